@@ -9,14 +9,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from safe_envs.dynamics.philox import Key, StreamReader, key_of
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
-from safe_envs.envs.simulation import NoiseStream, Simulation, steps_until
+from safe_envs.envs.noise import NoiseStream
+from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.errors import InvalidInputError, NumericalError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.validators import real_array
+
+_UNKNOWN = -1
+"""Gymnasium's seed of a generator that was set."""
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -62,11 +67,14 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self.action_space = action_box(problem)
         self.render_mode = render_mode
         self._simulation = Simulation(problem, "floats")
-        self._noise = NoiseStream(self._simulation.integrator.channels)
         center, half = center_and_half_width(problem)
         self._scales = list(zip(center, half, strict=True))
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
+        self._noise = NoiseStream(self._simulation.integrator.channels, self._limit)
+        self._reader = StreamReader()
+        self._key: Key | None = None
+        self._number = 0
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
         self._episode = Episode()
@@ -118,16 +126,16 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Start an episode from the problem's initial distribution.
 
         Args:
-            seed: of starts and noise; None goes on with the generator.
+            seed: of starts and noise, of which every episode since the seed has its own; None goes
+                on to the next one. `np_random` is seeded too, but nothing is drawn from it, unless
+                it was set: then every episode takes a key of its own from it.
             options: ignored.
 
         Returns:
             The observation, float32 (k,), and the info.
         """
         super().reset(seed=seed)
-        if seed is not None:
-            self._noise.clear()
-        self._x = self._simulation.starts.draw(self.np_random)
+        self._begin_episode(seeded=seed is not None)
         self._episode.restart()
         observation, _, _, info = self._observe([c for c, _ in self._scales])
         if self.viewer is not None:
@@ -147,9 +155,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Step with a physical input inside its bounds, as a filter returns it."""
         self.executed = u
         try:
-            self._x = self._simulation.integrator.step(
-                self.components, u, self._noise.next(self.np_random)
-            )
+            self._x = self._simulation.integrator.step(self.components, u, self._noise.next())
             self._episode.steps += 1
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
@@ -186,6 +192,18 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Close the window of the mode "human"."""
         if self.viewer is not None:
             self.viewer.close()
+
+    def _begin_episode(self, seeded: bool) -> None:
+        """Go to the streams of the next episode, and draw its start."""
+        if self.np_random_seed == _UNKNOWN:
+            low, high = self.np_random.integers(2**64, size=2, dtype=np.uint64).tolist()
+            self._key, self._number = (low, high), 0
+        elif seeded or self._key is None:
+            self._key, self._number = key_of(self.np_random_seed), 0
+        else:
+            self._number += 1
+        self._x = self._simulation.starts.draw(self._reader, self._key, self._number)
+        self._noise.begin(self._key, self._number)
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x, episode = self.components, self._episode

@@ -1,4 +1,4 @@
-"""The random generators of a batch: one for each env, as if the envs were alone."""
+"""The random streams of a batch: those of each env are the ones that it would have alone."""
 
 from __future__ import annotations
 
@@ -7,24 +7,39 @@ from collections.abc import Sequence
 import numpy as np
 from gymnasium.utils import seeding
 
+from safe_envs.dynamics.philox import Key, StreamReader, key_of
 from safe_envs.errors import ConfigurationError
 
 Seeds = int | Sequence[int | None] | None
 """A seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env."""
 
 
-class Generators:
-    """A random generator for each env of a batch, seeded at the first use.
+class EpisodeStreams:
+    """The streams that the envs of a batch draw from in their current episodes.
 
     Attributes:
-        rngs: the generators; empty before the first use.
-        seeds: by which they were seeded.
+        reader: reads the streams.
+        keys: of the seed of each env; empty before the first use.
+        episodes: number of the episode of each env since its seed, int64 (num_envs,); -1 before
+            the first.
+        seeds: of each env.
     """
 
     def __init__(self, num_envs: int) -> None:
-        self._num_envs = num_envs
-        self.rngs: list[np.random.Generator] = []
+        self.num_envs = num_envs
+        self.reader = StreamReader()
+        self.keys: list[Key] = []
+        self.episodes = np.full(num_envs, -1, dtype=np.int64)
         self.seeds: list[int] = []
+        self._generators: list[np.random.Generator | None] = [None] * num_envs
+
+    def generators(self) -> tuple[np.random.Generator, ...]:
+        """Return a generator for each env, seeded as Gymnasium does; nothing here draws from it."""
+        self._generators = [
+            seeding.np_random(seed)[0] if generator is None else generator
+            for generator, seed in zip(self._generators, self.seeds, strict=True)
+        ]
+        return tuple(self._generators)  # pyright: ignore[reportReturnType]
 
     def for_each_env(self, seed: Seeds) -> list[int | None]:
         """Return a seed, or None, for each env.
@@ -36,19 +51,43 @@ class Generators:
             ConfigurationError: There are not as many seeds as envs.
         """
         if seed is None:
-            return [None] * self._num_envs
+            return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self._num_envs)]
-        if len(seed) != self._num_envs:
-            raise ConfigurationError(f"{len(seed)} seeds were given for {self._num_envs} envs")
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ConfigurationError(f"{len(seed)} seeds were given for {self.num_envs} envs")
         return [None if s is None else int(s) for s in seed]
 
     def seed(self, seeds: Sequence[int | None]) -> list[int]:
-        """Seed the envs that have a seed, at the first use all; return their indices."""
-        first = not self.rngs
-        if first:
-            self.rngs, self.seeds = [None] * self._num_envs, [0] * self._num_envs  # pyright: ignore[reportAttributeAccessIssue]
-        chosen = [i for i, seed in enumerate(seeds) if first or seed is not None]
-        for i in chosen:
-            self.rngs[i], self.seeds[i] = seeding.np_random(seeds[i])
-        return chosen
+        """Seed the envs that have a seed, at the first use all; return their indices.
+
+        Their next episode is number 0.
+
+        Raises:
+            ConfigurationError: A seed is negative.
+        """
+        if not self.keys:
+            seeds = [_entropy() if seed is None else seed for seed in seeds]
+        chosen = {i: (seed, key_of(seed)) for i, seed in enumerate(seeds) if seed is not None}
+        if not self.keys:
+            self.keys, self.seeds = [(0, 0)] * self.num_envs, [0] * self.num_envs
+        for i, (seed, key) in chosen.items():
+            self.seeds[i], self.keys[i] = seed, key
+            self.episodes[i], self._generators[i] = -1, None
+        return list(chosen)
+
+    def begin_episodes(
+        self, envs: Sequence[int] | np.ndarray
+    ) -> tuple[Sequence[Key], Sequence[int]]:
+        """Go on to the next episode of some envs, given by their indices.
+
+        Returns:
+            The keys of their seeds, and the numbers of their episodes.
+        """
+        self.episodes[envs] += 1
+        return [self.keys[i] for i in envs], self.episodes[envs].tolist()
+
+
+def _entropy() -> int:
+    """Return a seed from the operating system, of as many bits as Gymnasium takes."""
+    return int(np.random.SeedSequence().entropy)  # pyright: ignore[reportArgumentType]

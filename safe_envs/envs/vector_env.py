@@ -13,8 +13,9 @@ from gymnasium.vector.utils import batch_space
 from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, with_masks
-from safe_envs.envs.seeding import Generators, Seeds
-from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
+from safe_envs.envs.noise import NoiseStreams
+from safe_envs.envs.seeding import EpisodeStreams, Seeds
+from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
@@ -27,8 +28,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """`num_envs` copies of a problem, stepped together.
 
     Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i,
-    as in Gymnasium's own SyncVectorEnv, whatever `num_envs` is. Infos are those of `SafeEnv` with
-    the batch in front.
+    as in Gymnasium's own SyncVectorEnv, whatever `num_envs` is. Starts and noise are a function of
+    an env's seed, the number of its episode since the seed, and the control period. Infos are those
+    of `SafeEnv` with the batch in front.
 
     Attributes:
         executed: the components of the physical inputs of the last step.
@@ -71,12 +73,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._simulation = Simulation(problem, "arrays")
-        self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
         self._actions = BatchActions(problem, num_envs)
         observed = {f.expression for f in problem.features}
         self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
         self._limit = steps_until(problem, max_episode_steps)
-        self._generators = Generators(num_envs)
+        self._streams = EpisodeStreams(num_envs)
+        self._noise = NoiseStreams(self._streams, self._simulation.integrator.channels, self._limit)
         self.executed: Sequence[Any] = ()
         self._x: Components = ()
         self.episodes = Episodes(num_envs)
@@ -95,15 +97,15 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The generator of each env."""
-        self._seed([None] * self.num_envs)
-        return tuple(self._generators.rngs)
+        """A generator of each env, seeded as Gymnasium does; the env does not draw from it."""
+        self._streams.seed([None] * self.num_envs)
+        return self._streams.generators()
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The seed of each env."""
-        self._seed([None] * self.num_envs)
-        return tuple(self._generators.seeds)
+        self._streams.seed([None] * self.num_envs)
+        return tuple(self._streams.seeds)
 
     def physical_action(self, actions: Any) -> Components:
         """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
@@ -125,9 +127,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Returns:
             The observations, float32 (num_envs, k), and the info.
         """
-        seeds = self._generators.for_each_env(seed)
+        seeds = self._streams.for_each_env(seed)
         mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
-        self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
+        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._actions.center), counted=mask)
         if self.viewer is not None:
@@ -143,8 +145,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Args:
             snapshot: of an env of the same problem and size.
-            seed: of the noise and of the starts from then on; see `reset`. The generators are no
-                part of a snapshot.
+            seed: whose first episode has the noise from the snapshot's control period on; see
+                `reset`. Without a seed the noise goes on where it is: it is not in a snapshot.
 
         Raises:
             InvalidInputError: the snapshot is of an env of another size or problem.
@@ -155,9 +157,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"the snapshot has states of shape {shape}; these envs have"
                 f" {(self.num_envs, self.problem.plant.n)}"
             )
-        self._seed(self._generators.for_each_env(seed))
+        seeded = self._streams.seed(self._streams.for_each_env(seed))
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         self.episodes.restore(snapshot)
+        self._streams.begin_episodes(seeded)
+        self._noise.seek(seeded, self.episodes.steps[seeded])
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, range(self.num_envs))
 
@@ -181,7 +185,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded(
                 f"the episodes of envs {np.flatnonzero(due)[:5].tolist()} have ended: reset them"
             )
-        draws = self._noise.next(self._generators.rngs, None if due is None else ~due)
+        draws = self._noise.next(None if due is None else ~due)
         # A state that overflows is found by `_observe`, which says so better than a warning.
         with np.errstate(over="ignore", invalid="ignore"):
             self._x = self._simulation.integrator.step(x, u, draws)
@@ -239,13 +243,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _times(self) -> np.ndarray:
         return self.episodes.steps * self.problem.dt
 
-    def _seed(self, seeds: Sequence[int | None]) -> None:
-        self._noise.clear(self._generators.seed(seeds))
-
     def _restart(self, envs: np.ndarray) -> None:
         """Put some envs at the start of an episode."""
-        rngs = [self._generators.rngs[i] for i in envs.tolist()]
-        start = self._simulation.starts.draw_batch(rngs)
+        begun = self._streams.begin_episodes(envs)
+        self._noise.begin(envs)
+        start = self._simulation.starts.draw_batch(self._streams.reader, *begun)
         if envs.size == self.num_envs:
             self._x = tuple(start)
         else:

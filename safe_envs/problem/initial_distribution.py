@@ -9,6 +9,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
+from safe_envs.dynamics.philox import START, Key, StreamReader
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 
@@ -65,14 +66,22 @@ class StartSampler:
             self._tries = _TRIES_AT_ONCE
             self._accept = compile_function(model.states, (condition,), "floats")
 
-    def draw(self, rng: np.random.Generator) -> Components:
-        """Draw an initial state: a plain float for each state.
+    def draw(self, reader: StreamReader, key: Key, episode: int) -> Components:
+        """Draw the initial state of an episode: a plain float for each state.
+
+        Args:
+            reader: reads the uniforms of the stream `START`, for each try as many as the
+                distribution has.
+            key: of the episode's seed.
+            episode: its number.
 
         Raises:
             ConfigurationError: The condition is hardly ever met.
         """
+        if self._uniforms:
+            reader.seek(key, episode, START)
         for _ in range(_MOST_TRIES // self._tries):
-            for uniforms in rng.random((self._tries, self._uniforms)).tolist():
+            for uniforms in reader.uniforms((self._tries, self._uniforms)).tolist():
                 x = self._state(*uniforms)
                 if self._accept is None or self._accept(*x)[0] > 0:
                     return x
@@ -81,9 +90,22 @@ class StartSampler:
             " tries; give a fixed start or another distribution"
         )
 
-    def draw_batch(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
-        """Draw an initial state from each generator; shape (n, len(rngs))."""
-        if rngs and not self._uniforms:
+    def draw_batch(
+        self, reader: StreamReader, keys: Sequence[Key], episodes: Sequence[int]
+    ) -> np.ndarray:
+        """Draw the initial states of episodes.
+
+        Args:
+            reader: see `draw`.
+            keys: of each episode's seed.
+            episodes: their numbers.
+
+        Returns:
+            Shape (n, len(keys)).
+        """
+        if keys and not self._uniforms:
             # Nothing is drawn for a fixed start.
-            return np.repeat(np.array([self.draw(rngs[0])], dtype=float).T, len(rngs), axis=1)
-        return np.array([self.draw(rng) for rng in rngs], dtype=float).T.copy()
+            fixed = np.array([self.draw(reader, keys[0], episodes[0])], dtype=float).T
+            return np.repeat(fixed, len(keys), axis=1)
+        drawn = [self.draw(reader, k, e) for k, e in zip(keys, episodes, strict=True)]
+        return np.array(drawn, dtype=float).T.copy()

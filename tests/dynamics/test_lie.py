@@ -21,6 +21,7 @@ from safe_envs.dynamics.lie import (
     relative_degree,
     tidied,
 )
+from safe_envs.dynamics.philox import StreamReader
 from safe_envs.envs.simulation import Simulation
 from tests.conftest import problem_of
 
@@ -37,13 +38,11 @@ def in_fifty_digits(system, expression):
 
 def states_near_starts(problem, count=4):
     simulation = Simulation(problem, "floats")
-    rng = np.random.default_rng(0)
+    reader, rng = StreamReader(), np.random.default_rng(0)
+    starts = [simulation.starts.draw(reader, (0, 0), i) for i in range(count)]
     return [
-        [
-            mpmath.mpf(c)
-            for c in np.add(simulation.starts.draw(rng), 0.3 * rng.normal(size=problem.plant.n))
-        ]
-        for _ in range(count)
+        [mpmath.mpf(c) for c in np.add(start, 0.3 * rng.normal(size=problem.plant.n))]
+        for start in starts
     ]
 
 

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.dynamics.philox import StreamReader
 from safe_envs.envs.simulation import Simulation
 from safe_envs.systems.stochastic_dubins import StochasticDubins
 from safe_envs.wrappers import SafetyFilterWrapper
@@ -70,9 +71,9 @@ def test_observations_stay_in_their_space_until_the_end(env_id):
 def test_starts_are_safe_and_in_the_workspace(env_id):
     problem = problem_of(env_id)
     simulation = Simulation(problem, "floats")
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        x = simulation.starts.draw(rng)
+    reader = StreamReader()
+    for episode in range(200):
+        x = simulation.starts.draw(reader, (0, 0), episode)
         _, barriers, _, outside, goal = simulation.measure(x, [0.0] * problem.plant.m, 0.0)
         assert min(barriers) > 0
         assert outside <= 0

@@ -16,7 +16,7 @@ from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.rare_events.particles import MakeTiltedEnv
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
-from safe_envs.envs.simulation import NoiseStreams
+from safe_envs.envs.noise import NoiseStreams
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
@@ -110,14 +110,14 @@ class _TiltedStreams(NoiseStreams):
     """The draws of an env with its drift."""
 
     def __init__(self, env: TiltedNoiseEnv, channels: int) -> None:
-        super().__init__(env.num_envs, channels)
+        super().__init__(env._streams, channels, env._limit)
         self._env = env
 
-    def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
+    def next(self, stepping: np.ndarray | None) -> np.ndarray:
         """See `NoiseStreams.next`."""
         # A state that overflows is found by the env, whose message is better than a warning.
         with np.errstate(all="ignore"):
-            return self._env.tilted(super().next(rngs, stepping))
+            return self._env.tilted(super().next(stepping))
 
 
 def log_ratio(girsanov_integrals: np.ndarray, lengths: Any) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.dynamics.philox import StreamReader, key_of
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.simulation import Simulation
 from safe_envs.errors import ConfigurationError
@@ -112,10 +113,8 @@ def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray
     Returns:
         States, shape (count, n).
     """
-    rngs: list[Any] = [
-        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)
-    ]
-    return Simulation(problem, "floats").starts.draw_batch(rngs).T
+    starts = Simulation(problem, "floats").starts
+    return starts.draw_batch(StreamReader(), [key_of(seed)] * count, range(count)).T
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,198 @@
+"""The standard normal numbers that drive an episode, drawn ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from safe_envs.dynamics.normal import standard_normals
+from safe_envs.dynamics.philox import NOISE, Key, StreamReader
+from safe_envs.envs.seeding import EpisodeStreams
+
+_CHUNK = 256
+_FIRST_CHUNK = 64
+_AHEAD = 32
+"""Control periods before their end at which chunks may be renewed together with others."""
+
+
+class NoiseStream:
+    """Standard normal numbers of one env, drawn ahead in chunks.
+
+    Args:
+        channels: numbers in a control period.
+        periods: of an episode; nothing is drawn ahead for more.
+    """
+
+    def __init__(self, channels: int, periods: int) -> None:
+        self._channels, self._periods = channels, periods
+        self._reader = StreamReader()
+        self.begin((0, 0), 0)
+
+    def begin(self, key: Key, episode: int) -> None:
+        """Go to the first control period of an episode of a seed."""
+        self._key, self._episode, self._drawn = key, episode, 0
+        self._rows: list[list[float]] = []
+        self._position = 0
+
+    def next(self) -> list[float]:
+        """Return the draws of the next control period."""
+        if not self._channels:
+            return []
+        if self._position == len(self._rows):
+            self._draw()
+        self._position += 1
+        return self._rows[self._position - 1]
+
+    def _draw(self) -> None:
+        left = self._periods - self._drawn
+        count = min(left, _CHUNK) if left > 0 else _CHUNK
+        self._reader.seek(self._key, self._episode, NOISE, self._drawn * self._channels)
+        uniforms = self._reader.uniforms((count, self._channels))
+        self._rows = standard_normals(uniforms, out=uniforms).tolist()
+        self._position = 0
+        self._drawn += count
+
+
+class NoiseStreams:
+    """Standard normal numbers of a batch: each env has its own stream.
+
+    Computing few numbers takes nearly as long as computing thousands. Hence envs whose episodes are
+    not in step draw ahead together: what they soon need, and the beginning of their next episode.
+
+    Args:
+        streams: of the envs.
+        channels: numbers in a control period.
+        periods: of an episode; nothing is drawn ahead for more.
+    """
+
+    def __init__(self, streams: EpisodeStreams, channels: int, periods: int) -> None:
+        self._streams, self._channels, self._periods = streams, channels, periods
+        self._chunk = min(_CHUNK, periods)
+        # Env i has the slots 2 i and 2 i + 1, one for its episode and one for the beginning of the
+        # next; what a slot holds stands at its end.
+        n = streams.num_envs
+        self._buffer = np.empty((2 * n, self._chunk, channels))
+        self._rows = self._buffer.reshape(2 * n * self._chunk, channels)
+        self._slot = 2 * np.arange(n)
+        self._row = (self._slot + 1) * self._chunk
+        self._end = self._row.copy()
+        self._drawn = np.zeros(n, dtype=np.int64)
+        self._ahead = np.zeros(n, dtype=np.int64)
+        self._before_refill = 0
+
+    def seek(self, envs: Sequence[int] | np.ndarray, periods: np.ndarray) -> None:
+        """Go to a control period of the episodes of some envs.
+
+        Args:
+            envs: their indices.
+            periods: the control period of each.
+        """
+        self._row[envs] = self._end[envs]
+        self._drawn[envs] = periods
+        self._ahead[envs] = 0
+        self._before_refill = 0
+
+    def begin(self, envs: np.ndarray) -> None:
+        """Begin the next episodes of some envs, given by their indices."""
+        if not self._channels:
+            return
+        # What was drawn ahead before a seed is of another stream.
+        ahead = np.where(self._streams.episodes[envs] > 0, self._ahead[envs], 0)
+        slot = self._slot[envs] ^ 1
+        end = (slot + 1) * self._chunk
+        self._slot[envs] = slot
+        self._end[envs] = end
+        self._row[envs] = end - ahead
+        self._drawn[envs] = ahead
+        self._ahead[envs] = 0
+        self._before_refill = min(self._before_refill, int(ahead.min()))
+
+    def next(self, stepping: np.ndarray | None) -> np.ndarray:
+        """Return the draws of the next control period, shape (channels, num_envs).
+
+        Args:
+            stepping: the envs whose stream moves on; None for all. The others get draws that are to
+                be ignored.
+        """
+        if not self._channels:
+            return self._rows.T[:0]
+        if not self._before_refill:
+            self._refill(stepping)
+        self._before_refill -= 1
+        draws = self._rows.take(
+            self._row if stepping is None else np.where(stepping, self._row, 0), axis=0
+        ).T
+        self._row += 1 if stepping is None else stepping
+        return draws
+
+    def _refill(self, stepping: np.ndarray | None) -> None:
+        left = self._end - self._row
+        moving = True if stepping is None else stepping
+        used_up = (left == 0) & moving
+        if np.count_nonzero(used_up):
+            soon = (left <= _AHEAD) & (self._drawn < self._periods) & moving
+            self._draw_now(np.flatnonzero(used_up | soon), left)
+            later = (self._streams.episodes > 0) & (self._ahead == 0)
+            if np.count_nonzero(later):
+                self._draw_ahead(np.flatnonzero(later))
+            left = self._end - self._row
+        self._before_refill = max(int(left.min()), 1)
+
+    def _draw_now(self, envs: np.ndarray, left: np.ndarray) -> None:
+        """Draw on for some envs; `left` is what each env still has."""
+        counts = self._counts(self._drawn[envs], left[envs])
+        normals = self._normals(envs, self._streams.episodes[envs], self._drawn[envs], counts)
+        first = 0
+        for i, count, rest in zip(
+            self._slot[envs].tolist(), counts.tolist(), left[envs].tolist(), strict=True
+        ):
+            slot, new = self._buffer[i], self._chunk - count
+            if rest:
+                slot[new - rest : new] = slot[-rest:]
+            slot[new:] = normals[first : first + count]
+            first += count
+        self._row[envs] -= counts
+        self._drawn[envs] += counts
+
+    def _draw_ahead(self, envs: np.ndarray) -> None:
+        """Draw the beginnings of the next episodes of some envs."""
+        nothing = np.zeros_like(envs)
+        counts = self._counts(nothing, nothing)
+        normals = self._normals(envs, self._streams.episodes[envs] + 1, nothing, counts)
+        count = int(counts[0])
+        slots = self._slot[envs] ^ 1
+        self._buffer[slots, -count:] = normals.reshape(len(envs), count, self._channels)
+        self._ahead[envs] = count
+
+    def _counts(self, drawn: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Return for how many control periods to draw, after some and with some that are left."""
+        to_come = self._periods - drawn
+        # An episode that has lasted is likely to last: chunks grow with it.
+        counts = np.clip(drawn, _FIRST_CHUNK, self._chunk)
+        counts = np.where(to_come <= 2 * counts, to_come, counts)
+        return np.minimum(np.where(to_come > 0, counts, self._chunk), self._chunk - left)
+
+    def _normals(
+        self, envs: np.ndarray, episodes: np.ndarray, periods: np.ndarray, counts: np.ndarray
+    ) -> np.ndarray:
+        """Return the numbers of some control periods of each env, one after the other.
+
+        Args:
+            envs: their indices.
+            episodes: of each.
+            periods: the first control period of each.
+            counts: number of control periods of each.
+
+        Returns:
+            Shape (sum of the counts, channels).
+        """
+        found = np.empty((int(counts.sum()), self._channels))
+        keys, reader = self._streams.keys, self._streams.reader
+        first, words = 0, (periods * self._channels).tolist()
+        for i, episode, word, count in zip(
+            envs.tolist(), episodes.tolist(), words, counts.tolist(), strict=True
+        ):
+            reader.seek(keys[i], episode, NOISE, word).fill(found[first : first + count])
+            first += count
+        return standard_normals(found, out=found)
