@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, tolerance, tolerances
 
 _EXCESS = 1e3
@@ -47,7 +48,8 @@ def project_floats(
         whether it can be met.
     """
     if len(u) == 1:
-        return _project_scalar(a[0], b, u[0], low[0], high[0])
+        found, margin, active, feasible = project_scalar(a[0], b, u[0], low[0], high[0])
+        return [found], margin, active, feasible
     v = u
     u = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
@@ -73,23 +75,6 @@ def project_floats(
             tolerance(a, b, u),
         )
     return u, margin, True, margin >= -allowed
-
-
-def _project_scalar(
-    a: float, b: float, v: float, low: float, high: float
-) -> tuple[list[float], float, bool, bool]:
-    """Project a single input: to the root of the constraint, or the bound next to it."""
-    u = low if v < low else high if v > high else v
-    margin = a * u + b
-    if margin >= 0.0:
-        return [u], margin, False, True
-    if a == 0.0:
-        return [u], margin, True, False
-    root = -b / a
-    u = low if root < low else high if root > high else root
-    product = a * u
-    margin = product + b
-    return [u], margin, True, margin >= -ROUNDING * abs(b) - ROUNDING * abs(product)
 
 
 def _follow_multiplier(
