@@ -36,10 +36,22 @@ NOT_FINITE = 4
 PERIODS = 16
 """Control periods of noise that are drawn at once. With a multiple of 4, whole blocks are."""
 
-STEPS, PERIOD = 0, 1
-COST, H_MIN, EPISODE_COST, BARRIERS = 0, 1, 2, 3
-TERMINATED, TRUNCATED, ENDED, VIOLATION, INTERVENTION, ACTIVE, FEASIBLE = 0, 1, 2, 3, 4, 5, 6
-INTERVENTIONS, INFEASIBLE, ACTIVE_BARRIER = 0, 1, 2
+STEPS = 0
+PERIOD = 1
+COST = 0
+H_MIN = 1
+EPISODE_COST = 2
+BARRIERS = 3
+TERMINATED = 0
+TRUNCATED = 1
+ENDED = 2
+VIOLATION = 3
+INTERVENTION = 4
+ACTIVE = 5
+FEASIBLE = 6
+INTERVENTIONS = 0
+INFEASIBLE = 1
+ACTIVE_BARRIER = 2
 
 
 def step_batch(  # noqa: PLR0913
@@ -51,7 +63,8 @@ def step_batch(  # noqa: PLR0913
     limit: int,
     dt: float,
     channels: int,
-    streams: np.ndarray,
+    keys: np.ndarray,
+    episodes: np.ndarray,
     chunks: np.ndarray,
     noise: np.ndarray,
     uniforms: np.ndarray,
@@ -86,7 +99,8 @@ def step_batch(  # noqa: PLR0913
         limit: control periods until an episode is truncated.
         dt: control period in s.
         channels: standard normals of a control period.
-        streams: the two words of the key and the number of the episode, of each env.
+        keys: the two words of each env's key.
+        episodes: number of each env's episode since its seed.
         chunks: number of the chunk of noise of each env, -1 without one.
         noise: that chunk.
         uniforms: scratch array, with an entry for each uniform of the start distribution.
@@ -114,7 +128,7 @@ def step_batch(  # noqa: PLR0913
     for i in range(len(restarts)):
         u = resting_input(data)
         if restarts[i]:
-            x = draw_start(streams[i, 0], streams[i, 1], streams[i, 2], uniforms, data)
+            x = draw_start(keys[i, 0], keys[i, 1], episodes[i], uniforms, data)
             if not isfinite(x[0]):
                 return NO_START
             chunks[i] = -1
@@ -153,9 +167,7 @@ def step_batch(  # noqa: PLR0913
                     if chunks[i] != period // PERIODS:
                         chunks[i] = period // PERIODS
                         first = (period - period % PERIODS) * channels
-                        fill_normals(
-                            noise[i], first, streams[i, 2], NOISE, streams[i, 0], streams[i, 1]
-                        )
+                        fill_normals(noise[i], first, episodes[i], NOISE, keys[i, 0], keys[i, 1])
                 x = advance(x, u, noise[i], place, data)
         time = counts[i, STEPS] * dt
         counted = stepping or restarts[i]

@@ -17,6 +17,7 @@ from safe_envs.agents.rare_events.particles import MakeTiltedEnv
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
 from safe_envs.envs.noise import NoiseStreams
+from safe_envs.envs.simulation import steps_until
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
@@ -63,7 +64,8 @@ class TiltedNoiseEnv(SafeVectorEnv):
         self._shape = (len(rows), len(live), len(lengths))
         self._lengths = lengths
         self.girsanov_integrals = np.zeros((len(lengths), 2))
-        self._noise = _TiltedStreams(self, self._simulation.integrator.channels)
+        batch: Any = self._batch
+        batch.noise = _TiltedStreams(self, steps_until(problem, None))
 
     def tilt_direction(self) -> np.ndarray:
         """Return the direction e of the coming period, shape (noise channels, num_envs)."""
@@ -101,17 +103,20 @@ class TiltedNoiseEnv(SafeVectorEnv):
         super().restore(snapshot, seed)
         self.girsanov_integrals = np.array(snapshot["girsanov_integrals"])
 
-    def _restart(self, envs: np.ndarray) -> None:
-        super()._restart(envs)
-        self.girsanov_integrals[envs] = 0.0
-
 
 class _TiltedStreams(NoiseStreams):
     """The draws of an env with its drift."""
 
-    def __init__(self, env: TiltedNoiseEnv, channels: int) -> None:
-        super().__init__(env._streams, channels, env._limit)
+    def __init__(self, env: TiltedNoiseEnv, periods: int) -> None:
+        problem = env.problem
+        channels = len(problem.plant.noise_channels) * problem.substeps
+        super().__init__(env._streams, channels, periods)
         self._env = env
+
+    def begin(self, envs: np.ndarray) -> None:
+        """See `NoiseStreams.begin`."""
+        super().begin(envs)
+        self._env.girsanov_integrals[envs] = 0.0
 
     def next(self, stepping: np.ndarray | None) -> np.ndarray:
         """See `NoiseStreams.next`."""
