@@ -9,8 +9,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.envs.info import Info, filter_info, with_masks
-from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
+from safe_envs.envs.compiled_batch import BatchFilter, BatchStepper
+from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
+from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
@@ -20,6 +21,9 @@ from safe_envs.wrappers.env_wrappers.layers import (
 )
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.filter_qp.filter_source import filter_source
+
+_TALLIES = ("interventions", "infeasible")
 
 
 class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
@@ -28,7 +32,11 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     A step that only resets an env (next-step autoreset) ignores its action: there the filter
     reports what it reports at reset, and counts nothing.
 
+    Over envs with the engine "compiled" or "auto", made without a render mode, the filter is part
+    of their compiled function, if it has a closed form; "auto" leaves other filters to NumPy.
+
     Raises:
+        NotCompilableError: the engine of the env is "compiled", and the filter needs a solver.
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
@@ -51,8 +59,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         gym.vector.VectorWrapper.__init__(self, env)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
-        self._interventions = np.zeros(self.num_envs, dtype=np.int64)
-        self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
+        self._tallies = np.zeros((self.num_envs, 2), dtype=np.int64)
+        self._stepper = self._compiled() if env is inner else None
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -70,8 +78,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
         counts = {
-            "interventions": self._interventions.copy(),
-            "infeasible": self._infeasible.copy(),
+            name: self._tallies[:, j].copy() for j, name in enumerate(_TALLIES)
         }
         return {**self._inner.snapshot(), **counts}
 
@@ -80,12 +87,15 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     ) -> None:
         """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
-        self._interventions, self._infeasible = (
-            np.array(snapshot[name]) for name in ("interventions", "infeasible")
-        )
+        self._tallies = np.column_stack([snapshot[name] for name in _TALLIES])
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
+        if self._stepper is not None:
+            self._stepper.tallies = self._tallies
+            found = self._inner.step_filtered(self._stepper, actions)
+            self._tallies = self._stepper.tallies
+            return found
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
         active = (
@@ -117,8 +127,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         for u, v in zip(decision.action[1:], nominal[1:], strict=True):
             differs |= u != v
         differs &= active
-        self._interventions += differs
-        self._infeasible += ~decision.feasible
+        self._tallies = self._tallies + np.column_stack([differs, ~decision.feasible])
         return filter_info(
             nominal_action=_as_columns(nominal),
             safe_action=_as_columns(decision.action),
@@ -130,8 +139,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             ),
             slacks=_as_columns(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
-            episode_interventions=self._interventions.copy(),
-            episode_infeasible=self._infeasible.copy(),
+            episode_interventions=self._tallies[:, 0].copy(),
+            episode_infeasible=self._tallies[:, 1].copy(),
         )
 
     def _restart(self, added: Info, envs: np.ndarray) -> None:
@@ -143,8 +152,22 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             added[key][envs] = value
 
     def _forget(self, envs: np.ndarray) -> None:
-        self._interventions[envs] = 0
-        self._infeasible[envs] = 0
+        self._tallies = self._tallies.copy()
+        self._tallies[envs] = 0
+
+    def _compiled(self) -> BatchStepper | None:
+        """Return what filters and steps in one compiled function, where the env is compiled."""
+        if not isinstance(self._inner, SafeVectorEnv):
+            return None
+        qp, rest = self.safety_filter.qp, self._rest
+        at_rest = [rest[key] for key in ("nominal_action", "safe_action", "slack", "slacks")]
+        return self._inner.filtered(
+            BatchFilter(
+                lambda data: filter_source(qp, data),
+                self.safety_filter.decide_arrays,
+                np.hstack(at_rest),
+            )
+        )
 
 
 def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
