@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+from pathlib import Path
 
 # Before NumPy and torch are imported, and for processes that tests start: on small matrices,
 # threads that wait for each other take most of the processors from the other tests.
@@ -11,6 +12,8 @@ os.environ["OMP_NUM_THREADS"] = "1"
 # Before SymPy is imported: it would forget what one test has differentiated before the next one
 # needs it.
 os.environ["SYMPY_CACHE_SIZE"] = "None"
+# What one run has compiled serves the next one, and not the user's own work.
+os.environ["SAFE_ENVS_CACHE"] = str(Path(__file__).parents[1] / ".pytest_cache")
 
 import gymnasium as gym
 import hypothesis

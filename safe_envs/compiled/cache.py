@@ -6,13 +6,14 @@ import os
 import shutil
 import stat
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 _KEPT = 64
-"""Programs that are kept, the most recently used ones; each takes some hundred kilobytes."""
+"""Programs that are kept; each takes some hundred kilobytes."""
 
 VARIABLE = "SAFE_ENVS_CACHE"
-"""Environment variable with the folder to use in place of the user's cache folder; empty for none."""
+"""Environment variable with a folder to use in place of the user's cache; empty for none."""
 
 
 def cache_folder() -> Path | None:
@@ -27,16 +28,17 @@ def cache_folder() -> Path | None:
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         return folder if _is_private(folder) else None
-    except (OSError, ValueError):
+    except (OSError, RuntimeError, ValueError):  # No home, no right, no name of a file.
         return None
 
 
 def forget_old_programs(folder: Path) -> None:
-    """Remove the programs that were not used for longest, but for the last 64."""
-    programs = sorted(
-        (each for each in folder.iterdir() if each.is_dir()), key=lambda each: -each.stat().st_mtime
-    )
-    for program in programs[_KEPT:]:
+    """Remove programs, but for the 64 that were used last."""
+    used = {}
+    for program in folder.iterdir():
+        with suppress(OSError):  # Another process may have removed it.
+            used[program] = program.stat().st_mtime
+    for program in sorted(used, key=lambda each: -used[each])[_KEPT:]:
         shutil.rmtree(program, ignore_errors=True)
 
 

@@ -15,6 +15,8 @@ from safe_envs.dynamics.computable import excerpt
 from safe_envs.dynamics.printers import FloatPrinter
 from safe_envs.errors import SystemDefinitionError
 
+_LARGE = 2**31
+
 
 @dataclass(frozen=True)
 class Source:
@@ -46,7 +48,13 @@ class _KernelPrinter(FloatPrinter):
         self._data = data
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
-        return f"data[{self._data.add([float(expr)])}]"
+        # By way of its digits, as plain floats get it: that may round differently.
+        return f"data[{self._data.add([float(super()._print_Float(expr))])}]"
+
+    def _print_Integer(self, expr: Any) -> str:  # noqa: N802
+        # Compiled code has whole numbers of 64 bits.
+        small = abs(expr) < _LARGE
+        return super()._print_Integer(expr) if small else self._print_Float(sp.Float(expr, 17))
 
 
 def formulas(

@@ -11,9 +11,9 @@ from functools import lru_cache
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from safe_envs.compiled import plain_natives
+from safe_envs.compiled import plain_natives, slots
 from safe_envs.compiled.formulas import Source
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import SystemDefinitionError
 
 _MATH_FUNCTIONS = {name for name, value in vars(math).items() if not name.startswith("_")}
 
@@ -43,7 +43,7 @@ def linked(entries: Sequence[Callable[..., Any]], generated: Source) -> str:
         generated: functions of this program alone.
 
     Raises:
-        ConfigurationError: Two functions that the program needs have one name.
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
     """
     link = _Link(generated)
     for function in entries:
@@ -55,10 +55,11 @@ def linked(entries: Sequence[Callable[..., Any]], generated: Source) -> str:
 
 class _Link:
     def __init__(self, generated: Source) -> None:
-        tree = ast.parse(generated.text)
-        self._generated = {
-            node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)
-        }
+        self._generated: dict[str, ast.FunctionDef] = {}
+        for node in ast.parse(generated.text).body:
+            if not isinstance(node, ast.FunctionDef) or node.name in self._generated:
+                raise SystemDefinitionError(f"generated twice, or no function: {ast.unparse(node)}")
+            self._generated[node.name] = node
         self._found: dict[str, tuple[str, ast.stmt]] = {}
         self._math: set[str] = set()
         for node in self._generated.values():
@@ -79,6 +80,8 @@ class _Link:
             return
         if module == plain_natives.__name__:
             return
+        if module == slots.__name__:
+            raise SystemDefinitionError(f"the program needs a function {name!r}, which is missing")
         known = _parsed(module)
         if name in known.imports:
             self.need(*known.imports[name])
@@ -87,9 +90,11 @@ class _Link:
         if node is None:
             return
         if name in self._found:
-            if self._found[name][0] != module:
-                raise ConfigurationError(
-                    f"two kernels are called {name!r}, in {self._found[name][0]} and {module}"
+            other, found = self._found[name]
+            # A constant of one value may be stated in several modules.
+            if other != module and ast.unparse(found) != ast.unparse(node):
+                raise SystemDefinitionError(
+                    f"two kernels are called {name!r}, in {other} and {module}"
                 )
             return
         self._found[name] = module, node

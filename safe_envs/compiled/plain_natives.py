@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import struct
 
+import numpy as np
+
 _MASK = (1 << 64) - 1
 _FIRST, _SECOND = 0xD2E7470EE14C6C93, 0xCA5A826395121157
 _FIRST_STEP, _SECOND_STEP = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
@@ -44,3 +46,28 @@ def single(value: float) -> float:
         return struct.unpack("f", struct.pack("f", value))[0]
     except OverflowError:
         return float("inf") if value > 0.0 else float("-inf")
+
+
+def vector_view(array: np.ndarray, first: int, count: int) -> np.ndarray:
+    """Return entries of an array, to be read and written; compiled code takes no note of the view.
+
+    So it costs nothing, and must not outlive the array: no function returns one.
+
+    Args:
+        array: of one dimension.
+        first: its first entry.
+        count: number of entries.
+    """
+    return array[first : first + count]
+
+
+def table_view(array: np.ndarray, first: int, rows: int, columns: int) -> np.ndarray:
+    """Return entries of an array, row by row; see `vector_view`.
+
+    Args:
+        array: of one dimension.
+        first: its first entry.
+        rows: number of rows.
+        columns: number of columns.
+    """
+    return array[first : first + rows * columns].reshape(rows, columns)

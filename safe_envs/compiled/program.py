@@ -10,7 +10,6 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -48,7 +47,7 @@ class Program:
         text: of the program, in Python.
 
     Raises:
-        ConfigurationError: Two functions that the program needs have one name.
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
     """
 
     def __init__(
@@ -89,12 +88,9 @@ def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     if folder is None:
         _LOG.warning("compiling %s; there is no folder of yours to keep it in", title)
         return _functions({**vars(numba_natives), "entry": numba_natives.kernel}, text, names)
-    program = folder / digest
-    if not any(program.glob("**/*.nbi")):
-        _LOG.warning("compiling %s, which takes some seconds once", title)
-    found = _kept(program, text)
+    program = _KeptProgram(folder / digest, text, title)
     forget_old_programs(folder)
-    return {name: _Entry(found[name], program, text).__call__ for name in names}
+    return {name: program.entry(name) for name in names}
 
 
 def _functions(names: dict[str, Any], text: str, wanted: Sequence[str]) -> Functions:
@@ -102,35 +98,46 @@ def _functions(names: dict[str, Any], text: str, wanted: Sequence[str]) -> Funct
     return {name: names[name] for name in wanted}
 
 
-def _kept(program: Path, text: str) -> dict[str, Any]:
-    """Load a program from its folder, made if need be: Numba keeps what it compiles beside it."""
-    file = program / _FILE
-    program.mkdir(mode=0o700, exist_ok=True)
-    whole = f"from safe_envs.compiled.numba_natives import *\n{text}"
-    if not file.is_file() or file.read_text() != whole:
-        write_atomically(file, lambda path: path.write_text(whole))
-    os.utime(program)
-    name = f"safe_envs_program_{program.name}"
-    spec: Any = importlib.util.spec_from_file_location(name, file)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    # Numba has a cache of its own; bytecode would be one more file that others could write.
-    spec.loader.exec_module(module)
-    return vars(module)
+class _KeptProgram:
+    """A program in a folder of its own, where Numba keeps what it compiles."""
 
+    def __init__(self, folder: Path, text: str, title: str) -> None:
+        self._folder, self._title = folder, title
+        self._text = f"from safe_envs.compiled.numba_natives import *\n{text}"
+        self._functions = self._load()
 
-class _Entry:
-    """An entry point that compiles its program anew where what is kept on disk cannot be read."""
+    def entry(self, name: str) -> Callable[..., Any]:
+        """Return an entry point, which says so where it has to be compiled first."""
+        function = self._functions[name]
+        is_new = True
 
-    def __init__(self, function: Callable[..., Any], program: Path, text: str) -> None:
-        self._function, self._program, self._text = function, program, text
+        def call(*arguments: Any) -> Any:
+            nonlocal function, is_new
+            if not is_new:
+                return function(*arguments)
+            if not any(self._folder.glob(f"__pycache__/*.{name}-*.nbi")):
+                _LOG.warning("compiling %s, which takes some seconds once", self._title)
+            is_new = False
+            try:
+                return function(*arguments)
+            except Exception:
+                # Kernels raise nothing: what is kept cannot be read.
+                shutil.rmtree(self._folder, ignore_errors=True)
+                function = self._load()[name]
+                return function(*arguments)
 
-    def __call__(self, *arguments: Any) -> Any:
-        try:
-            return self._function(*arguments)
-        except Exception:
-            # Kernels raise nothing.
-            with suppress(OSError):
-                shutil.rmtree(self._program)
-            self._function = _kept(self._program, self._text)[self._function.__name__]
-            return self._function(*arguments)
+        return call
+
+    def _load(self) -> dict[str, Any]:
+        file = self._folder / _FILE
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        if not file.is_file() or file.read_text() != self._text:
+            write_atomically(file, lambda path: path.write_text(self._text))
+        os.utime(self._folder)
+        name = f"safe_envs_program_{self._folder.name}"
+        spec: Any = importlib.util.spec_from_file_location(name, file)
+        module = importlib.util.module_from_spec(spec)
+        # Numba finds a function's module by its name.
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        return vars(module)

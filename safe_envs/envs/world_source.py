@@ -108,24 +108,19 @@ def _measure(problem: SafetyProblem, data: Data) -> Source:
     )
     plant, last = problem.plant, features + barriers
     measure = formulas("measure", {"x": plant.states, "u": plant.inputs, "time": TIME}, read, data)
-    observed = "".join(f"single(values[{i}]), " for i in range(features))
-    shares = "".join(f"values[{features + i}], " for i in range(barriers))
-    smallest = ["    h = barriers[0]"]
-    for i in range(1, barriers):
-        smallest.append(f"    h = barriers[{i}] if not barriers[{i}] >= h else h")
-    total = " + ".join(
-        [
-            *(f"abs(single(values[{i}]))" for i in range(features)),
-            *(f"abs(values[{features + i}])" for i in range(barriers)),
-            *(f"abs(x[{i}])" for i in range(plant.n)),
-        ]
+    seen = [f"single(values[{i}])" for i in range(features)]
+    heights = [f"values[{features + i}]" for i in range(barriers)]
+    sizes = [f"abs({entry})" for entry in (*seen, *heights, *(f"x[{i}]" for i in range(plant.n)))]
+    smaller = "".join(
+        f"    h = h if barriers[{i}] >= h else barriers[{i}]\n" for i in range(1, barriers)
     )
     return measure + Source(
-        f"def observation_of(values):\n    return ({observed})\n"
-        f"def barriers_of(values):\n    return ({shares})\n"
-        "def smallest_barrier(barriers):\n" + "\n".join(smallest) + "\n    return h\n"
+        f"def observation_of(values):\n    return ({', '.join(seen)},)\n"
+        f"def barriers_of(values):\n    return ({', '.join(heights)},)\n"
+        f"def smallest_barrier(barriers):\n    h = barriers[0]\n{smaller}    return h\n"
         f"def reward_of(values):\n    return values[{last}]\n"
         f"def has_left(values):\n    return values[{last + 1}] > 0.0\n"
-        f"def has_ended(values):\n    return values[{last + 1}] > 0.0 or values[{last + 2}] >= 0.0\n"
-        f"def is_finite(x, values):\n    return isfinite({total})\n"
+        f"def has_ended(values):\n"
+        f"    return values[{last + 1}] > 0.0 or values[{last + 2}] >= 0.0\n"
+        f"def is_finite(x, values):\n    return isfinite({' + '.join(sizes)})\n"
     )

@@ -23,6 +23,10 @@ class CompiledQP:
 
     The formulas are the same for both flavours; only the choice between two values and the solver
     differ.
+
+    Attributes:
+        weights: of the inputs, those of the goal where there is one.
+        goal_unit: of the goal's slack, in which it weighs as much as an input.
     """
 
     def __init__(self, qp: FilterQP, flavour: Flavour) -> None:
@@ -38,7 +42,7 @@ class CompiledQP:
         self._symbols = (*qp.model.states, *(s for term in qp.terms for s in term.symbols))
         self._low: Sequence[Any] = constants(qp.low) if arrays else qp.low
         self._high: Sequence[Any] = constants(qp.high) if arrays else qp.high
-        self._weights = qp.weights
+        self.weights = qp.weights
         self._choose: Any = np.where if arrays else _choose
         self._larger: Any = np.maximum if arrays else max
         self._tolerance: Any = tolerances if arrays else tolerance
@@ -49,13 +53,14 @@ class CompiledQP:
         if qp.clf is not None:
             qp.clf.require_known(qp.model)
             weights = (qp.clf.input_weight, qp.clf.slack_weight)
-            input_weight, self._slack_weight = [float(qp.model.numeric(w)) for w in weights]
-            if not (0 < input_weight < math.inf and 0 < self._slack_weight < math.inf):
+            input_weight, slack_weight = [float(qp.model.numeric(w)) for w in weights]
+            if not (0 < input_weight < math.inf and 0 < slack_weight < math.inf):
                 raise ConfigurationError(
-                    f"the goal weighs inputs by {input_weight} and slack by {self._slack_weight};"
+                    f"the goal weighs inputs by {input_weight} and slack by {slack_weight};"
                     " give positive numbers"
                 )
-            self._weights = [input_weight] * self._m
+            self.weights = [input_weight] * self._m
+            self.goal_unit = math.sqrt(input_weight / slack_weight)
 
     def _with_terms(self, x: Sequence[Any]) -> Sequence[Any]:
         """Return the state, followed by the learned terms there."""
@@ -107,18 +112,21 @@ class CompiledQP:
     @cached_property
     def _values(self) -> Any:
         """Values that `_split` takes apart again."""
+        return self._compiled(self.expressions)
+
+    @property
+    def expressions(self) -> list[Any]:
+        """Expressions of the values that `_split` takes apart."""
         p = self._qp
         expressions = [e for c in p.constraints for e in (*c.coefficient, c.offset)]
         if p.clf is not None:
             growth, along = p.clf.growth(p.model)
             expressions += [growth, *along]
         expressions += [_beyond_rounding(p.constraints[i].chain[0]) for i in self._reciprocal]
-        return self._compiled(
-            [
-                *expressions,
-                *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ()),
-            ]
-        )
+        return [
+            *expressions,
+            *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ()),
+        ]
 
     @cached_property
     def _demands(self) -> dict[int, Any]:

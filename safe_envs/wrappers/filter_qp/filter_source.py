@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source, formulas
-from safe_envs.errors import NotCompilableError
+from safe_envs.compiled.formulas import Source
+from safe_envs.wrappers.filter_qp.array_decision import ArrayDecision
+from safe_envs.wrappers.filter_qp.decision_text import Body, Values
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 
 
-def unfiltered_source() -> Source:
-    """Return the function `decide` of `safe_envs.compiled.slots` that lets every input pass."""
-    return Source("def decide(x, u, data, work):\n    return u, u, False, True, (0.0,), 0, True\n")
+def unfiltered_source(m: int) -> Source:
+    """Return the function `decide` of `safe_envs.compiled.slots` that lets every input pass.
+
+    Args:
+        m: number of inputs.
+    """
+    action = "".join(f"u[{j}], " for j in range(m))
+    return Source(
+        f"def decide(x, u, data, work):\n    return ({action}), u, False, True, (0.0,), 0, True\n"
+    )
 
 
 def filter_source(qp: FilterQP, data: Data) -> Source:
@@ -22,28 +30,23 @@ def filter_source(qp: FilterQP, data: Data) -> Source:
         data: receives its numbers.
 
     Raises:
-        NotCompilableError: There is no kernel for such a QP.
+        NotCompilableError: No method for one state at a time solves such a QP.
     """
-    if len(qp.constraints) > 1 or qp.model.m > 1 or qp.terms or not qp.plain:
-        raise NotCompilableError("this filter has no kernel yet")
-    return _one_scalar_constraint(qp, data)
+    only = qp.constraints[0] if len(qp.constraints) == 1 else None
+    if only and qp.model.m == 1 and qp.plain and only.uncertainty is None:
+        return _scalar_decision(qp, data)
+    return ArrayDecision(qp, data).source()
 
 
-def _one_scalar_constraint(qp: FilterQP, data: Data) -> Source:
-    (constraint,) = qp.constraints
-    values = formulas(
-        "filter_constraint",
-        {"x": qp.model.states},
-        [qp.model.numeric(e) for e in (*constraint.coefficient, constraint.offset)],
-        data,
+def _scalar_decision(qp: FilterQP, data: Data) -> Source:
+    values, bounds = Values(qp, data), data.add([qp.low[0], qp.high[0]])
+    body = Body(data)
+    body.add(
+        *values.lines,
+        "action, margin, active, feasible = project_scalar("
+        f"values[0], values[1], u[0], data[{bounds}], data[{bounds + 1}])",
+        "slack = 0.0 if feasible else -margin",
+        "return (action,), u, active, feasible, (slack,), 0, isfinite(margin)",
     )
-    low = data.add([qp.low[0], qp.high[0]])
-    return values + Source(
-        "def decide(x, u, data, work):\n"
-        "    a, b = filter_constraint(x, data)\n"
-        "    action, margin, active, feasible ="
-        f" project_scalar(a, b, u[0], data[{low}], data[{low + 1}])\n"
-        "    slack = 0.0 if feasible else -margin\n"
-        "    return (action,), u, active, feasible, (slack,), 0, isfinite(margin)\n",
-        (project_scalar,),
-    )
+    body.uses.append(project_scalar)
+    return values.source + body.source()

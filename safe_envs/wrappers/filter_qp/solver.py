@@ -149,7 +149,7 @@ class FilterQPSolver(CompiledQP):
                 for rj, aj in zip(rise, self._over_largest(a[i]), strict=True)
             ]
         rise = self._over_largest(rise)
-        steepness = sum([rj * rj / wj for rj, wj in zip(rise, self._weights, strict=True)])
+        steepness = sum([rj * rj / wj for rj, wj in zip(rise, self.weights, strict=True)])
         ends = list(zip(self._low, self._high, strict=True))
         span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
         far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
@@ -157,7 +157,7 @@ class FilterQPSolver(CompiledQP):
             self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj))
             for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)
         ]
-        return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self._weights, strict=True)]
+        return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self.weights, strict=True)]
 
     def _over_largest(self, entries: Sequence[Any]) -> list[Any]:
         """Return entries over the largest of their sizes, whose inverse may overflow."""
@@ -184,10 +184,10 @@ class FilterQPSolver(CompiledQP):
                 return [action], list(margin), list(active), feasible
             a, b = self._on_the_safe_side(a, b, forms)
         if not goal:
-            return self._project(a, b, u, self._low, self._high, self._weights, p.priorities)
-        # The goal's slack d = unit e, in a unit in which it weighs as much as an input: its square
-        # would overflow before d does. Twice the most that the input bounds can make d always meets
-        # the goal's constraint, also after rounding.
+            return self._project(a, b, u, self._low, self._high, self.weights, p.priorities)
+        # The goal's slack is d = unit e, since the square of d would overflow before d does. Twice
+        # the most that the input bounds can make d always meets the goal's constraint, also after
+        # rounding.
         growth, along = goal[0], goal[1:]
         most = growth + sum(
             [
@@ -195,11 +195,11 @@ class FilterQPSolver(CompiledQP):
                 for bj, lo, hi in zip(along, self._low, self._high, strict=True)
             ]
         )
-        unit = math.sqrt(self._weights[0] / self._slack_weight)
+        unit = self.goal_unit
         rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
         low = (*self._low, 0.0)
         high = (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
-        w, priorities = (*self._weights, self._weights[0]), [*p.priorities[: len(a)], 1.0]
+        w, priorities = (*self.weights, self.weights[0]), [*p.priorities[: len(a)], 1.0]
         action, margin, active, _ = self._project(
             rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
         )
@@ -216,7 +216,7 @@ class FilterQPSolver(CompiledQP):
         """Return affine constraints that are met only where the uncertain ones are."""
         a, b = list(a), list(b)
         for i, form in forms.items():
-            slopes, constant = self._planes[i] if i in self._planes else self._plane(form)
+            slopes, constant = self.planes[i] if i in self.planes else self._plane(form)
             a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
             b[i] = b[i] - constant
         return a, b
@@ -232,7 +232,7 @@ class FilterQPSolver(CompiledQP):
         return majorant(q, self._qp.low, self._qp.high)
 
     @cached_property
-    def _planes(self) -> dict[int, tuple[list[Any], Any]]:
+    def planes(self) -> dict[int, tuple[list[Any], Any]]:
         """Planes that are the same at every state."""
         forms = {i: self._qp.constraints[i].uncertainty or () for i in self._uncertain}
         return {
@@ -261,7 +261,7 @@ class FilterQPSolver(CompiledQP):
             # So that squares neither overflow nor vanish.
             unit = self._choose(size > 0.0, size, 1.0)
             square = sum(
-                [p * p / wj for p, wj in zip([aj / unit for aj in ai], self._weights, strict=True)]
+                [p * p / wj for p, wj in zip([aj / unit for aj in ai], self.weights, strict=True)]
             )
             distance = -(_dot(ai, u) + bi) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
             if i in inside:

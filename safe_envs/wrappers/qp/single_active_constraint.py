@@ -64,5 +64,6 @@ def project_arrays(
         u[:, solved] = at[:, allowed]
         margin[:, solved] = reached[:, allowed]
         active[:, solved] = (reached <= rounding)[:, allowed]
+        active[i, solved] = True  # whatever the rounding of a long way there left of its margin
         left = np.setdiff1d(left, solved, assume_unique=True)
     return (u, margin, active, feasible), left

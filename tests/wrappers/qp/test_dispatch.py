@@ -211,3 +211,14 @@ def test_rows_that_contradict_are_not_handed_to_the_general_solver(gap, monkeypa
     np.testing.assert_allclose(u, [[-gap / 4, -gap / 4, 5.0]], rtol=1e-12)
     np.testing.assert_allclose(margin, [[-1.5 * gap, -gap]], rtol=1e-12)
     assert not feasible.any()
+
+
+def test_a_constraint_that_moves_the_action_is_active_however_far_the_proposal():
+    rng = np.random.default_rng(5)
+    a, b, v, low, high, w = random_batch(rng, 200, 2, 3)
+    _, margin, active, feasible = solve(a, b, 1e3 * v, low, high, w)
+    inside = np.clip(1e3 * v, low, high)
+    missed = (np.einsum("nij,nj->ni", a, inside) + b < 0.0).any(axis=1)
+    assert np.count_nonzero(missed & feasible) > 50
+    assert active[missed].any(axis=1).all()
+    assert np.all(margin[feasible] > -1e-12)

@@ -1,0 +1,285 @@
+"""A filter's decision with its constraints in arrays, as the text of a compiled program."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source
+from safe_envs.errors import NotCompilableError
+from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
+from safe_envs.wrappers.filter_qp.decision_text import Body, Values
+from safe_envs.wrappers.filter_qp.qp import FilterQP
+from safe_envs.wrappers.qp.kernels.interval import project_interval, work_of_interval
+from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
+from safe_envs.wrappers.qp.kernels.one_constraint import (
+    project_one_constraint,
+    row_margin,
+    row_tolerance,
+    work_of_one_constraint,
+)
+from safe_envs.wrappers.qp.kernels.plane import project_plane, work_of_plane
+from safe_envs.wrappers.qp.kernels.second_order import project_second_order, work_of_second_order
+
+
+class ArrayDecision:
+    """Writes `decide` as `FilterQPSolver.solve` decides; what a QP has not leaves no statement.
+
+    The statements name these arrays, for k constraints on m inputs and with one more of both for a
+    goal: `a` and `b` as the conditions say, `asked` for b less what is asked for, `rows` and
+    `offsets` of the QP, `inside` with 0 for conditions outside their domain.
+
+    Args:
+        qp: the QP.
+        data: receives its numbers.
+
+    Raises:
+        NotCompilableError: No method for one state at a time solves such a QP.
+    """
+
+    def __init__(self, qp: FilterQP, data: Data) -> None:
+        self._qp = qp
+        self._k, self._m, self._goal = len(qp.constraints), qp.model.m, int(qp.clf is not None)
+        constraints = list(enumerate(qp.constraints))
+        self._reciprocal = [i for i, c in constraints if c.demand is not None]
+        self._sampled = [i for i, c in constraints if c.change is not None]
+        self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
+        self._exact = bool(self._uncertain) and self._m == 1 and not self._goal
+        self._method, self._room = _method(
+            self._k + self._goal, self._m + self._goal, uncertain=self._exact
+        )
+        self._values, self._body = Values(qp, data), Body(data)
+        self._single = self._k == 1 and qp.plain
+        width = self._m + 1
+        self._a = [[f"values[{i * width + j}]" for j in range(self._m)] for i in range(self._k)]
+        self._b = [f"values[{i * width + self._m}]" for i in range(self._k)]
+        self._growth = self._k * width
+        self._h = self._growth + self._goal * width
+        self._forms = self._h + len(self._reciprocal)
+        self._finite: list[str] = []
+
+    def source(self) -> Source:
+        """Return the function, and those that it calls."""
+        body, m, size = self._body, self._m + self._goal, self._k + self._goal
+        body.add(*self._values.lines)
+        body.table("a", self._a)
+        body.vector("b", self._b)
+        if not self._single:
+            self._finite.append(" + ".join([*self._b, *(e for row in self._a for e in row)]))
+        for name, count in (("action", m), ("margin", size), ("active", size)):
+            body.room(name, count)
+        body.room("scratch", self._room)
+        self._bounds()
+        self._wish()
+        self._domains()
+        self._rows()
+        self._minimise()
+        if self._sampled:
+            self._sample()
+            self._minimise()
+        self._leave_domains()
+        self._answer()
+        return self._values.source + body.source()
+
+    def _bounds(self) -> None:
+        """Write the constants of the QP."""
+        qp, goal, weights = self._qp, self._goal, self._values.solver.weights
+        self._body.constants("low", [*qp.low, 0.0][: self._m + goal])
+        self._body.constants("w", [*weights, weights[0]][: self._m + goal])
+        self._body.constants("priority", [*qp.priorities, 1.0][: self._k + goal])
+        if not goal:
+            self._body.constants("high", qp.high)
+
+    def _wish(self) -> None:
+        """Write what the constraints change: the given input, or the best one of the goal."""
+        body, m, goal = self._body, self._m, self._growth
+        if not self._goal:
+            body.vector("proposed", [f"u[{j}]" for j in range(m)])
+            if self._reciprocal:
+                body.vector("aim", [f"u[{j}]" for j in range(m)])
+            return
+        low, high, unit = map(
+            body.number, (self._qp.low[0], self._qp.high[0], self._values.solver.goal_unit)
+        )
+        growth, along = f"values[{goal}]", f"values[{goal + 1}]"
+        self._finite.append(f"{growth} + {along}")
+        body.add(f"most = {growth} + max({along} * {low}, {along} * {high})")
+        body.vector("high", [high, f"2.0 * most / {unit} if most > 0.0 else 1.0"])
+        body.table("goal_row", [[f"-{along}", unit]])
+        body.vector("goal_offset", [f"-{growth}"])
+        body.vector("aim", ["0.0 * u[0]"] * 2)
+        body.room("proposed", 2)
+        body.room("goal_scratch", work_of_one_constraint(1, 2))
+        body.call(
+            project_one_constraint,
+            "goal_row, goal_offset, aim, low, high, w, priority, proposed, margin, active,"
+            " goal_scratch",
+        )
+
+    def _domains(self) -> None:
+        """Write which conditions are inside their domain, and aim outwards where one is not."""
+        body = self._body
+        if self._single:
+            return
+        h = {i: f"values[{self._h + place}]" for place, i in enumerate(self._reciprocal)}
+        body.vector(
+            "inside",
+            [f"1.0 if {h[i]} > 0.0 else 0.0" if i in h else "1.0" for i in range(self._k)],
+        )
+        if h:
+            body.room("rise", self._m)
+            body.call(aim_outwards, f"{self._m}, a, inside, low, high, w, rise, aim")
+
+    def _rows(self) -> None:
+        """Write the QP's constraints."""
+        body, k = self._body, self._k
+        asked, rows = list(self._b), [list(row) for row in self._a]
+        for i in self._reciprocal:
+            demand = self._values.call(f"filter_demand_{i}", [self._qp.constraints[i].demand])
+            asked[i] = f"{asked[i]} - {demand}[0] if inside[{i}] > 0.0 else 0.0"
+            rows[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in rows[i]]
+        changed = self._reciprocal or self._sampled
+        self._asked = "asked" if changed else "b"
+        if changed:
+            body.vector("asked", asked)
+        self._offsets = [f"{self._asked}[{i}]" for i in range(k)]
+        for place, i in enumerate(self._uncertain):
+            self._form(place, i, rows)
+        if self._exact:
+            forms = {i: place for place, i in enumerate(self._uncertain)}
+            entries = [
+                [
+                    f"values[{self._forms + 3 * forms[i] + e}]" if i in forms else "0.0"
+                    for e in range(3)
+                ]
+                for i in range(k)
+            ]
+            body.table("form", entries)
+        if self._goal:
+            rows = [*([*row, "0.0"] for row in rows), ["goal_row[0, 0]", "goal_row[0, 1]"]]
+            self._offsets.append("goal_offset[0]")
+        self._in_place = rows == self._a
+        if not self._in_place:
+            body.table("rows", rows)
+            body.room("offsets", k + self._goal)
+
+    def _form(self, place: int, i: int, rows: list[list[str]]) -> None:
+        """Take the uncertainty of a constraint into account: as it is, or as a plane above it.
+
+        Args:
+            place: its number among the uncertain ones.
+            i: its number.
+            rows: coefficients of all, which are changed.
+        """
+        body, m = self._body, self._m
+        count = (m + 1) * (m + 2) // 2
+        form = [f"values[{self._forms + place * count + e}]" for e in range(count)]
+        self._finite.append(" + ".join(form))
+        if self._exact:
+            return
+        planes = self._values.solver.planes
+        if i in planes:
+            slopes, constant = planes[i]
+            slopes, constant = [body.number(s) for s in slopes], body.number(constant)
+        else:
+            entry = dict(zip(pairs(m), form, strict=True))
+            square = range(m + 1)
+            body.table(f"form_{i}", [[entry[min(j, e), max(j, e)] for e in square] for j in square])
+            body.room(f"slopes_{i}", m)
+            body.room(f"corners_{i}", work_of_majorant(m))
+            constant = f"constant_{i}"
+            body.call(
+                majorant_plane,
+                f"form_{i}, vector_view(low, 0, {m}), vector_view(high, 0, {m}), slopes_{i},"
+                f" corners_{i}",
+                f"{constant} = ",
+            )
+            slopes = [f"slopes_{i}[{j}]" for j in range(m)]
+        rows[i] = [f"{entry} - {slope}" for entry, slope in zip(rows[i], slopes, strict=True)]
+        self._offsets[i] += f" - {constant}"
+
+    def _minimise(self) -> None:
+        """Write the solution of the QP."""
+        body, rows, offsets = self._body, "a", self._asked
+        if not self._in_place:
+            rows, offsets = "rows", "offsets"
+            body.fill("offsets", self._offsets)
+        form = ", form" if self._exact else ""
+        aim = "aim" if self._goal or self._reciprocal else "proposed"
+        arguments = f"{rows}, {offsets}{form}, {aim}, low, high, w, priority, action, margin"
+        body.call(self._method, f"{arguments}, active, scratch", "feasible = ")
+        if self._goal:
+            # The goal's constraint, which can always be met, has no say in that, nor has its
+            # rounding.
+            met = [
+                f"margin[{i}] >= -row_tolerance(rows, {i}, offsets[{i}], action)"
+                for i in range(self._k)
+            ]
+            body.add(f"feasible = {' and '.join(met)}")
+            body.uses.append(row_tolerance)
+
+    def _sample(self) -> None:
+        """Write how far the constraints fall while the input is held."""
+        qp, body = self._qp, self._body
+        dt = body.number(qp.dt)
+        held = "".join(f"action[{j}], " for j in range(self._m))
+        for i in self._sampled:
+            change = self._values.call(
+                f"filter_change_{i}", [qp.constraints[i].change], f"({held})"
+            )
+            fall = f"asked[{i}] -= {dt} * max(-{change}[0], 0.0)"
+            body.add(f"if inside[{i}] > 0.0:\n        {fall}" if i in self._reciprocal else fall)
+
+    def _leave_domains(self) -> None:
+        """Write what conditions outside their domain make of the decision."""
+        body = self._body
+        for i in self._reciprocal:
+            body.uses.append(row_margin)
+            body.add(
+                f"if inside[{i}] == 0.0:",
+                f"    margin[{i}] = row_margin(a, {i}, b[{i}], vector_view(action, 0, {self._m}))",
+                f"    active[{i}] = 1.0",
+                "    feasible = False",
+            )
+
+    def _answer(self) -> None:
+        """Write the decision."""
+        body, k, m = self._body, self._k, self._m
+        action = [f"action[{j}]" for j in range(m)]
+        margin = [f"margin[{i}]" for i in range(k)]
+        self._finite.append(" + ".join(margin if self._single else [*action, *margin]))
+        cause = "0"
+        if not self._single:
+            cause = "cause"
+            arguments = f"{m}, a, {self._asked}, proposed, w, inside, active"
+            body.call(furthest_constraint, arguments, "cause = ")
+        slack = "".join(f"0.0 if feasible else max(-{g}, 0.0), " for g in margin)
+        proposed = "".join(f"proposed[{j}], " for j in range(m)) if self._goal else "u"
+        body.add(
+            f"acts = {' or '.join(f'active[{i}] > 0.0' for i in range(k))}",
+            f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}",
+            f"action_given = ({''.join(f'{entry}, ' for entry in action)})",
+            f"slack = ({slack})",
+            f"return action_given, {f'({proposed})' if self._goal else 'u'}, acts, feasible, slack,"
+            f" {cause}, sound",
+        )
+
+
+def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int]:
+    """Return the kernel for k constraints on m inputs, and the scratch entries that it needs."""
+    if uncertain:
+        return project_second_order, work_of_second_order(k, m)
+    if k == 1:
+        return project_one_constraint, work_of_one_constraint(k, m)
+    if m == 1:
+        return project_interval, work_of_interval(k, m)
+    if m == 2:
+        return project_plane, work_of_plane(k, m)
+    raise NotCompilableError(f"{k} constraints on {m} inputs need a solver")
+
+
+def pairs(m: int) -> list[tuple[int, int]]:
+    """Return the places of the entries of an uncertainty in its symmetric matrix."""
+    return list(itertools.combinations_with_replacement(range(m + 1), 2))

@@ -1,0 +1,124 @@
+"""The text of a filter's decision: the formulas that it calls, and its statements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
+from safe_envs.wrappers.filter_qp.qp import FilterQP
+from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
+
+
+class Values:
+    """The formulas of a QP in a program.
+
+    Args:
+        qp: the QP.
+        data: receives their numbers.
+
+    Attributes:
+        solver: whose `expressions` they are.
+        lines: statements that evaluate them, and name the results `values`.
+    """
+
+    def __init__(self, qp: FilterQP, data: Data) -> None:
+        self._model, self._data = qp.model, data
+        self._symbols: dict[str, Sequence[sp.Symbol]] = {"x": qp.model.states}
+        self._text = Source("")
+        self.solver = FilterQPSolver(qp, "floats")
+        self.lines: list[str] = []
+        calls = []
+        for i, term in enumerate(qp.terms):
+            name = f"filter_terms_{i}"
+            self._text += term.source(name, data)
+            calls.append(f"{name}(x, data, work)")
+        if calls:
+            self._symbols["terms"] = tuple(s for term in qp.terms for s in term.symbols)
+            self.lines.append(f"terms = {' + '.join(calls)}")
+        self.lines.append(f"values = {self.call('filter_values', self.solver.expressions)}")
+
+    @property
+    def source(self) -> Source:
+        """Functions that are called."""
+        return self._text
+
+    def call(self, name: str, expressions: Iterable[Any], inputs: str = "") -> str:
+        """Add a function of the state, and return a call of it, which gives a tuple.
+
+        Args:
+            name: of the function.
+            expressions: what it returns.
+            inputs: text of a tuple of inputs, where the function takes some.
+        """
+        numbers = [self._model.numeric(e) for e in expressions]
+        arguments, given = dict(self._symbols), list(self._symbols)
+        if inputs:
+            arguments["u"] = self._model.inputs
+            given.append(inputs)
+        self._text += formulas(name, arguments, numbers, self._data)
+        return f"{name}({', '.join(given)}, data)"
+
+
+class Body:
+    """The statements of `decide`, and the arrays that they name.
+
+    Args:
+        data: receives constant arrays.
+
+    Attributes:
+        uses: kernels that are called.
+    """
+
+    def __init__(self, data: Data) -> None:
+        self._data = data
+        self._lines: list[str] = []
+        self._work = 0
+        self.uses: list[Callable[..., Any]] = []
+
+    def source(self) -> Source:
+        """Return the function."""
+        text = "".join(f"    {line}\n" for line in self._lines)
+        return Source(f"def decide(x, u, data, work):\n{text}", tuple(self.uses), self._work)
+
+    def add(self, *lines: str) -> None:
+        """Append statements."""
+        self._lines += lines
+
+    def constants(self, name: str, numbers: Sequence[float]) -> None:
+        """Name an array of constant numbers."""
+        self.add(f"{name} = vector_view(data, {self._data.add(numbers)}, {len(numbers)})")
+
+    def number(self, value: float) -> str:
+        """Return the text of a constant number."""
+        return f"data[{self._data.add([value])}]"
+
+    def call(self, kernel: Callable[..., Any], arguments: str, before: str = "") -> None:
+        """Append the call of a kernel, after the beginning of a statement."""
+        self.uses.append(kernel)
+        self.add(f"{before}{kernel.__name__}({arguments})")
+
+    def room(self, name: str, count: int) -> None:
+        """Name a scratch array of so many entries."""
+        self.add(f"{name} = vector_view(work, {self._work}, {count})")
+        self._work += count
+
+    def vector(self, name: str, entries: Sequence[str]) -> None:
+        """Name an array of given entries."""
+        self.room(name, len(entries))
+        self.fill(name, entries)
+
+    def fill(self, name: str, entries: Sequence[str]) -> None:
+        """Write to the entries of an array."""
+        self.add(*(f"{name}[{i}] = {entry}" for i, entry in enumerate(entries)))
+
+    def table(self, name: str, rows: Sequence[Sequence[str]]) -> None:
+        """Name an array of given rows."""
+        width = len(rows[0])
+        self.add(f"{name} = table_view(work, {self._work}, {len(rows)}, {width})")
+        self._work += len(rows) * width
+        for i, row in enumerate(rows):
+            self.add(*(f"{name}[{i}, {j}] = {entry}" for j, entry in enumerate(row)))

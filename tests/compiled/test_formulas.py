@@ -1,0 +1,94 @@
+"""Formulas in programs: the numbers of `compile_function`, as plain Python and compiled."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
+from safe_envs.compiled.program import Program
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.printers import SUPPORTED
+from safe_envs.errors import SystemDefinitionError
+from tests.compiled import kernels
+
+x, y, t = sp.symbols("x y t", real=True)
+POINTS = [(0.3, 1.7, 0.5), (0.9, 1.1, 2.0), (0.2, 2.9, -1.0)]
+
+
+def program(expressions: list, data: Data) -> Program:
+    source = formulas("values_of", {"values": (x, y), "time": t}, expressions, data)
+    values = "values_of((values[0], values[1]), values[2], values[3:])"
+    call = f"def reward_of(values):\n    return {values}[0]\n"
+    return Program("formulas", [kernels.read], source + Source(call))
+
+
+def read(functions: dict, data: Data, point: tuple) -> float:
+    return functions["read"](np.array([*point, *data.array()]))
+
+
+def applied(function: type) -> list:
+    """Expressions of a function with arguments in its domain, and with numbers of every kind."""
+    if function is sp.Piecewise:
+        return [sp.Piecewise((x / 3, x < 0.5), (sp.sqrt(y), sp.And(x < 0.7, t > 0)), (t, True))]
+    two = function in (sp.atan2, sp.Mod)
+    beyond = function in (sp.acosh, sp.asec, sp.acsc)
+    first = function(x, y) if two else function(y if beyond else x)
+    return [first * 2 + sp.Rational(1, 3) * y**3 + sp.Float(0.1) * t * first**2 + sp.pi]
+
+
+EXPRESSIONS = [
+    *(e for function in SUPPORTED for e in applied(function)),
+    sp.Max(x, y, t) + sp.Min(x * y, t),
+    x**9 + y**-3 + (1 + t**2) ** sp.Rational(-3, 2) + x**y,
+    sp.Integer(10) ** 30 * x + sp.Integer(2) ** 40,
+    sp.Integer(3),
+]
+
+
+def check(functions_of) -> None:
+    for expression in EXPRESSIONS:
+        data = Data()
+        functions = functions_of(program([expression], data))
+        expected = compile_function((x, y, t), [expression], "floats")
+        for point in POINTS:
+            assert read(functions, data, point) == pytest.approx(expected(*point)[0], rel=1e-14)
+
+
+def test_plain_programs_compute_formulas() -> None:
+    check(Program.plain)
+
+
+@pytest.mark.oracle
+def test_compiled_programs_compute_formulas() -> None:
+    check(Program.compiled)
+
+
+def test_numbers_are_data_and_not_text() -> None:
+    found = []
+    for number in (0.5, 12.25):
+        data = Data()
+        text = program([sp.Float(number) * sp.sin(x) + sp.Float(number + 1) * y], data).text
+        found.append((text, data.array().tolist()))
+    assert found[0][0] == found[1][0]
+    assert sorted(found[0][1]) == [0.5, 1.5]
+    assert sorted(found[1][1]) == [12.25, 13.25]
+
+
+def test_what_has_no_number_is_refused_as_elsewhere() -> None:
+    for expression in (sp.gamma(x), x + sp.Symbol("z"), sp.I * x):
+        with pytest.raises(SystemDefinitionError):
+            formulas("f", {"values": (x, y)}, [expression], Data())
+
+
+def test_a_function_returns_floats_and_reads_what_it_needs() -> None:
+    source = formulas("f", {"values": (x, y), "time": t}, [1, 2 * y], Data())
+    assert "values[0]" not in source.text
+    assert "time\n" not in source.text
+    names: dict = dict(vars(math))
+    exec(source.text, names)
+    assert names["f"]((math.nan, 3.0), math.nan, np.array([1.0])) == (1.0, 6.0)

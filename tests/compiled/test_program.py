@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safe_envs.compiled import cache, program
+from safe_envs.compiled.cache import VARIABLE, cache_folder, forget_old_programs
+from safe_envs.compiled.engine import compiled_or_none, require_engine
+from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.program import Program
+from safe_envs.errors import ConfigurationError, NotCompilableError, SystemDefinitionError
+from tests.compiled import kernels, other_kernels
+
+HALF = "def reward_of(values):\n    return 0.5 * values[0]\n"
+VALUES = np.array([1.0, 2.0, 4.0])
+
+
+def small(text: str = HALF) -> Program:
+    return Program("a sum", [kernels.total_reward], Source(text))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    program._loaded.cache_clear()
+    return tmp_path / "cache" / "compiled"
+
+
+def test_a_program_holds_what_is_reached_and_nothing_else() -> None:
+    text = small().text
+    assert "def total_reward" in text
+    assert "def scaled" in text
+    assert "FACTOR = 2.0" in text
+    assert "root" not in text
+    assert "sqrt" not in text
+    assert "philox_block" not in text
+    assert text.count("@entry") == 1
+    assert small().plain()["total_reward"](VALUES) == 7.0
+
+
+def test_generated_functions_bring_the_kernels_that_they_use() -> None:
+    text = "def reward_of(values):\n    return root(values[0]) + floor(values[0])\n"
+    found = Program("roots", [kernels.total_reward], Source(text, (kernels.root,))).plain()
+    assert found["total_reward"](VALUES) == pytest.approx(2.0 * (np.sqrt(VALUES) + VALUES).sum())
+
+
+@pytest.mark.parametrize(
+    ("text", "uses", "words"),
+    [
+        ("def another(values):\n    return 0.0\n", (), "'reward_of', which is missing"),
+        (HALF + HALF, (), "generated twice"),
+        (HALF, (other_kernels.scaled,), "two kernels are called 'scaled'"),
+    ],
+)
+def test_programs_that_do_not_fit_together(text: str, uses: tuple, words: str) -> None:
+    with pytest.raises(SystemDefinitionError, match=words):
+        Program("a sum", [kernels.total_reward], Source(text, uses))
+
+
+def test_compiled_programs_are_kept_and_a_changed_one_is_another(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, "safe_envs"):
+        assert small().compiled()["total_reward"](VALUES) == 7.0
+    assert [each.message for each in caplog.records] == [
+        "compiling a sum, which takes some seconds once"
+    ]
+    assert stat.S_IMODE(next(folder.iterdir()).stat().st_mode) == 0o700
+    caplog.clear()
+    program._loaded.cache_clear()
+    found = small().compiled()["total_reward"]
+    assert found(VALUES) == found(VALUES) == 7.0
+    assert not caplog.records
+    assert small(HALF.replace("0.5", "1.0")).compiled()["total_reward"](VALUES) == 14.0
+    assert len(list(folder.iterdir())) == 2
+    assert len(caplog.records) == 1
+
+
+def test_a_damaged_program_is_compiled_again(folder: Path) -> None:
+    small().compiled()["total_reward"](VALUES)
+    for kept in folder.glob("*/__pycache__/*.nb*"):
+        kept.write_bytes(b"damaged")
+    program._loaded.cache_clear()
+    assert small().compiled()["total_reward"](VALUES) == 7.0
+    for kept in folder.glob("*/program.py"):
+        kept.write_text("raise SystemExit")
+    program._loaded.cache_clear()
+    assert small().compiled()["total_reward"](VALUES) == 7.0
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs rights of files as on Unix")
+def test_a_folder_that_others_write_to_is_not_used(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    assert cache_folder() is None
+    assert small().compiled()["total_reward"](VALUES) == 7.0
+    assert not list(folder.iterdir())
+
+
+def test_places_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "")
+    assert cache_folder() is None
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "file"))
+    assert cache_folder() is None
+    monkeypatch.delenv(VARIABLE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cache.sys, "platform", "linux")
+    assert cache_folder() == tmp_path / "safe-envs" / "compiled"
+
+
+def test_the_programs_used_last_remain(tmp_path: Path) -> None:
+    for i in range(70):
+        (tmp_path / str(i)).mkdir()
+        os.utime(tmp_path / str(i), (i, i))
+    forget_old_programs(tmp_path)
+    assert {each.name for each in tmp_path.iterdir()} == {str(i) for i in range(6, 70)}
+
+
+def test_compiled_natives_give_what_plain_ones_give(folder: Path) -> None:
+    numbers = [0.1, -3e-46, 1e300, -1e39, np.pi, np.inf]
+    results = []
+    for functions in (
+        (natives := Program("words", [kernels.words_of], Source(""))).plain,
+        (natives.compiled),
+    ):
+        out, singles = np.zeros(64), np.array(numbers)
+        functions()["words_of"](out, singles, np.uint64(2**64 - 3))
+        results.append((out, singles))
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    np.testing.assert_array_equal(results[0][1], results[1][1])
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(results[0][1], np.array(numbers, np.float32).astype(float))
+
+
+def _in_another_process(values: np.ndarray) -> float:
+    return small().compiled()["total_reward"](values)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_other_processes_use_what_is_kept(folder: Path, method: str) -> None:
+    if method not in multiprocessing.get_all_start_methods():
+        pytest.skip("not on this system")
+    assert _in_another_process(VALUES) == 7.0
+    with multiprocessing.get_context(method).Pool(2) as pool:
+        assert pool.map(_in_another_process, [VALUES, 2.0 * VALUES]) == [7.0, 14.0]
+
+
+def test_engines_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def impossible() -> int:
+        raise NotCompilableError("the reason")
+
+    assert compiled_or_none("numpy", 1e9, lambda: 1) is None
+    assert compiled_or_none("auto", 1e3, lambda: 1) is None
+    assert compiled_or_none("auto", 1e9, lambda: 1) == 1
+    assert compiled_or_none("auto", 1e9, impossible) is None
+    with pytest.raises(NotCompilableError, match="the reason"):
+        compiled_or_none("compiled", 1.0, impossible)
+    with pytest.raises(ConfigurationError, match="did you mean 'numpy'"):
+        require_engine("nmpy")
+    monkeypatch.setattr(program.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigurationError, match=r"needs Numba.*safe-envs\[fast\]"):
+        small().compiled()

@@ -1,0 +1,57 @@
+"""The kernel of three and more inputs with one binding constraint against the dispatcher."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from safe_envs.wrappers.qp import single_active_constraint
+from safe_envs.wrappers.qp.kernels import single_active as kernel
+from tests.oracles.kernel_problems import KINDS, Problems, random_problems, reference, solve
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("k", "m"), [(2, 3), (3, 3), (2, 4)])
+def test_says_what_the_dispatcher_does_where_it_can(k, m, kind):
+    problems = random_problems(np.random.default_rng([k, m, KINDS.index(kind)]), 100, k, m, kind)
+    solved = []
+
+    def project(*arguments):
+        answer = kernel.project_single_active(*arguments)
+        solved.append(answer[0])
+        return answer[1]
+
+    found = solve(project, kernel.work_of_single_active(k, m), problems)
+    chosen = np.flatnonzero(solved)
+    assert chosen.size > (40 if kind in ("plain", "sizes", "far") else 10)
+    expected = reference(Problems(*[part[chosen] for part in problems[:6]], problems.priority))
+    assert expected.active.any(axis=1).sum() > 5
+    # A proposal 1e8 boxes away has its own rounding.
+    relative = 1e-7 if kind == "far" else 1e-11
+    np.testing.assert_allclose(found.u[chosen], expected.u, rtol=relative, atol=relative)
+    np.testing.assert_array_equal(found.active[chosen], expected.active)
+    np.testing.assert_array_equal(found.feasible[chosen], expected.feasible)
+    sizes = (np.abs(problems.a) @ np.abs(found.u)[:, :, None])[chosen, :, 0]
+    sizes += np.abs(problems.b[chosen])
+    assert np.all(np.abs(found.margin[chosen] - expected.margin) <= relative * sizes)
+
+
+def test_solves_all_that_the_batch_does():
+    for kind in ("plain", "flat", "integers"):
+        problems = random_problems(np.random.default_rng(3), 100, 3, 3, kind)
+        a, b, v, low, high, w, _ = problems
+        rows = list(a.transpose(1, 2, 0).copy())
+        flat = (a == 0.0).all(axis=2)
+        _, left = single_active_constraint.project_arrays(
+            rows, np.where(flat, np.maximum(b, 0.0), b).T.copy(), v.T, low.T, high.T, list(w.T)
+        )
+        buffers = np.empty(3), np.empty(3), np.empty(3)
+        work = np.full(kernel.work_of_single_active(3, 3), np.nan)
+        solved = [
+            kernel.project_single_active(
+                *[part[i] for part in problems[:6]], problems.priority, *buffers, work
+            )[0]
+            for i in range(100)
+        ]
+        assert np.flatnonzero(np.logical_not(solved)).tolist() == left.tolist()
+        assert left.size > 5
