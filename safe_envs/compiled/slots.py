@@ -113,13 +113,13 @@ def observation_within(observation: tuple[float, ...], data: np.ndarray) -> tupl
     raise NotImplementedError
 
 
-def state_of(row: np.ndarray) -> State:
-    """Return the state that the first entries of an array hold."""
+def state_at(table: np.ndarray, row: int) -> State:
+    """Return the state that the first entries of a row of a table hold."""
     raise NotImplementedError
 
 
-def input_of(row: np.ndarray) -> Input:
-    """Return the input that the first entries of an array hold."""
+def input_at(table: np.ndarray, row: int) -> Input:
+    """Return the input that the first entries of a row of a table hold."""
     raise NotImplementedError
 
 

@@ -6,7 +6,8 @@ from math import inf, isfinite
 
 import numpy as np
 
-from safe_envs.compiled.draws import NOISE, draw_start, fill_normals, store_row
+from safe_envs.compiled.draws import NOISE, draw_start, fill_normals
+from safe_envs.compiled.plain_natives import vector_view
 from safe_envs.compiled.slots import (
     Input,
     State,
@@ -15,7 +16,7 @@ from safe_envs.compiled.slots import (
     decide,
     has_ended,
     has_left,
-    input_of,
+    input_at,
     is_finite,
     measure,
     observation_of,
@@ -24,7 +25,7 @@ from safe_envs.compiled.slots import (
     reward_of,
     scaled_input,
     smallest_barrier,
-    state_of,
+    state_at,
 )
 
 DONE = 0
@@ -102,7 +103,7 @@ def step_batch(  # noqa: PLR0913
         keys: the two words of each env's key.
         episodes: number of each env's episode since its seed.
         chunks: number of the chunk of noise of each env, -1 without one.
-        noise: that chunk.
+        noise: those chunks, one after the other.
         uniforms: scratch array, with an entry for each uniform of the start distribution.
         work: scratch array.
         data: numbers of the program.
@@ -125,6 +126,7 @@ def step_batch(  # noqa: PLR0913
         What happened, one of the constants of this module.
     """
     status = DONE
+    width = PERIODS * channels
     for i in range(len(restarts)):
         u = resting_input(data)
         if restarts[i]:
@@ -139,16 +141,16 @@ def step_batch(  # noqa: PLR0913
             if filtered:
                 rest_filter(i, u, rest, inputs, tallies, choices, flags)
             if stepping:
-                store_row(inputs[i, : len(u)], scaled_input(input_of(actions[i]), data))
+                store_entries(inputs, i, 0, scaled_input(input_at(actions, i), data))
         else:
-            x = state_of(states_before[i])
+            x = state_at(states_before, i)
             states[i, len(x)] = states_before[i, len(x)]
             states[i, len(x) + 1] = states_before[i, len(x) + 1]
             period = counts_before[i, PERIOD]
             counts[i, STEPS] = counts_before[i, STEPS] + stepping
             counts[i, PERIOD] = period + stepping
             if stepping:
-                u = input_of(actions[i])
+                u = input_at(actions, i)
                 if not scaled:
                     for a in u:
                         if not isfinite(a):
@@ -160,15 +162,16 @@ def step_batch(  # noqa: PLR0913
                     )
                     if not sound:
                         return UNDEFINED_FILTER
-                store_row(inputs[i, : len(u)], u)
+                store_entries(inputs, i, 0, u)
                 place = 0
                 if channels:
                     place = (period % PERIODS) * channels
                     if chunks[i] != period // PERIODS:
                         chunks[i] = period // PERIODS
                         first = (period - period % PERIODS) * channels
-                        fill_normals(noise[i], first, episodes[i], NOISE, keys[i, 0], keys[i, 1])
-                x = advance(x, u, noise[i], place, data)
+                        ahead = vector_view(noise, i * width, width)
+                        fill_normals(ahead, first, episodes[i], NOISE, keys[i, 0], keys[i, 1])
+                x = advance(x, u, noise, i * width + place, data)
         time = counts[i, STEPS] * dt
         counted = stepping or restarts[i]
         if not read_state(
@@ -204,10 +207,10 @@ def filter_input(  # noqa: PLR0913
     for each in slacks:
         slack = max(slack, each)
     m = len(u)
-    store_row(inputs[i, m : 2 * m], proposed)
-    store_row(inputs[i, 2 * m : 3 * m], action)
+    store_entries(inputs, i, m, proposed)
+    store_entries(inputs, i, 2 * m, action)
     inputs[i, 3 * m] = slack
-    store_row(inputs[i, 3 * m + 1 :], slacks)
+    store_entries(inputs, i, 3 * m + 1, slacks)
     intervened = active and action != proposed
     tallies[i, INTERVENTIONS] = tallies_before[i, INTERVENTIONS] + intervened
     tallies[i, INFEASIBLE] = tallies_before[i, INFEASIBLE] + (not feasible)
@@ -261,7 +264,7 @@ def read_state(  # noqa: PLR0913
     h = smallest_barrier(barriers)
     cost = 1.0 if h < 0.0 else 0.0
     n = len(x)
-    store_row(states[i, :n], x)
+    store_entries(states, i, 0, x)
     h_min = states[i, n]
     if not h >= h_min:
         h_min = h
@@ -273,12 +276,25 @@ def read_state(  # noqa: PLR0913
     readings[i, COST] = cost
     readings[i, H_MIN] = h_min
     readings[i, EPISODE_COST] = episode_cost
-    store_row(readings[i, BARRIERS:], barriers)
+    store_entries(readings, i, BARRIERS, barriers)
     flags[VIOLATION, i] = h < 0.0
     flags[TERMINATED, i] = has_ended(values)
     if has_left(values):
-        store_row(observations[i], observation_within(observation_of(values), data))
+        store_entries(observations, i, 0, observation_within(observation_of(values), data))
     else:
-        store_row(observations[i], observation_of(values))
+        store_entries(observations, i, 0, observation_of(values))
     rewards[i] = reward_of(values)
     return is_finite(x, values)
+
+
+def store_entries(table: np.ndarray, row: int, first: int, values: tuple[float, ...]) -> None:
+    """Write a tuple to a row of a table.
+
+    Args:
+        table: to write to.
+        row: its row.
+        first: column of the first entry.
+        values: the entries.
+    """
+    for j in range(len(values)):
+        table[row, first + j] = values[j]

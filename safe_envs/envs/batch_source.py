@@ -10,7 +10,7 @@ from safe_envs.problem.problem import SafetyProblem
 
 
 def batch_source(problem: SafetyProblem, data: Data) -> Source:
-    """Return the functions of `safe_envs.compiled.slots` about rows, actions and observations.
+    """Return the functions of `safe_envs.compiled.slots` about tables, actions and observations.
 
     Args:
         problem: what to simulate.
@@ -20,8 +20,8 @@ def batch_source(problem: SafetyProblem, data: Data) -> Source:
     bounds = list(zip(space.low.tolist(), space.high.tolist(), strict=True))
     scales = list(zip(*center_and_half_width(problem), strict=True))
     return Source(
-        f"def state_of(row):\n    return ({_entries('row', problem.plant.n)})\n"
-        f"def input_of(row):\n    return ({_entries('row', len(scales))})\n"
+        f"def state_at(table, row):\n    return ({_entries(problem.plant.n)})\n"
+        f"def input_at(table, row):\n    return ({_entries(len(scales))})\n"
         "def scaled_input(action, data):\n"
         f"    return ({_calls('scaled_action', 'action', scales, data)})\n"
         "def observation_within(observation, data):\n"
@@ -30,8 +30,8 @@ def batch_source(problem: SafetyProblem, data: Data) -> Source:
     )
 
 
-def _entries(array: str, count: int) -> str:
-    return "".join(f"{array}[{i}], " for i in range(count))
+def _entries(count: int) -> str:
+    return "".join(f"table[row, {i}], " for i in range(count))
 
 
 def _calls(function: str, array: str, numbers: list[tuple[float, float]], data: Data) -> str:

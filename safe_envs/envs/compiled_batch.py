@@ -67,7 +67,7 @@ class CompiledBatch:
         self.shape = (n, len(problem.inputs))
         self.settings = (limit, problem.dt, self.channels)
         self.chunks = np.full(n, -1, dtype=np.int64)
-        self.noise = np.empty((n, kernel.PERIODS * self.channels))
+        self.noise = np.empty(n * kernel.PERIODS * self.channels)
         self.uniforms = np.empty(len(problem.starts[problem.start].uniforms))
         self.states = np.full((n, problem.plant.n + 2), np.nan)
         self.counts = np.zeros((n, 2), dtype=np.int64)

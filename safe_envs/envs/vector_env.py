@@ -137,13 +137,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Returns:
             The observations, float32 (num_envs, k), and the info.
         """
-        seeds = self._streams.for_each_env(seed)
-        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
-        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
-        observation, _, _, _, info = self._batch.begin(mask)
-        if self.viewer is not None:
-            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
-        return observation, with_masks(info, mask)
+        return self._restarted(self._batch, seed, options)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
@@ -191,6 +185,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Step with actions in [-1, 1], which a filter corrects; see `filtered`."""
         return self._told(stepper, stepper.step(actions, self._due()))
 
+    def reset_filtered(
+        self, stepper: BatchStepper, seed: Seeds = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
+        """Start episodes as `reset` does; the info has what the filter reports."""
+        return self._restarted(stepper, seed, options)
+
     def filtered(self, batch_filter: BatchFilter) -> BatchStepper | None:
         """Return what steps these envs with a filter in one compiled function.
 
@@ -227,6 +227,17 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _require_started(self) -> None:
         if not self.episodes.started:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
+
+    def _restarted(
+        self, stepper: _Stepper, seed: Seeds, options: dict[str, Any] | None
+    ) -> tuple[np.ndarray, Info]:
+        seeds = self._streams.for_each_env(seed)
+        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
+        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
+        observation, _, _, _, info = stepper.begin(mask)
+        if self.viewer is not None:
+            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
+        return observation, with_masks(info, mask)
 
     def _due(self) -> np.ndarray | None:
         """Return the envs whose coming step begins an episode; None for none."""

@@ -59,13 +59,15 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         gym.vector.VectorWrapper.__init__(self, env)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
-        self._tallies = np.zeros((self.num_envs, 2), dtype=np.int64)
         self._stepper = self._compiled() if env is inner else None
+        self._counted = _Counted(self.num_envs) if self._stepper is None else self._stepper
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
+        if self._stepper is not None:
+            return self._inner.reset_filtered(self._stepper, seed, options)
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
@@ -77,9 +79,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
-        counts = {
-            name: self._tallies[:, j].copy() for j, name in enumerate(_TALLIES)
-        }
+        counts = {name: self._counted.tallies[:, j].copy() for j, name in enumerate(_TALLIES)}
         return {**self._inner.snapshot(), **counts}
 
     def restore(
@@ -87,15 +87,12 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     ) -> None:
         """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
-        self._tallies = np.column_stack([snapshot[name] for name in _TALLIES])
+        self._counted.tallies = np.column_stack([snapshot[name] for name in _TALLIES])
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
         if self._stepper is not None:
-            self._stepper.tallies = self._tallies
-            found = self._inner.step_filtered(self._stepper, actions)
-            self._tallies = self._stepper.tallies
-            return found
+            return self._inner.step_filtered(self._stepper, actions)
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
         active = (
@@ -127,7 +124,9 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         for u, v in zip(decision.action[1:], nominal[1:], strict=True):
             differs |= u != v
         differs &= active
-        self._tallies = self._tallies + np.column_stack([differs, ~decision.feasible])
+        self._counted.tallies = self._counted.tallies + np.column_stack(
+            [differs, ~decision.feasible]
+        )
         return filter_info(
             nominal_action=_as_columns(nominal),
             safe_action=_as_columns(decision.action),
@@ -139,8 +138,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             ),
             slacks=_as_columns(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
-            episode_interventions=self._tallies[:, 0].copy(),
-            episode_infeasible=self._tallies[:, 1].copy(),
+            episode_interventions=tallies[:, 0].copy(),
+            episode_infeasible=tallies[:, 1].copy(),
         )
 
     def _restart(self, added: Info, envs: np.ndarray) -> None:
@@ -152,8 +151,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             added[key][envs] = value
 
     def _forget(self, envs: np.ndarray) -> None:
-        self._tallies = self._tallies.copy()
-        self._tallies[envs] = 0
+        self._counted.tallies = np.where(envs[:, None], 0, self._counted.tallies)
 
     def _compiled(self) -> BatchStepper | None:
         """Return what filters and steps in one compiled function, where the env is compiled."""
@@ -168,6 +166,13 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
                 np.hstack(at_rest),
             )
         )
+
+
+class _Counted:
+    """What `BatchStepper` counts."""
+
+    def __init__(self, num_envs: int) -> None:
+        self.tallies = np.zeros((num_envs, 2), dtype=np.int64)
 
 
 def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
