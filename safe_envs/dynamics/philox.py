@@ -25,6 +25,7 @@ Key = tuple[int, int]
 _WORD = 2**64 - 1
 _LANES = 4
 _EMPTY = (0, 0, 0, 0)
+_FIRST_CHUNK, _CHUNK = 64, 256
 
 
 def key_of(seed: int) -> Key:
@@ -48,8 +49,7 @@ class StreamReader:
     """
 
     def __init__(self) -> None:
-        self._bits = np.random.Philox(key=0)
-        self._generator = np.random.Generator(self._bits)
+        self._generator = np.random.Generator(np.random.Philox(key=0))
         self._place: dict[str, tuple[int, ...]] = {}
         # NumPy counts up before it computes a block, and an empty buffer makes it do so.
         self._state = {
@@ -73,14 +73,14 @@ class StreamReader:
         block, lane = divmod(word, _LANES)
         self._place["counter"] = (block, episode, purpose, 0)
         self._place["key"] = key
-        self._bits.state = self._state
+        self._generator.bit_generator.state = self._state  # pyright: ignore[reportAttributeAccessIssue]
         if lane:
-            self._bits.random_raw(lane, output=False)
+            self.words(lane)
         return self
 
     def words(self, count: int) -> np.ndarray:
         """Return the next words, uint64 (count,)."""
-        return self._bits.random_raw(count)
+        return self._generator.bit_generator.random_raw(count)
 
     def uniforms(self, shape: int | tuple[int, ...]) -> np.ndarray:
         """Return the uniforms (w >> 11) / 2**53 in [0, 1) of the next words, in C order."""
@@ -89,3 +89,55 @@ class StreamReader:
     def fill(self, out: np.ndarray) -> None:
         """Write the uniforms of the next words to an array of doubles, which is contiguous."""
         self._generator.random(out=out)
+
+
+class EpisodeUniforms:
+    """Uniforms of the episodes of an evaluation side by side, which do not depend on each other.
+
+    Args:
+        seed: of the evaluation.
+        episodes: their numbers, one for each row.
+        purpose: of what is drawn.
+        width: how many numbers a control period takes.
+    """
+
+    def __init__(self, seed: int, episodes: range, purpose: int, width: int) -> None:
+        self._keys = [(g, 0) for g in episode_seeds(seed, episodes)]
+        self._purpose, self._width = purpose, width
+        self._reader = StreamReader()
+        self._chunk = np.empty((len(self._keys), 0, width))
+        self._position = self._drawn = 0
+
+    def __len__(self) -> int:
+        """Return the number of episodes."""
+        return len(self._keys)
+
+    def next(self) -> np.ndarray:
+        """Return the uniforms in [0, 1) of the next control period, shape (episodes, width)."""
+        if self._position == self._chunk.shape[1]:
+            self._draw()
+        self._position += 1
+        return self._chunk[:, self._position - 1]
+
+    def _draw(self) -> None:
+        # An episode that has lasted is likely to last: chunks grow with it.
+        count = min(max(self._drawn, _FIRST_CHUNK), _CHUNK)
+        self._chunk = np.empty((len(self._keys), count, self._width))
+        for key, out in zip(self._keys, self._chunk, strict=True):
+            self._reader.seek(key, 0, self._purpose, self._drawn * self._width).fill(out)
+        self._drawn += count
+        self._position = 0
+
+
+def episode_seeds(seed: int, episodes: range) -> list[int]:
+    """Return the seeds of the envs in consecutive episodes of an evaluation.
+
+    Args:
+        seed: of the evaluation.
+        episodes: their numbers.
+
+    Returns:
+        Whole numbers below 2**64. That of episode i is word 4 i of the stream `EPISODE`.
+    """
+    reader = StreamReader().seek(key_of(seed), 0, EPISODE, _LANES * episodes.start)
+    return reader.words(_LANES * len(episodes))[::_LANES].tolist()

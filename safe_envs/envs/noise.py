@@ -15,6 +15,9 @@ _FIRST_CHUNK = 64
 _AHEAD = 32
 """Control periods before their end at which chunks may be renewed together with others."""
 
+_OTHERS = 16
+"""Envs without an ended episode to draw ahead for at a time: it takes as long as the call does."""
+
 
 class NoiseStream:
     """Standard normal numbers of one env, drawn ahead in chunks.
@@ -132,38 +135,49 @@ class NoiseStreams:
         used_up = (left == 0) & moving
         if np.count_nonzero(used_up):
             soon = (left <= _AHEAD) & (self._drawn < self._periods) & moving
-            self._draw_now(np.flatnonzero(used_up | soon), left)
-            later = (self._streams.episodes > 0) & (self._ahead == 0)
-            if np.count_nonzero(later):
-                self._draw_ahead(np.flatnonzero(later))
+            self._draw(np.flatnonzero(used_up | soon), self._later(), left)
             left = self._end - self._row
         self._before_refill = max(int(left.min()), 1)
 
-    def _draw_now(self, envs: np.ndarray, left: np.ndarray) -> None:
-        """Draw on for some envs; `left` is what each env still has."""
-        counts = self._counts(self._drawn[envs], left[envs])
-        normals = self._normals(envs, self._streams.episodes[envs], self._drawn[envs], counts)
+    def _later(self) -> np.ndarray:
+        """Return the envs for whose next episodes to draw too, if episodes end at all."""
+        missing, restarted = self._ahead == 0, self._streams.episodes > 0
+        others = np.flatnonzero(missing & ~restarted)[:_OTHERS]
+        later = np.flatnonzero(missing & restarted)
+        return np.concatenate([later, others]) if later.size else later
+
+    def _draw(self, now: np.ndarray, later: np.ndarray, left: np.ndarray) -> None:
+        """Draw for some envs.
+
+        Args:
+            now: those that need more for their episodes.
+            later: those that need the beginnings of their next episodes.
+            left: what every env still has for its episode.
+        """
+        n, envs, nothing = len(now), np.concatenate([now, later]), np.zeros_like(later)
+        drawn = np.concatenate([self._drawn[now], nothing])
+        kept = np.concatenate([left[now], nothing])
+        counts = self._counts(drawn, kept)
+        episodes, slots = self._streams.episodes[envs], self._slot[envs]
+        episodes[n:] += 1
+        slots[n:] ^= 1
+        normals = self._normals(envs, episodes, drawn, counts)
         first = 0
         for i, count, rest in zip(
-            self._slot[envs].tolist(), counts.tolist(), left[envs].tolist(), strict=True
+            slots[:n].tolist(), counts[:n].tolist(), kept[:n].tolist(), strict=True
         ):
             slot, new = self._buffer[i], self._chunk - count
             if rest:
                 slot[new - rest : new] = slot[-rest:]
             slot[new:] = normals[first : first + count]
             first += count
-        self._row[envs] -= counts
-        self._drawn[envs] += counts
-
-    def _draw_ahead(self, envs: np.ndarray) -> None:
-        """Draw the beginnings of the next episodes of some envs."""
-        nothing = np.zeros_like(envs)
-        counts = self._counts(nothing, nothing)
-        normals = self._normals(envs, self._streams.episodes[envs] + 1, nothing, counts)
-        count = int(counts[0])
-        slots = self._slot[envs] ^ 1
-        self._buffer[slots, -count:] = normals.reshape(len(envs), count, self._channels)
-        self._ahead[envs] = count
+        self._row[now] -= counts[:n]
+        self._drawn[now] += counts[:n]
+        if later.size:
+            count = int(counts[n])
+            ahead = normals[first:].reshape(len(later), count, self._channels)
+            self._buffer[slots[n:], -count:] = ahead
+            self._ahead[later] = count
 
     def _counts(self, drawn: np.ndarray, left: np.ndarray) -> np.ndarray:
         """Return for how many control periods to draw, after some and with some that are left."""

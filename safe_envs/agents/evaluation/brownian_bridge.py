@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.lie import quadratic_variation_rate, vanishes
+from safe_envs.dynamics.normal import standard_exponentials
+from safe_envs.dynamics.philox import BRIDGE, EpisodeUniforms
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 
 MONITORING = ("discrete", "continuous")
 """Where h is checked: at control instants, or between them too."""
-
-_CHUNK = 256
 
 
 def require_monitoring(monitoring: str) -> None:
@@ -137,20 +135,9 @@ class Exponentials:
         width: how many a row gets at a time.
     """
 
-    def __init__(self, seed: int, episodes: Sequence[int], width: int) -> None:
-        # The env of episode i is seeded by the child (i,) of the seed, and a random policy by (i,
-        # 0).
-        self._generators = [
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 1))) for i in episodes
-        ]
-        self._drawn = np.empty((len(self._generators), _CHUNK, width))
-        self._position = _CHUNK
+    def __init__(self, seed: int, episodes: range, width: int) -> None:
+        self._uniforms = EpisodeUniforms(seed, episodes, BRIDGE, width)
 
     def next(self) -> np.ndarray:
         """Return the draws of the next control period, shape (rows, width)."""
-        if self._position == _CHUNK:
-            for generator, drawn in zip(self._generators, self._drawn, strict=True):
-                generator.standard_exponential(out=drawn)
-            self._position = 0
-        self._position += 1
-        return self._drawn[:, self._position - 1]
+        return standard_exponentials(self._uniforms.next())

@@ -62,8 +62,9 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     search. A bound that the episodes contradict is withheld: see
     `safe_envs.agents.evaluation.contradiction`.
 
-    Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is
-    the same, to the last bit, for every `num_envs` and `jobs`.
+    Episode i has a seed of its own, `episode_seed(seed, i)`, the same for all filters: it is the
+    first episode of an env after `reset(seed=episode_seed(seed, i))`. All but `timing` is the same,
+    to the last bit, for every `num_envs` and `jobs`.
 
     A filter with a learned model is learned first, with the defaults of its method; with `repeats`
     once for each repeat, and the intervals are over identifications too: see

@@ -18,6 +18,7 @@ from safe_envs.agents.jobs.processes import compute_in_order
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
 from safe_envs.dynamics.codegen import Components
+from safe_envs.dynamics.philox import episode_seeds
 from safe_envs.envs.info import Info
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import InvalidInputError, SafeEnvsError, shortened
@@ -29,13 +30,13 @@ _PARTS = 4
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """Return the seed of the env in an episode: its own child of the evaluation's seed.
+    """Return the seed of the env in an episode; see `episode_seeds`.
 
     Args:
         seed: of the evaluation.
         episode: its number.
     """
-    return int(np.random.SeedSequence(seed, spawn_key=(episode,)).generate_state(1, np.uint64)[0])
+    return episode_seeds(seed, range(episode, episode + 1))[0]
 
 
 def play(
@@ -53,7 +54,7 @@ def play(
         env: with next-step autoreset: what it simulates after an episode's end is ignored.
         policy: anything with Stable-Baselines3's `predict`.
         episodes: their numbers.
-        seed: whose children seed the episodes.
+        seed: of the evaluation, from which every episode gets a seed of its own.
         progress: called after every step with the number of episodes that are done; those under
             way count with the part that is done.
         trajectories: is filled, if given.
@@ -70,7 +71,7 @@ def play(
         with blas_threads.limited():
             if isinstance(policy, Policy):
                 policy.begin(rows, seed)
-            started = env.reset(seed=[episode_seed(seed, i) for i in rows])
+            started = env.reset(seed=episode_seeds(seed, rows))
             starts = world.components
             watch = (
                 None
@@ -102,7 +103,7 @@ def play_in_processes(
         make_env: makes a vector env of a size.
         policy: anything with Stable-Baselines3's `predict`.
         episodes: how many.
-        seed: whose children seed the episodes.
+        seed: of the evaluation, from which every episode gets a seed of its own.
         num_envs: how many to simulate side by side in each process, at most.
         jobs: number of processes.
         continuous: whether to monitor h between control instants.

@@ -6,11 +6,10 @@ import numpy as np
 
 from safe_envs.agents.policies.base import StatelessPolicy
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.philox import POLICY, EpisodeUniforms
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NumericalError
 from safe_envs.problem.problem import SafetyProblem
-
-_CHUNK = 128
 
 
 class NominalController(StatelessPolicy):
@@ -98,26 +97,15 @@ class RandomPolicy(StatelessPolicy):
         super().__init__(len(problem.features))
         self._m = len(problem.inputs)
         self._generator = np.random.default_rng(seed)
-        self._streams: list[np.random.Generator] = []
+        self._uniforms: EpisodeUniforms | None = None
 
     def begin(self, episodes: range, seed: int) -> None:
         """Give each episode its stream; see `Policy.begin`."""
-        # The env of episode i is seeded by the child (i,) of the seed; this is the child of that
-        # child.
-        self._streams = [
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 0))) for i in episodes
-        ]
-        self._drawn = np.empty((len(episodes), _CHUNK, self._m))
-        self._position = _CHUNK
+        self._uniforms = EpisodeUniforms(seed, episodes, POLICY, self._m)
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Draw actions; see `StatelessPolicy.actions`."""
         batch = given.shape[:-1]
-        if batch != (len(self._streams),):
+        if self._uniforms is None or batch != (len(self._uniforms),):
             return self._generator.uniform(-1.0, 1.0, (*batch, self._m))
-        if self._position == _CHUNK:
-            for stream, drawn in zip(self._streams, self._drawn, strict=True):
-                stream.random(out=drawn)
-            self._position = 0
-        self._position += 1
-        return 2.0 * self._drawn[:, self._position - 1] - 1.0
+        return 2.0 * self._uniforms.next() - 1.0

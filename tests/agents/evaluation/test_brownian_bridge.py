@@ -16,6 +16,8 @@ from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, bridge_notes
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.policies.nominal import RandomPolicy
+from safe_envs.dynamics.normal import standard_exponentials
+from safe_envs.dynamics.philox import BRIDGE, POLICY, StreamReader
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
 pytestmark = pytest.mark.slow
@@ -130,12 +132,20 @@ def test_answer_is_the_same_for_every_num_envs():
         assert first.rows == other.rows
 
 
-def test_bridges_policies_and_envs_of_all_episodes_have_streams_of_their_own():
-    policy = RandomPolicy(make_problem("Scalar-v0"))
-    policy.begin(range(3), 7)
-    generators = [*Exponentials(7, range(3), 1)._generators, *policy._streams]
-    generators += [np.random.default_rng(episode_seed(7, i)) for i in range(3)]
-    assert len({generator.bit_generator.random_raw() for generator in generators}) == 9
+def test_bridges_and_policies_draw_from_the_streams_of_their_episodes():
+    """More control periods than there are numbers drawn ahead."""
+    policy, periods = RandomPolicy(make_problem("Quadrotor-v0")), 400
+    policy.begin(range(2, 5), 7)
+    exponentials = Exponentials(7, range(2, 5), 3)
+    actions = np.stack([policy.predict(np.zeros((3, 15)))[0] for _ in range(periods)], axis=1)
+    drawn = np.stack([exponentials.next() for _ in range(periods)], axis=1)
+    reader = StreamReader()
+    for row, episode in enumerate(range(2, 5)):
+        key = (episode_seed(7, episode), 0)
+        uniforms = reader.seek(key, 0, POLICY).uniforms((periods, actions.shape[2]))
+        np.testing.assert_array_equal(actions[row], 2.0 * uniforms - 1.0)
+        uniforms = reader.seek(key, 0, BRIDGE).uniforms((periods, 3))
+        np.testing.assert_array_equal(drawn[row], standard_exponentials(uniforms))
 
 
 def test_without_noise_in_h_nothing_changes_and_a_note_says_so():

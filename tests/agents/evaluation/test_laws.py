@@ -11,6 +11,15 @@ from scipy.stats import norm
 from safe_envs.agents import RandomPolicy, evaluate, make_problem
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.evaluation.statistics import wilson_interval
+from safe_envs.dynamics.philox import (
+    BRIDGE,
+    EPISODE,
+    NOISE,
+    START,
+    StreamReader,
+    episode_seeds,
+    key_of,
+)
 from tests.agents.evaluation.evaluated import Constant, Levelling
 from tests.oracles.laws import survival
 
@@ -86,9 +95,17 @@ def test_law_of_the_scalar_system():
 
 
 def test_episode_seeds_differ():
-    seeds = {episode_seed(seed, i) for seed in range(20) for i in range(200)}
+    seeds = {s for seed in range(20) for s in episode_seeds(seed, range(200))}
     assert len(seeds) == 4000
     assert all(0 <= s < 2**64 for s in seeds)
+
+
+def test_the_seed_of_an_episode_does_not_depend_on_the_others():
+    words = StreamReader().seek(key_of(5), 0, EPISODE).words(40)
+    assert episode_seeds(5, range(10)) == words[::4].tolist()
+    assert episode_seeds(5, range(3, 7)) == [episode_seed(5, i) for i in range(3, 7)]
+    assert episode_seeds(5, range(3, 7)) == words[12:28:4].tolist()
+    assert episode_seeds(5, range(2, 2)) == []
 
 
 def test_random_policy_and_noise_do_not_share_their_numbers():
@@ -96,5 +113,9 @@ def test_random_policy_and_noise_do_not_share_their_numbers():
     policy = RandomPolicy(problem)
     policy.begin(range(400), seed=0)
     actions = policy.predict(np.zeros((400, 1)))[0][:, 0]
-    starts = [np.random.default_rng(episode_seed(0, i)).random() for i in range(400)]
-    assert abs(np.corrcoef(actions, starts)[0, 1]) < 5 / math.sqrt(400)
+    reader = StreamReader()
+    for purpose in (NOISE, START, BRIDGE):
+        others = [
+            reader.seek(key_of(episode_seed(0, i)), 0, purpose).uniforms(1)[0] for i in range(400)
+        ]
+        assert abs(np.corrcoef(actions, others)[0, 1]) < 5 / math.sqrt(400)
