@@ -124,9 +124,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         for u, v in zip(decision.action[1:], nominal[1:], strict=True):
             differs |= u != v
         differs &= active
-        self._counted.tallies = self._counted.tallies + np.column_stack(
-            [differs, ~decision.feasible]
-        )
+        now = np.column_stack([differs, ~decision.feasible])
+        self._counted.tallies = tallies = self._counted.tallies + now
         return filter_info(
             nominal_action=_as_columns(nominal),
             safe_action=_as_columns(decision.action),

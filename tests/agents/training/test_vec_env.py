@@ -82,7 +82,7 @@ def test_equals_dummy_vec_env(env_id, filtered):
 
 
 def test_equals_dummy_vec_env_when_episodes_end_at_different_steps():
-    ours, theirs = pair("safe_envs/Scalar-v0", "scbf", noise=4.0, horizon=0.3)
+    ours, theirs = pair("safe_envs/Scalar-v0", "scbf", noise=6.0, horizon=0.3)
     shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
     ends = [
         info["TimeLimit.truncated"]
