@@ -65,7 +65,7 @@ def has_ended(values: tuple[float, ...]) -> bool:
 
 
 def is_finite(x: State, values: tuple[float, ...]) -> bool:
-    """Return whether a state and what an env reads off it are finite numbers."""
+    """Return whether a state and what an env reads off it are finite; not so for huge numbers."""
     raise NotImplementedError
 
 

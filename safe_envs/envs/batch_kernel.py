@@ -34,7 +34,7 @@ UNDEFINED_FILTER = 2
 NO_START = 3
 NOT_FINITE = 4
 
-PERIODS = 16
+PERIODS = 8
 """Control periods of noise that are drawn at once. With a multiple of 4, whole blocks are."""
 
 STEPS = 0

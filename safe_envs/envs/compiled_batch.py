@@ -44,9 +44,6 @@ class BatchFilter(NamedTuple):
 class CompiledBatch:
     """The states of a batch of envs, with the interface of `ArrayBatch`.
 
-    Attributes:
-        executed: components of the physical inputs of the last step.
-
     Args:
         problem: what to simulate.
         streams: of the envs.
@@ -62,7 +59,7 @@ class CompiledBatch:
         self, problem: SafetyProblem, streams: EpisodeStreams, episodes: Episodes, limit: int
     ) -> None:
         self.problem, self.streams, self.episodes = problem, streams, episodes
-        self.executed: Sequence[Any] = ()
+        self.inputs = np.empty((0, 0))
         n, self.channels = streams.num_envs, noise_channels(problem)
         self.shape = (n, len(problem.inputs))
         self.settings = (limit, problem.dt, self.channels)
@@ -84,6 +81,11 @@ class CompiledBatch:
         for column in columns:
             column.setflags(write=False)
         return columns
+
+    @property
+    def executed(self) -> Components:
+        """Components of the physical inputs of the last step; what was proposed at a restart."""
+        return tuple(self.inputs.T[: self.shape[1]])
 
     def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
         """Put the envs into states; see `ArrayBatch.place`."""
@@ -152,6 +154,8 @@ class BatchStepper:
         self._nowhere = np.zeros(n, dtype=bool)
         self._nothing = np.zeros(batch.shape)
         self._told: _Told | None = None
+        self._observation_shape = (n, len(problem.features))
+        self._reading_shape = (n, kernel.BARRIERS + len(problem.barriers))
         self._rows = n if batch_filter is not None else 0
         self._width = m + len(self._rest)
         self.tallies = np.zeros((self._rows, 2), dtype=np.int64)
@@ -162,8 +166,7 @@ class BatchStepper:
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`."""
-        given = self._batch.actions.checked(actions)
-        return self.hold(given, False, due)
+        return self._run(self._batch.actions.checked(actions), False, True, due)
 
     def hold(self, given: np.ndarray, scaled: bool, due: np.ndarray | None) -> VectorStep:
         """Hold actions for one control period.
@@ -186,12 +189,11 @@ class BatchStepper:
         if restarts is not None:
             batch.streams.begin_episodes(np.flatnonzero(restarts))
         n, problem = len(given), batch.problem
-        states, counts = np.empty_like(batch.states), np.empty_like(batch.counts)
-        tallies = np.empty_like(self.tallies) if stepping else self.tallies.copy()
+        states, counts = np.empty(batch.states.shape), np.empty((n, 2), dtype=np.int64)
+        tallies = np.empty((self._rows, 2), np.int64) if stepping else self.tallies.copy()
         told = self._new_told() if stepping or self._told is None else self._told.copied()
-        observations = np.empty((n, len(problem.features)), dtype=np.float32)
-        rewards = np.empty(n)
-        readings = np.empty((n, kernel.BARRIERS + len(problem.barriers)))
+        observations, rewards = np.empty(self._observation_shape, np.float32), np.empty(n)
+        readings = np.empty(self._reading_shape)
         status = self._step(
             given,
             scaled,
@@ -225,7 +227,7 @@ class BatchStepper:
         batch.commit(states, counts, restarts)
         self.tallies, self._told = tallies, told
         if stepping:
-            batch.executed = tuple([told.inputs[:, j] for j in range(batch.shape[1])])
+            batch.inputs = told.inputs
         if status:
             h = readings[:, kernel.BARRIERS :].min(axis=1)
             require_sound(batch.components, h, observations, problem)
@@ -243,30 +245,29 @@ class BatchStepper:
 
     def _info(self, readings: np.ndarray, told: _Told) -> Info:
         inputs, choices, flags = told
+        _, _, _, violation, intervention, active, feasible = flags
         info = safety_info(
-            flags[kernel.VIOLATION],
+            violation,
             readings[:, kernel.COST],
             readings[:, kernel.BARRIERS :],
             readings[:, kernel.H_MIN],
             readings[:, kernel.EPISODE_COST],
         )
-        if self._filter is None:
-            return info
-        m = self._batch.shape[1]
-        info.update(
-            filter_info(
+        if self._filter is not None:
+            m = self._batch.shape[1]
+            interventions, infeasible, active_barrier = choices.T
+            info |= filter_info(
                 nominal_action=inputs[:, m : 2 * m],
                 safe_action=inputs[:, 2 * m : 3 * m],
-                intervention=flags[kernel.INTERVENTION],
-                filter_active=flags[kernel.ACTIVE],
-                feasible=flags[kernel.FEASIBLE],
+                intervention=intervention,
+                filter_active=active,
+                feasible=feasible,
                 slack=inputs[:, 3 * m],
                 slacks=inputs[:, 3 * m + 1 :],
-                active_barrier=choices[:, kernel.ACTIVE_BARRIER],
-                episode_interventions=choices[:, kernel.INTERVENTIONS],
-                episode_infeasible=choices[:, kernel.INFEASIBLE],
+                active_barrier=active_barrier,
+                episode_interventions=interventions,
+                episode_infeasible=infeasible,
             )
-        )
         return info
 
     def _refuse(self, status: int, given: np.ndarray, restarts: np.ndarray | None) -> None:

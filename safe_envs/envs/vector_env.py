@@ -92,7 +92,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     @property
     def components(self) -> Components:
         """The exact states: for each state an array (num_envs,), not to be written to."""
-        self._require_started()
+        if not self.episodes.started:
+            raise _without_state()
         return self._batch.components
 
     @property
@@ -224,10 +225,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return None
         return self.viewer.frames() if self.components else None
 
-    def _require_started(self) -> None:
-        if not self.episodes.started:
-            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
-
     def _restarted(
         self, stepper: _Stepper, seed: Seeds, options: dict[str, Any] | None
     ) -> tuple[np.ndarray, Info]:
@@ -241,7 +238,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _due(self) -> np.ndarray | None:
         """Return the envs whose coming step begins an episode; None for none."""
-        self._require_started()
+        if not self.episodes.started:
+            raise _without_state()
         due = self.episodes.due()
         if due is not None and self._autoreset == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
@@ -283,6 +281,10 @@ def _last_of_episode(ended: np.ndarray, observation: np.ndarray, info: Info) -> 
     for i in np.flatnonzero(ended).tolist():
         final[i] = observation[i]
     return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
+
+
+def _without_state() -> gym.error.ResetNeeded:
+    return gym.error.ResetNeeded("the envs have no state yet: call reset() first")
 
 
 def _mode(given: str | AutoresetMode) -> AutoresetMode:
