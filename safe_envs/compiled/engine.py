@@ -45,3 +45,13 @@ def compiled_or_none(engine: str, periods: float, make: Callable[[], _Found]) ->
         if engine == "compiled":
             raise
         return None
+
+
+def engine_for(engine: str, periods: float) -> str:
+    """Return "numpy" in place of "auto" for short work, and any other word as it is.
+
+    Args:
+        engine: one of `ENGINES`.
+        periods: control periods to simulate, about.
+    """
+    return "numpy" if engine == "auto" and periods < LONG else engine

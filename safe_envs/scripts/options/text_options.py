@@ -26,6 +26,16 @@ Trust = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
+Engine = Annotated[
+    str,
+    typer.Option(
+        metavar="auto|numpy|compiled",
+        help=(
+            "What simulates: NumPy, or a program that is compiled once, which needs Numba. auto"
+            " takes that for long runs."
+        ),
+    ),
+]
 FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
 
 
