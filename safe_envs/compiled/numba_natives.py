@@ -23,8 +23,8 @@ __all__ = [
     "vector_view",
 ]
 
-kernel = numba.njit(nogil=True, error_model="numpy", forceinline=True)
-entry = numba.njit(nogil=True, error_model="numpy", cache=True)
+kernel = numba.njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
+entry = numba.njit(nogil=True, error_model="numpy", _nrt=False, cache=True)
 
 _WORD = np.uint64
 _FIRST, _SECOND = _WORD(0xD2E7470EE14C6C93), _WORD(0xCA5A826395121157)
@@ -71,9 +71,9 @@ def single(value: Any) -> Any:
 
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Generate an array of given first entry and shape that owns nothing and counts no references.
+    """Generate an array of given first entry and shape that owns nothing.
 
-    Counting takes some 30 ns, and all threads count for the same arrays.
+    A slice takes some 5 ns, and a reshaped one 20 ns, for it clips its bounds and checks strides.
     """
     array, first, *shape = arguments
     size = context.get_constant(numba.types.intp, 8)

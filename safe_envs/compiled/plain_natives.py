@@ -49,9 +49,10 @@ def single(value: float) -> float:
 
 
 def vector_view(array: np.ndarray, first: int, count: int) -> np.ndarray:
-    """Return entries of an array, to be read and written; compiled code takes no note of the view.
+    """Return entries of an array, to be read and written.
 
-    So it costs nothing, and must not outlive the array: no function returns one.
+    Compiled code checks nothing and takes no note of the view, so that it costs nothing, and must
+    not outlive the array: no function returns one.
 
     Args:
         array: of one dimension.

@@ -54,6 +54,32 @@ def smallest_barrier(barriers: tuple[float, ...]) -> float:
     raise NotImplementedError
 
 
+def lowest_between(
+    x: State,
+    before: tuple[float, ...],
+    after: tuple[float, ...],
+    uniforms: np.ndarray,
+    first: int,
+    data: np.ndarray,
+) -> float:
+    """Return the smallest h that counts in a control period.
+
+    Args:
+        x: state at its beginning.
+        before: barriers there.
+        after: barriers at its end.
+        uniforms: numbers in [0, 1); from `first` on there is one for each barrier, if any is used.
+        first: where those of this period begin.
+        data: numbers of the program.
+    """
+    raise NotImplementedError
+
+
+def no_barriers(data: np.ndarray) -> tuple[float, ...]:
+    """Return barriers of NaN."""
+    raise NotImplementedError
+
+
 def reward_of(values: tuple[float, ...]) -> float:
     """Return the reward."""
     raise NotImplementedError

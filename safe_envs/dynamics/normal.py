@@ -6,7 +6,7 @@ import numpy as np
 
 from safe_envs.dynamics import normal_kernel as kernel
 
-_PIECE = 8192
+_PIECE = 16384
 """Numbers to compute at a time: so many, with all that is computed on the way, fit the cache."""
 
 _Pairs = tuple[np.ndarray, ...]

@@ -83,6 +83,11 @@ def standard_normal(uniform: float) -> float:
         top = ((((((A7 * r + A6) * r + A5) * r + A4) * r + A3) * r + A2) * r + A1) * r + A0
         low = ((((((B7 * r + B6) * r + B5) * r + B4) * r + B3) * r + B2) * r + B1) * r + 1.0
         return q * (top / low)
+    return normal_tail(q)
+
+
+def normal_tail(q: float) -> float:
+    """Return the standard normal number at 1/2 + q, where |q| > `CENTRAL`."""
     r = sqrt(-log(0.5 - abs(q)))
     if r <= NEAR_END:
         r = r - NEAR_SHIFT

@@ -33,7 +33,12 @@ class NoiseStream:
         self.begin((0, 0), 0)
 
     def begin(self, key: Key, episode: int) -> None:
-        """Go to the first control period of an episode of a seed."""
+        """Go to the first control period of an episode.
+
+        Args:
+            key: of the seed.
+            episode: its number since the seed.
+        """
         self._key, self._episode, self._drawn = key, episode, 0
         self._rows: list[list[float]] = []
         self._position = 0

@@ -67,13 +67,16 @@ class StartSampler:
             self._accept = compile_function(model.states, (condition,), "floats")
 
     def draw(self, reader: StreamReader, key: Key, episode: int) -> Components:
-        """Draw the initial state of an episode: a plain float for each state.
+        """Draw the initial state of an episode.
 
         Args:
             reader: reads the uniforms of the stream `START`, for each try as many as the
                 distribution has.
             key: of the episode's seed.
             episode: its number.
+
+        Returns:
+            A plain float for each state.
 
         Raises:
             ConfigurationError: The condition is hardly ever met.

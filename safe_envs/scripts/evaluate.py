@@ -34,7 +34,8 @@ def evaluate(
     particles: of.Particles = None,
     repetitions: of.Repetitions = None,
     num_envs: of.NumEnvs = None,
-    jobs: of.Jobs = 1,
+    jobs: of.Jobs = None,
+    engine: text_options.Engine = "auto",
     json: of.JsonOut = None,
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
@@ -70,7 +71,8 @@ def evaluate(
             "--plot": plot,
             "--episodes-out": episodes_out,
             "--repeats": repeats != 1,
-            "--jobs": jobs != 1,
+            "--jobs": jobs is not None,
+            "--engine": engine != "auto",
             "--episodes": episodes is not None,
             "--num-envs": num_envs is not None,
         }
@@ -83,7 +85,7 @@ def evaluate(
             " place"
         )
     third_party = filter_spec and env.env_id and not env.system
-    common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs}
+    common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "engine": engine}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     problem = env.env_id if third_party else env.full_id
     _evaluate(problem, policy, refine, (json, episodes_out, plot), common)

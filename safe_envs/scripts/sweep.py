@@ -49,6 +49,7 @@ def sweep(
         ),
     ] = None,
     trust: text_options.Trust = False,
+    engine: text_options.Engine = "auto",
     json: Json = None,
 ) -> None:
     """Evaluate each cell of a sweep: one env, filter, policy, seed and set of parameters.
@@ -71,7 +72,7 @@ def sweep(
             " compute"
         )
     place = Backend(backend, address, jobs or 2)
-    found = read_sweep(spec, trust)
+    found = read_sweep(spec, trust, engine)
     store = Store(out, found)
     before = len(found.cells) - len(store.missing)
     missing = store.missing

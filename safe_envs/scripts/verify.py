@@ -46,6 +46,7 @@ def verify(
             "--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds."
         ),
     ] = True,
+    engine: text_options.Engine = "auto",
     json: Annotated[
         Path | None,
         typer.Option(
@@ -72,6 +73,7 @@ def verify(
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
     from safe_envs.agents.policies.registry import make_policy
+    from safe_envs.compiled.engine import require_engine
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.verify_answer import VerifyAnswer
     from safe_envs.scripts.reports.verify_report import print_report
@@ -79,6 +81,7 @@ def verify(
     from safe_envs.wrappers.verification import feasibility
 
     require_whole("episodes", episodes, 1)
+    require_engine(engine)
     inputs = text_options.inputs_of(env.system, policy, [filter_name or ""])
     text_options.require_outputs(json, plot, inputs=inputs)
     known, arguments = env.full_id, env.arguments
@@ -91,7 +94,9 @@ def verify(
     bounds, measurements = found.guarantee.applicable_bounds(starts, problem.duration), []
     if simulate:
         with progress_bar("Simulating") as tell:
-            measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
+            measurements = measure(
+                found, actor, episodes=episodes, seed=seed, engine=engine, progress=tell
+            )
         bounds, measurements = judged(bounds, measurements, found)
     config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
     title = title_of(known, arguments)

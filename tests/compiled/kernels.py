@@ -6,7 +6,13 @@ from math import sqrt
 
 import numpy as np
 
-from safe_envs.compiled.plain_natives import philox_block, single, uniform_of
+from safe_envs.compiled.plain_natives import (
+    philox_block,
+    single,
+    table_view,
+    uniform_of,
+    vector_view,
+)
 from safe_envs.compiled.slots import reward_of
 
 FACTOR = 2.0
@@ -33,8 +39,10 @@ def root(value: float) -> float:
 
 
 def words_of(out: np.ndarray, singles: np.ndarray, key: int) -> None:
-    """Write uniforms of Philox blocks, and some numbers in single precision."""
+    """Write uniforms of Philox blocks, one of them twice, and some numbers in single precision."""
     for i in range(len(out)):
         out[i] = uniform_of(philox_block(i, 2, 3, -1, key, 7)[i % 4])
+    part, table = vector_view(out, 1, 3), table_view(out, 8, 2, 3)
+    part[2] = table[1, 2]
     for i in range(len(singles)):
         singles[i] = single(singles[i])

@@ -77,6 +77,7 @@ def test_json_has_the_documented_keys(safe_envs_command):
     assert {"safe-envs", "python", "numpy", "gymnasium"} <= set(document["versions"])
     assert document["timing"]["num_envs"] == 1024
     assert [row["filter"] for row in document["timing"]["rows"]] == ["none", "hocbf:p=1,2"]
+    assert {(row["engine"], row["jobs"]) for row in document["timing"]["rows"]} == {("numpy", 1)}
     assert [p.name for p in Path().iterdir()] == ["out.json"]
 
 

@@ -158,6 +158,7 @@ def test_the_policy_is_looked_for_before_anything_else(verify):
         ((CUBIC_DISK, "--knowledge", "guess"), "allowed: model, plant"),
         ((CUBIC_DISK, "--episodes", "0"), "episodes = 0"),
         ((CUBIC_DISK, "--seed", "-1"), "seed = -1"),
+        ((CUBIC_DISK, "--engine", "fast"), "engine = 'fast'"),
         ((CUBIC_DISK, "--box", "1"), "--box"),
         ((CUBIC_DISK, "--policy", "nobody"), "unknown policy"),
         ((CUBIC_DISK, "--json", "missing/found.json"), "does not exist"),

@@ -115,6 +115,7 @@ def measure(
     *,
     episodes: int = 500,
     seed: int = 0,
+    engine: str = "auto",
     progress: Progress | None = None,
 ) -> list[Measurement]:
     """Simulate a policy under the conditions, and compare its safety with the bounds.
@@ -132,6 +133,7 @@ def measure(
         policy: as for `evaluate`.
         episodes: for each start.
         seed: of all randomness.
+        engine: as for `evaluate`.
         progress: called with the part of the work that is done, from 0 to 1.
 
     Returns:
@@ -153,7 +155,7 @@ def measure(
     found = []
     for i, (name, world) in enumerate(worlds):
         part = None if progress is None else _part_of(progress, i / len(worlds), 1.0 / len(worlds))
-        found.append(_measure(verification, name, world, policy, episodes, seed, part))
+        found.append(_measure(verification, name, world, policy, episodes, seed, engine, part))
     return _all_compared(found)
 
 
@@ -179,6 +181,7 @@ def _measure(
     policy: Any,
     episodes: int,
     seed: int,
+    engine: str,
     progress: Progress | None,
 ) -> Measurement:
     formulas, starts = verification.formulas, starts_of(world, seed)
@@ -200,6 +203,7 @@ def _measure(
             seed=seed,
             knowledge=formulas.knowledge,
             bounds=False,
+            engine=engine,
             progress=(
                 None if progress is None else _part_of(progress, done / whole, run[-1] / whole)
             ),

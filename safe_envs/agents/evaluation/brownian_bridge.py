@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
@@ -54,13 +56,8 @@ class BrownianBridge:
 
     def __init__(self, problem: SafetyProblem) -> None:
         plant = problem.plant
-        rates = [
-            quadratic_variation_rate(plant, barrier.expression) for barrier in problem.barriers
-        ]
-        self.reached = tuple(not vanishes(plant, rate) for rate in rates)
-        self._rates = compile_function(
-            plant.states, [2.0 * problem.dt * plant.numeric(rate) for rate in rates], "arrays"
-        )
+        self.reached = reached_by_noise(problem)
+        self._rates = compile_function(plant.states, bridge_rates(problem), "arrays")
         self._h = compile_function(
             plant.states,
             [plant.numeric(barrier.expression) for barrier in problem.barriers],
@@ -98,6 +95,22 @@ class BrownianBridge:
         return ends
 
 
+def reached_by_noise(problem: SafetyProblem) -> tuple[bool, ...]:
+    """Return for each barrier whether the noise reaches it directly."""
+    plant = problem.plant
+    return tuple(
+        not vanishes(plant, quadratic_variation_rate(plant, barrier.expression))
+        for barrier in problem.barriers
+    )
+
+
+def bridge_rates(problem: SafetyProblem) -> list[Any]:
+    """Return 2 s^2 dt of each barrier as a formula of the state."""
+    plant = problem.plant
+    rates = [quadratic_variation_rate(plant, barrier.expression) for barrier in problem.barriers]
+    return [2.0 * problem.dt * plant.numeric(rate) for rate in rates]
+
+
 def smallest(barriers: np.ndarray) -> np.ndarray:
     """Return the smallest of the barriers of each episode: shape (B,) for (B, k)."""
     return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
@@ -105,7 +118,7 @@ def smallest(barriers: np.ndarray) -> np.ndarray:
 
 def bridge_notes(problem: SafetyProblem) -> list[str]:
     """Return notes on how to read numbers of continuous monitoring."""
-    reached = BrownianBridge(problem).reached
+    reached = reached_by_noise(problem)
     smooth = [
         barrier.name
         for barrier, reaches in zip(problem.barriers, reached, strict=True)

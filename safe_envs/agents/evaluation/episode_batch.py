@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_envs.agents.evaluation.rounding import may_touch, touches
+from safe_envs.agents.evaluation.rounding import touching
 from safe_envs.agents.evaluation.rows import EpisodeResults, EpisodeSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.statistics import rate_interval, safety_curve, share
@@ -95,11 +95,14 @@ class EpisodeBatch:
         Returns:
             The number of such violations.
         """
-        low, part = self.h_min[:count], ~self.safe[:count]
-        part &= may_touch(low, self.watch.depth[:count])
-        if not part.any():
-            return 0
-        return int(touches(problem, low[part], self.watch.lowest.T[:count][part]).sum())
+        part = slice(count)
+        return touching(
+            problem,
+            ~self.safe[part],
+            self.h_min[part],
+            self.watch.depth[part],
+            self.watch.lowest.T[part],
+        )
 
 
 @dataclass(frozen=True)

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
-from safe_envs.agents.evaluation.episode_batch import EpisodeStatistics, PlayedBatch
+from safe_envs.agents.evaluation.episode_batch import EpisodeStatistics
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
+from safe_envs.agents.evaluation.players import Player, player_of
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
-from safe_envs.agents.evaluation.rollout import play, play_in_processes
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
-from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import Condition, FilterSpec
+from safe_envs.wrappers import FilterSpec
 from safe_envs.wrappers.learning import LearnedModel
 
 
@@ -45,9 +42,10 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     monitoring: str = "discrete",
-    jobs: int = 1,
+    jobs: int | None = None,
     progress: Progress | None = None,
     record: bool = False,
+    engine: str = "auto",
 ) -> Evaluation:
     """Estimate the safety of a policy under each filter.
 
@@ -64,7 +62,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
 
     Episode i has a seed of its own, `episode_seed(seed, i)`, the same for all filters: it is the
     first episode of an env after `reset(seed=episode_seed(seed, i))`. All but `timing` is the same,
-    to the last bit, for every `num_envs` and `jobs`.
+    to the last bit, for every `num_envs` and `jobs`; the engines agree to rounding.
 
     A filter with a learned model is learned first, with the defaults of its method; with `repeats`
     once for each repeat, and the intervals are over identifications too: see
@@ -78,7 +76,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         options: arguments of `gym.make` for an id.
         episodes: number for each filter.
         seed: whole number from 0.
-        num_envs: how many episodes to simulate side by side.
+        num_envs: how many episodes NumPy simulates side by side.
         knowledge: what the filters know, "model" or "plant".
         objective: of the filters, "nearest" or "clf".
         confidence: of all intervals, between 0 and 1.
@@ -87,9 +85,10 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned.
         monitoring: where h is checked, "discrete" or "continuous".
-        jobs: number of processes; the result is the same.
+        jobs: number of processes, or of threads of the compiled engine; the result is the same.
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
+        engine: "auto", "numpy" or "compiled": see `RunSettings`.
 
     Raises:
         ConfigurationError: An argument names something unknown or is out of range.
@@ -113,7 +112,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         repeats=repeats,
         monitoring=monitoring,
     )
-    return run_evaluation(spec, RunSettings(num_envs, jobs, record, progress))
+    return run_evaluation(spec, RunSettings(num_envs, jobs, record, progress, engine))
 
 
 def run_evaluation(spec: EvaluationSpec, settings: RunSettings | None = None) -> Evaluation:
@@ -133,9 +132,6 @@ class _Runner:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
         parts = len(resolved.learning.missing()) + sum(map(resolved.repeats, resolved.names))
         self._work = WorkParts(settings.progress, parts)
-        self._bridge = (
-            BrownianBridge(resolved.problem) if self._spec.monitoring == "continuous" else None
-        )
         asked = None if self._spec.bounds else "it was not asked for"
         self._why_no_bound = resolved.target.why_no_bound or asked
 
@@ -143,10 +139,9 @@ class _Runner:
         """Run all filters and compare them."""
         resolved, spec, settings = self._resolved, self._spec, self._settings
         resolved.learn(self._work.part)
-        size = min(settings.num_envs, spec.episodes)
         # Made before the first episode: what is wrong with any of them shows at once.
-        envs = {
-            name: [resolved.env(conditions, size) for conditions in each]
+        players = {
+            name: [player_of(resolved, conditions, settings) for conditions in each]
             for name, each in resolved.filters.items()
         }
         config = {**resolved.config(), "episodes": spec.episodes, "repeats": spec.repeats}
@@ -157,11 +152,13 @@ class _Runner:
         rows, timings, episodes, visited = [], [], {}, {}
         for name in resolved.names:
             begun = time.perf_counter()
-            totals, averagers = self._simulated(name, envs[name], trajectories.get(name))
+            totals, averagers = self._simulated(name, players[name], trajectories.get(name))
             rows.append(self._row(name, totals, averagers, config["policy"]["name"]))
             episodes[name] = [each.results for each in totals]
             visited[name] = [each.visited for each in totals]
-            timings.append(self._timing(name, totals, time.perf_counter() - begun))
+            timings.append(
+                self._timing(name, totals, players[name][0], time.perf_counter() - begun)
+            )
         return Evaluation(
             resolved.problem,
             spec,
@@ -180,50 +177,24 @@ class _Runner:
         )
 
     def _simulated(
-        self, name: str, envs: Sequence[Env], trajectories: Trajectories | None
+        self, name: str, players: Sequence[Player], trajectories: Trajectories | None
     ) -> tuple[list[EpisodeStatistics], list[GuaranteeAverager]]:
         """Run the episodes under a filter, with each identification."""
-        resolved = self._resolved
+        resolved, episodes = self._resolved, self._spec.episodes
         found = []
         averagers = [
             GuaranteeAverager(c, resolved.problem, self._spec.knowledge, self._why_no_bound)
             for c in resolved.filters[name]
         ]
-        for repeat, (env, averager) in enumerate(zip(envs, averagers, strict=True)):
+        for repeat, (player, averager) in enumerate(zip(players, averagers, strict=True)):
             statistics = EpisodeStatistics(resolved.problem)
             recorded = trajectories if repeat == 0 else None
-            for batch in self._played(env, resolved.filters[name][repeat], recorded):
+            for batch in player.play(self._work.part(episodes), recorded):
                 averager.add(batch.starts)
                 statistics.add(batch)
-            env.close()
+            player.close()
             found.append(statistics)
         return found, averagers
-
-    def _played(
-        self, env: Env, conditions: Sequence[Condition], trajectories: Trajectories | None
-    ) -> Iterator[PlayedBatch]:
-        spec, settings = self._spec, self._settings
-        progress = self._work.part(spec.episodes)
-        if settings.jobs == 1:
-            return play(
-                env,
-                self._resolved.policy,
-                range(spec.episodes),
-                spec.seed,
-                progress,
-                trajectories,
-                self._bridge,
-            )
-        return play_in_processes(
-            partial(self._resolved.env, conditions),
-            self._resolved.policy,
-            spec.episodes,
-            spec.seed,
-            settings.num_envs,
-            settings.jobs,
-            self._bridge is not None,
-            progress,
-        )
 
     def _row(
         self,
@@ -248,8 +219,10 @@ class _Runner:
         return judged(row, row.ci_high)
 
     def _timing(
-        self, name: str, totals: Sequence[EpisodeStatistics], seconds: float
+        self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float
     ) -> FilterTiming:
         steps = sum(int(each.results.length.sum()) for each in totals)
         learning = seconds_of(self._resolved.filters[name])
-        return FilterTiming(name, seconds, steps, steps / seconds, learning)
+        return FilterTiming(
+            name, seconds, steps, steps / seconds, learning, player.engine, player.jobs
+        )

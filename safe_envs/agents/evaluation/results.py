@@ -31,6 +31,8 @@ class FilterTiming:
         steps: control periods of all episodes.
         steps_per_second: steps/seconds.
         learning_seconds: mean time of an identification; None where nothing was learned.
+        engine: "numpy" or "compiled".
+        jobs: processes of NumPy, or threads of the compiled engine.
     """
 
     filter: str
@@ -38,6 +40,8 @@ class FilterTiming:
     steps: int
     steps_per_second: float
     learning_seconds: float | None
+    engine: str
+    jobs: int
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Timing:
     """The part of a result that depends on the machine.
 
     Attributes:
-        num_envs: episodes side by side.
+        num_envs: episodes that NumPy simulates side by side.
         rows: one for each filter.
     """
 

@@ -32,6 +32,26 @@ def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
     return lowest >= -_NEARLY * largest
 
 
+def touching(
+    problem: SafetyProblem,
+    violating: np.ndarray,
+    lowest: np.ndarray,
+    largest: np.ndarray,
+    x: np.ndarray,
+) -> int:
+    """Count the violations that only touch h = 0.
+
+    Args:
+        problem: whose barriers they are of.
+        violating: which episodes violate, shape (B,).
+        lowest: minimum h of each, shape (B,).
+        largest: maximum h of each, shape (B,).
+        x: the states where the minima were, shape (B, n).
+    """
+    part = violating & may_touch(lowest, largest)
+    return int(touches(problem, lowest[part], x[part]).sum()) if part.any() else 0
+
+
 def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return which of the minima h <= 0 are 0 to floating-point precision, shape (B,).
 

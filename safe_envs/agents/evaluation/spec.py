@@ -12,6 +12,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
 from safe_envs.agents.evaluation.statistics import require_confidence
+from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition, FilterSpec, spec_of
@@ -170,25 +171,33 @@ _WRITTEN = tuple(each.name for each in fields(EvaluationSpec) if each.name != "t
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How an evaluation is run, which does not change its result.
+    """How an evaluation is run, which does not change its result but for rounding.
 
     Attributes:
-        num_envs: episodes to simulate side by side.
-        jobs: number of processes.
+        num_envs: episodes that NumPy simulates side by side.
+        jobs: processes of NumPy, or threads of the compiled engine; None for one process, or as
+            many threads as there are processors.
         record: keep trajectories for pictures.
         progress: called with the part of the work that is done, from 0 to 1.
+        engine: "numpy"; "compiled", which compiles each kind of simulation once, and needs Numba;
+            or "auto" for the compiled one from 5e6 control periods of a filter on, if it is there
+            and can do it. They agree to rounding, but for steps within rounding of a threshold.
 
     Raises:
         ConfigurationError: A value is out of range, or trajectories are asked of several processes.
     """
 
     num_envs: int = 1024
-    jobs: int = 1
+    jobs: int | None = None
     record: bool = False
     progress: Progress | None = None
+    engine: str = "auto"
 
     def __post_init__(self) -> None:
         require_whole("num_envs", self.num_envs, 1)
+        require_engine(self.engine)
+        if self.jobs is None:
+            return
         require_whole("jobs", self.jobs, 1)
         if self.jobs > 1 and self.record:
             raise ConfigurationError(

@@ -38,6 +38,28 @@ class VisitedStates:
         n, m = len(problem.states), len(problem.inputs)
         return cls(np.empty((0, n)), np.empty((0, m)), np.empty(0), np.empty((0, n)), np.empty(0))
 
+    @classmethod
+    def of(
+        cls,
+        violating: np.ndarray,
+        actions: np.ndarray,
+        slack: np.ndarray,
+        deepest: np.ndarray,
+        depth: np.ndarray,
+    ) -> VisitedStates:
+        """Return the most extreme ones of the states of episodes.
+
+        Args:
+            violating: where the slack was largest, shape (E, n).
+            actions: what was executed there, shape (E, m).
+            slack: violation of the worst condition there, 0 where none was, shape (E,).
+            deepest: where the smallest h was largest, shape (E, n).
+            depth: h there, shape (E,).
+        """
+        worst, highest = _first(slack), _first(depth)
+        worst = worst[slack[worst] > 0.0]
+        return cls(violating[worst], actions[worst], slack[worst], deepest[highest], depth[highest])
+
     def joined(self, other: VisitedStates) -> VisitedStates:
         """Return the most extreme states of both."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
@@ -106,15 +128,13 @@ class StateWatch:
 
     def visited(self, count: int) -> VisitedStates:
         """Return the extreme states of the first `count` episodes."""
-        slack, depth = self._slack[:count], self.depth[:count]
-        worst = _first(slack)
-        worst, highest = worst[slack[worst] > 0.0], _first(depth)
-        return VisitedStates(
-            self._violating.T[worst],
-            self._actions.T[worst],
-            slack[worst],
-            self._deepest.T[highest],
-            depth[highest],
+        part = slice(count)
+        return VisitedStates.of(
+            self._violating.T[part],
+            self._actions.T[part],
+            self._slack[part],
+            self._deepest.T[part],
+            self.depth[part],
         )
 
 

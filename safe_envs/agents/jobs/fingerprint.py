@@ -8,6 +8,7 @@ import platform
 from functools import cache
 from importlib.metadata import version
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,10 @@ _PACKAGES = (
 )
 
 
+_OPTIONAL = ("numba",)
+"""Packages that round results in another way where they are installed."""
+
+
 def package_versions() -> dict[str, str]:
     """Return the versions of Python and of the packages on which results depend, by name."""
     return dict(_versions())
@@ -37,6 +42,7 @@ def _versions() -> dict[str, str]:
     return {
         "python": platform.python_version(),
         **{package: version(package) for package in _PACKAGES},
+        **{package: version(package) for package in _OPTIONAL if find_spec(package)},
     }
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from safe_envs.agents.jobs.threads import one_thread
 from safe_envs.errors import SafeEnvsError
 
 _FRAMES = 3
@@ -56,7 +57,7 @@ def outcome_of(job: Job) -> JobOutcome:
     result = error = None
     try:
         # Jobs run side by side already.
-        with _ONE_AT_A_TIME, threadpool_limits(1):
+        with _ONE_AT_A_TIME, threadpool_limits(1), one_thread():
             result = job.compute()
     except SafeEnvsError as raised:
         error = str(raised)

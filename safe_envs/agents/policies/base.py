@@ -10,10 +10,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source
+from safe_envs.errors import ConfigurationError, InvalidInputError, NotCompilableError
 
 BLOCK = 128
 """Observations in a block; see `BlockPolicy`."""
+
+CHOOSE = "def choose(observation, step, k0, k1, data, work):\n"
+"""How the function of a compiled program begins; see `Policy.source`."""
 
 POLICY_FILE = "policy.npz"
 """Name of the file of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
@@ -61,6 +66,20 @@ class Policy(ABC):
         Returns:
             Actions in [-1, 1], shape (m,) or (B, m), and the hidden state.
         """
+
+    def source(self, data: Data) -> Source:
+        """Return the policy as a function of compiled programs.
+
+        It is called `choose`, takes what `act` of `safe_envs.compiled.slots` takes, and returns the
+        actions that `predict` returns, a tuple; an action without a finite value is NaN.
+
+        Args:
+            data: receives its numbers.
+
+        Raises:
+            NotCompilableError: There is no such function.
+        """
+        raise not_compilable(self)
 
 
 class StatelessPolicy(Policy):
@@ -117,6 +136,14 @@ class BlockPolicy(StatelessPolicy):
         padded[self._offset : end] = rows
         found = [self.act(padded[k : k + BLOCK]) for k in range(0, len(padded), BLOCK)]
         return np.concatenate(found)[self._offset : end].reshape(*given.shape[:-1], -1)
+
+
+def not_compilable(policy: Any) -> NotCompilableError:
+    """Return the error that says that a policy is no function of compiled programs."""
+    return NotCompilableError(
+        f"the policy {type(policy).__name__} has no compiled form, and only the NumPy engine can"
+        " call it"
+    )
 
 
 def checked_observation(observation: Any, width: int) -> np.ndarray:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from safe_envs.agents.policies.base import StatelessPolicy
+from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
+from safe_envs.agents.policies.clf_kernel import best_inputs_for_goal, work_of_goal
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.problem.clf import CLF
@@ -43,6 +48,7 @@ class CLFController(StatelessPolicy):
         self._center, self._half = center_and_half_width(problem)
         low, high = [pair[0] for pair in problem.box], [pair[1] for pair in problem.box]
         qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
+        self._qp, self._goal = qp, goal
         self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
 
     def actions(self, given: np.ndarray) -> np.ndarray:
@@ -69,6 +75,30 @@ class CLFController(StatelessPolicy):
             ) from error
         return np.stack(
             [(u - c) / w for u, c, w in zip(inputs, self._center, self._half, strict=True)], axis=-1
+        )
+
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        model, m = self._qp.model, len(self._half)
+        growth, along = self._goal.growth(model)
+        rates = formulas(
+            "goal_rates", {"x": model.states}, [model.numeric(e) for e in (growth, *along)], data
+        )
+        weight, slack_weight = (
+            float(model.numeric(w)) for w in (self._goal.input_weight, self._goal.slack_weight)
+        )
+        unit = math.sqrt(weight / slack_weight)
+        place = data.add([*self._qp.low, *self._qp.high, weight, unit])
+        scales = data.add([*self._center, *self._half])
+        x = "".join(f"observation[{column}], " for column in self._columns)
+        entries = "".join(
+            f"(work[{j}] - data[{scales + j}]) / data[{scales + m + j}], " for j in range(m)
+        )
+        return rates + Source(
+            f"{CHOOSE}    best_inputs_for_goal(goal_rates(({x}), data), {place}, data, work)\n"
+            f"    return ({entries})\n",
+            (best_inputs_for_goal,),
+            work_of_goal(m),
         )
 
 

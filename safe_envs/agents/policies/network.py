@@ -1,10 +1,9 @@
-"""Trained policies as data: a network in a file that holds numbers and JSON, and no pickle."""
+"""Files of trained policies: a network as numbers and JSON, and no pickle."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,12 @@ import numpy as np
 
 from safe_envs.agents.policies.base import (
     POLICY_FILE,
-    BlockPolicy,
     require_spaces,
     saved_policy_file,
 )
+from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.envs.env import action_box, observation_box
-from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.data import files
 from safe_envs.wrappers.learning.data.signature import Signature
@@ -27,107 +26,6 @@ KIND = "policy"
 """Kind of a file that holds a policy."""
 
 _WRITER = "safe-envs train"
-
-_OUTPUTS = {"tanh": np.tanh, "clip": lambda x: np.clip(x, -1.0, 1.0)}
-
-
-@dataclass(frozen=True)
-class Normalization:
-    """What Stable-Baselines3's VecNormalize does to observations.
-
-    Attributes:
-        mean: k numbers, subtracted.
-        var: k numbers, by whose roots is divided then.
-        clip: bound of the result.
-        epsilon: added to `var`.
-
-    Raises:
-        ConfigurationError: a number is not finite, or out of range.
-    """
-
-    mean: tuple[float, ...]
-    var: tuple[float, ...]
-    clip: float
-    epsilon: float
-
-    def __post_init__(self) -> None:
-        numbers = np.array([*self.mean, *self.var, self.clip, self.epsilon], dtype=float)
-        if (
-            not np.isfinite(numbers).all()
-            or min(self.var) + self.epsilon <= 0.0
-            or self.clip <= 0.0
-        ):
-            raise ConfigurationError(
-                "the normalisation of a policy needs finite numbers, var + epsilon above 0 and clip"
-                " above 0"
-            )
-
-    @classmethod
-    def of(cls, wrapper: Any) -> Normalization | None:
-        """Return what a VecNormalize does now; None if that is nothing."""
-        if wrapper is None or not wrapper.norm_obs:
-            return None
-        moments = wrapper.obs_rms
-        return cls(
-            tuple(moments.mean.tolist()),
-            tuple(moments.var.tolist()),
-            float(wrapper.clip_obs),
-            float(wrapper.epsilon),
-        )
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Normalization:
-        """Read what `asdict` and JSON made of one."""
-        mean, var = (tuple(map(float, data[name])) for name in ("mean", "var"))
-        return cls(mean, var, float(data["clip"]), float(data["epsilon"]))
-
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Normalise observations (B, k)."""
-        return np.clip(
-            (observations - np.array(self.mean)) / np.sqrt(np.array(self.var) + self.epsilon),
-            -self.clip,
-            self.clip,
-        )
-
-
-class NetworkPolicy(BlockPolicy):
-    """The deterministic actor of a trained policy, in NumPy alone.
-
-    It computes in double precision: what it rounds to single precision hardly depends on the
-    machine then.
-
-    Args:
-        network: from observations to actions before `output`.
-        output: function after the last layer, "tanh" or "clip".
-        normalization: before the first layer, if any.
-        boxes: input bounds of the training and of the env, each (m, 2), where they differ.
-
-    Raises:
-        ConfigurationError: the output is unknown.
-    """
-
-    def __init__(
-        self,
-        network: Network,
-        output: str,
-        normalization: Normalization | None = None,
-        boxes: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        super().__init__(len(network.input_mean))
-        if output not in _OUTPUTS:
-            raise ConfigurationError(f"output = {shown(output)}; {nearest(str(output), _OUTPUTS)}")
-        self._network, self._output = network, _OUTPUTS[output]
-        self._normalization, self._boxes = normalization, boxes
-
-    def act(self, block: np.ndarray) -> np.ndarray:
-        """Evaluate the network; see `BlockPolicy.act`."""
-        x = block.astype(float)
-        if self._normalization is not None:
-            x = self._normalization(x)
-        actions = self._output(self._network.outputs(x))
-        if self._boxes is not None:
-            actions = _in_another_box(actions, *self._boxes)
-        return actions.astype(np.float32)
 
 
 def save_policy(
@@ -249,14 +147,6 @@ def _policy(content: files.Content, problem: SafetyProblem) -> NetworkPolicy:
 def _box(problem: SafetyProblem) -> np.ndarray:
     """Return the physical bounds of a problem's inputs, (m, 2)."""
     return np.array(problem.box, dtype=float)
-
-
-def _in_another_box(actions: np.ndarray, trained: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """Return actions (B, m) that stand for the same or the nearest inputs in other input bounds."""
-    (center, half), (new_center, new_half) = (
-        (box.mean(axis=1), 0.5 * np.ptp(box, axis=1)) for box in (trained, given)
-    )
-    return np.clip((center + half * actions - new_center) / new_half, -1.0, 1.0)
 
 
 def _spaces(problem: SafetyProblem) -> dict[str, Any]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.agents.policies.base import StatelessPolicy
+from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
+from safe_envs.agents.policies.policy_kernel import action_of_input, random_action
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.philox import POLICY, EpisodeUniforms
 from safe_envs.envs.spaces import center_and_half_width
@@ -26,10 +29,10 @@ class NominalController(StatelessPolicy):
         self._name = problem.name
         self._box = problem.box
         self._center, self._half = center_and_half_width(problem)
-        symbols = tuple(f.symbol for f in problem.features)
-        laws = tuple(problem.model.numeric(law) for law in problem.nominal)
-        self._floats = compile_function(symbols, laws, "floats")
-        self._arrays = compile_function(symbols, laws, "arrays")
+        self._symbols = tuple(f.symbol for f in problem.features)
+        self._laws = tuple(problem.model.numeric(law) for law in problem.nominal)
+        self._floats = compile_function(self._symbols, self._laws, "floats")
+        self._arrays = compile_function(self._symbols, self._laws, "arrays")
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Evaluate the laws; see `StatelessPolicy.actions`.
@@ -55,6 +58,20 @@ class NominalController(StatelessPolicy):
             raise self._undefined(rows[~np.isfinite(actions.reshape(len(rows), -1)).all(axis=1)][0])
         return actions
 
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        entries = ""
+        for j, ((low, high), c, w) in enumerate(
+            zip(self._box, self._center, self._half, strict=True)
+        ):
+            place = data.add([low, high, c, w])
+            numbers = ", ".join(f"data[{place + i}]" for i in range(4))
+            entries += f"action_of_input(inputs[{j}], {numbers}), "
+        return formulas("nominal_laws", {"observation": self._symbols}, self._laws, data) + Source(
+            f"{CHOOSE}    inputs = nominal_laws(observation, data)\n    return ({entries})\n",
+            (action_of_input,),
+        )
+
     def _undefined(self, observation: np.ndarray) -> NumericalError:
         return NumericalError(
             f"the nominal controller of {self._name!r} has no finite value at the observation"
@@ -78,6 +95,12 @@ class ZeroController(StatelessPolicy):
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Return the one action for every observation; see `StatelessPolicy.actions`."""
         return np.tile(self._action, (*given.shape[:-1], 1))
+
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        place = data.add(self._action)
+        entries = "".join(f"data[{place + j}], " for j in range(len(self._action)))
+        return Source(f"{CHOOSE}    return ({entries})\n")
 
 
 class RandomPolicy(StatelessPolicy):
@@ -109,3 +132,9 @@ class RandomPolicy(StatelessPolicy):
         if self._uniforms is None or batch != (len(self._uniforms),):
             return self._generator.uniform(-1.0, 1.0, (*batch, self._m))
         return 2.0 * self._uniforms.next() - 1.0
+
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        m = self._m
+        entries = "".join(f"random_action(step * {m} + {j}, k0, k1), " for j in range(m))
+        return Source(f"{CHOOSE}    return ({entries})\n", (random_action,))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.evaluate import run_evaluation
-from safe_envs.agents.evaluation.spec import EvaluationSpec
+from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.agents.jobs.fingerprint import (
     file_checksum,
     json_checksum,
@@ -31,12 +31,15 @@ class Cell:
         files: SHA-256 of each file that it reads, by path.
         versions: versions by which it is to be computed; see `versions`.
         trust: load a policy's .zip, which runs code that it contains.
+        engine: what simulates; see `RunSettings`. It is no part of the configuration: results of
+            the engines differ by rounding.
     """
 
     settings: Mapping[str, Any]
     files: Mapping[str, str] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     trust: bool = False
+    engine: str = "auto"
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -92,7 +95,7 @@ class Cell:
             SafeEnvsError: the evaluation fails.
         """
         self._require_same_code()
-        found = run_evaluation(self.spec)
+        found = run_evaluation(self.spec, RunSettings(engine=self.engine))
         return {"row": found.rows[0].as_dict(), "config": found.config}
 
     def _require_same_code(self) -> None:

@@ -15,6 +15,7 @@ from safe_envs.agents.sweeps.cell import Cell, Sweep, versions
 from safe_envs.agents.sweeps.dependencies import absolute, installed, read_by, with_imported
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
+from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, SafeEnvsError
 from safe_envs.wrappers import LEARNED, SafetyFilter
 
@@ -28,7 +29,7 @@ _MOST_CELLS = 50_000
 """All of them are compared, in a second, before the first is computed."""
 
 
-def read_sweep(path: Path, trust: bool = False) -> Sweep:
+def read_sweep(path: Path, trust: bool = False, engine: str = "auto") -> Sweep:
     """Read a sweep from a YAML file, and check all that can be checked before a cell is computed.
 
     The file has the sections `fixed` (setting: value), `grid` (setting: list of values; lists
@@ -38,23 +39,28 @@ def read_sweep(path: Path, trust: bool = False) -> Sweep:
     Args:
         path: of the file. Paths in it begin at the working directory.
         trust: load a policy's .zip, which runs code that it contains.
+        engine: what simulates; see `RunSettings`.
 
     Raises:
-        ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or
-            value is not allowed.
+        ConfigurationError: the file cannot be read, or an engine, section, setting, id, filter,
+            policy or value is not allowed.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    sweep = sweep_of(document_in(path), trust, what=str(path))
+    require_engine(engine)
+    sweep = sweep_of(document_in(path), trust, engine, what=str(path))
     _check(sweep, str(path))
     return sweep
 
 
-def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Sweep:
+def sweep_of(
+    document: Any, trust: bool = False, engine: str = "auto", what: str = "the sweep"
+) -> Sweep:
     """Return the sweep of a file's content, with names and kinds of values checked.
 
     Args:
         document: mapping from the file's sections.
         trust: see `read_sweep`.
+        engine: see `read_sweep`.
         what: name of the sweep in errors.
 
     Raises:
@@ -83,7 +89,7 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
         _equal(settings): settings
         for settings in (complete({**fixed, **each}, what) for each in chosen)
     }
-    cells = {cell.key: cell for cell in _cells(once.values(), trust)}
+    cells = {cell.key: cell for cell in _cells(once.values(), trust, engine)}
     return Sweep(tuple(cells.values()), tuple(_swept([cell.settings for cell in cells.values()])))
 
 
@@ -113,7 +119,7 @@ def _equal(settings: Settings) -> str:
     )
 
 
-def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
+def _cells(found: Iterable[Settings], trust: bool, engine: str) -> Iterable[Cell]:
     digests: dict[Path, dict[str, str]] = {}
     checksums: dict[Path, str] = {}
     for given in found:
@@ -126,7 +132,7 @@ def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
             if path not in checksums:
                 checksums[path] = file_checksum(path)
             files[str(path)] = checksums[path]
-        yield Cell(settings, files, versions(), trust)
+        yield Cell(settings, files, versions(), trust, engine)
 
 
 def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:

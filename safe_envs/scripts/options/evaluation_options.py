@@ -108,7 +108,15 @@ NumEnvs = Annotated[
     int | None,
     typer.Option(help="Episodes side by side; it changes the speed, not the answer. [1024]"),
 ]
-Jobs = Annotated[int, typer.Option(help="Processes; they change the speed, not the answer.")]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        help=(
+            "Processes, or threads of the compiled engine; they change the speed, not the answer."
+            " [1, or all]"
+        )
+    ),
+]
 JsonOut = Annotated[
     Path | None,
     typer.Option(

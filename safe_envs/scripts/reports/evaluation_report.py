@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -12,7 +12,7 @@ from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.comparison import Comparison
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
-from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.results import Evaluation, FilterTiming
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
@@ -197,12 +197,24 @@ def _notes(evaluation: Evaluation) -> list[str]:
             notes.append(early_end(row.filter, "mean episode", length, steps))
     if evaluation.config["monitoring"] == "continuous":
         notes += bridge_notes(evaluation.problem)
+    notes += _of_engine(evaluation.timing.rows)
     if evaluation.is_deterministic:
         notes.append(
             "nothing is random here (no noise, a fixed start, a deterministic policy), so that all"
             " episodes are one and the same: the interval has no meaning."
         )
     return notes
+
+
+def _of_engine(rows: Sequence[FilterTiming]) -> list[str]:
+    """Return which rows are of the compiled engine."""
+    compiled = [row for row in rows if row.engine == "compiled"]
+    if not compiled:
+        return []
+    names = "" if len(compiled) == len(rows) else f" of {', '.join(row.filter for row in compiled)}"
+    jobs = compiled[0].jobs
+    threads = f"{jobs} threads" if jobs > 1 else "one thread"
+    return [f"the steps/s{names} are those of the compiled engine, in {threads}."]
 
 
 def _of_bound(row: EvaluationRow) -> list[str]:

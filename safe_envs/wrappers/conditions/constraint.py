@@ -8,9 +8,13 @@ from typing import Protocol
 
 import sympy as sp
 
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.own_source import has_own_source
 from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.lie import lie_derivative_g, tidied
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import NotCompilableError
 
 
 class Terms(Protocol):
@@ -28,6 +32,34 @@ class Terms(Protocol):
     def arrays(self, x: Components) -> Components:
         """Return the values at a batch of states, components of shape (B,) in and out."""
         ...
+
+    def source(self, name: str, data: Data) -> Source:
+        """Return a function `name(x, data, work)` of the state, a tuple, that gives the values.
+
+        Args:
+            name: of the function, with which the names of other generated functions begin.
+            data: receives its numbers.
+        """
+        ...
+
+
+def terms_source(terms: Terms, name: str, data: Data) -> Source:
+    """Return learned numbers as a function of a compiled program; see `Terms.source`.
+
+    Args:
+        terms: whose values it gives. They need no method `source`, as far as this is not called.
+        name: of the function.
+        data: receives its numbers.
+
+    Raises:
+        NotCompilableError: They have no method of their own for that.
+    """
+    if not has_own_source(terms, "floats", "arrays"):
+        raise NotCompilableError(
+            f"the learned terms {type(terms).__name__} have no compiled form, which their method"
+            " source(name, data) would give"
+        )
+    return terms.source(name, data)
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ class ArrayDecision:
     """Writes `decide` as `FilterQPSolver.solve` decides; what a QP has not leaves no statement.
 
     The statements name these arrays, for k constraints on m inputs and with one more of both for a
-    goal: `a` and `b` as the conditions say, `asked` for b less what is asked for, `rows` and
-    `offsets` of the QP, `inside` with 0 for conditions outside their domain.
+    goal: `a` and `b` as the conditions say, `asked` for b less what is asked for, `coefficients`
+    and `offsets` of the QP, `inside` with 0 for conditions outside their domain.
 
     Args:
         qp: the QP.
@@ -46,9 +46,9 @@ class ArrayDecision:
         self._reciprocal = [i for i, c in constraints if c.demand is not None]
         self._sampled = [i for i, c in constraints if c.change is not None]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
-        self._exact = bool(self._uncertain) and self._m == 1 and not self._goal
+        self._second_order = bool(self._uncertain) and self._m == 1 and not self._goal
         self._method, self._room = _method(
-            self._k + self._goal, self._m + self._goal, uncertain=self._exact
+            self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
         self._values, self._body = Values(qp, data), Body(data)
         self._single = self._k == 1 and qp.plain
@@ -74,7 +74,7 @@ class ArrayDecision:
         self._bounds()
         self._wish()
         self._domains()
-        self._rows()
+        self._constraints()
         self._minimise()
         if self._sampled:
             self._sample()
@@ -132,22 +132,22 @@ class ArrayDecision:
             body.room("rise", self._m)
             body.call(aim_outwards, f"{self._m}, a, inside, low, high, w, rise, aim")
 
-    def _rows(self) -> None:
+    def _constraints(self) -> None:
         """Write the QP's constraints."""
         body, k = self._body, self._k
-        asked, rows = list(self._b), [list(row) for row in self._a]
+        asked, held = list(self._b), [list(row) for row in self._a]
         for i in self._reciprocal:
             demand = self._values.call(f"filter_demand_{i}", [self._qp.constraints[i].demand])
             asked[i] = f"{asked[i]} - {demand}[0] if inside[{i}] > 0.0 else 0.0"
-            rows[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in rows[i]]
+            held[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in held[i]]
         changed = self._reciprocal or self._sampled
         self._asked = "asked" if changed else "b"
         if changed:
             body.vector("asked", asked)
         self._offsets = [f"{self._asked}[{i}]" for i in range(k)]
         for place, i in enumerate(self._uncertain):
-            self._form(place, i, rows)
-        if self._exact:
+            self._form(place, i, held)
+        if self._second_order:
             forms = {i: place for place, i in enumerate(self._uncertain)}
             entries = [
                 [
@@ -158,33 +158,33 @@ class ArrayDecision:
             ]
             body.table("form", entries)
         if self._goal:
-            rows = [*([*row, "0.0"] for row in rows), ["goal_row[0, 0]", "goal_row[0, 1]"]]
+            held = [*([*row, "0.0"] for row in held), ["goal_row[0, 0]", "goal_row[0, 1]"]]
             self._offsets.append("goal_offset[0]")
-        self._in_place = rows == self._a
+        self._in_place = held == self._a
         if not self._in_place:
-            body.table("rows", rows)
+            body.table("coefficients", held)
             body.room("offsets", k + self._goal)
 
-    def _form(self, place: int, i: int, rows: list[list[str]]) -> None:
+    def _form(self, place: int, i: int, held: list[list[str]]) -> None:
         """Take the uncertainty of a constraint into account: as it is, or as a plane above it.
 
         Args:
             place: its number among the uncertain ones.
             i: its number.
-            rows: coefficients of all, which are changed.
+            held: coefficients of all, which are changed.
         """
         body, m = self._body, self._m
         count = (m + 1) * (m + 2) // 2
         form = [f"values[{self._forms + place * count + e}]" for e in range(count)]
         self._finite.append(" + ".join(form))
-        if self._exact:
+        if self._second_order:
             return
         planes = self._values.solver.planes
         if i in planes:
             slopes, constant = planes[i]
             slopes, constant = [body.number(s) for s in slopes], body.number(constant)
         else:
-            entry = dict(zip(pairs(m), form, strict=True))
+            entry = dict(zip(_pairs(m), form, strict=True))
             square = range(m + 1)
             body.table(f"form_{i}", [[entry[min(j, e), max(j, e)] for e in square] for j in square])
             body.room(f"slopes_{i}", m)
@@ -197,24 +197,24 @@ class ArrayDecision:
                 f"{constant} = ",
             )
             slopes = [f"slopes_{i}[{j}]" for j in range(m)]
-        rows[i] = [f"{entry} - {slope}" for entry, slope in zip(rows[i], slopes, strict=True)]
+        held[i] = [f"{entry} - {slope}" for entry, slope in zip(held[i], slopes, strict=True)]
         self._offsets[i] += f" - {constant}"
 
     def _minimise(self) -> None:
         """Write the solution of the QP."""
-        body, rows, offsets = self._body, "a", self._asked
+        body, coefficients, offsets = self._body, "a", self._asked
         if not self._in_place:
-            rows, offsets = "rows", "offsets"
+            coefficients, offsets = "coefficients", "offsets"
             body.fill("offsets", self._offsets)
-        form = ", form" if self._exact else ""
+        form = ", form" if self._second_order else ""
         aim = "aim" if self._goal or self._reciprocal else "proposed"
-        arguments = f"{rows}, {offsets}{form}, {aim}, low, high, w, priority, action, margin"
-        body.call(self._method, f"{arguments}, active, scratch", "feasible = ")
+        arguments = f"{coefficients}, {offsets}{form}, {aim}, low, high, w, priority"
+        body.call(self._method, f"{arguments}, action, margin, active, scratch", "feasible = ")
         if self._goal:
             # The goal's constraint, which can always be met, has no say in that, nor has its
             # rounding.
             met = [
-                f"margin[{i}] >= -row_tolerance(rows, {i}, offsets[{i}], action)"
+                f"margin[{i}] >= -row_tolerance(coefficients, {i}, offsets[{i}], action)"
                 for i in range(self._k)
             ]
             body.add(f"feasible = {' and '.join(met)}")
@@ -256,14 +256,14 @@ class ArrayDecision:
             arguments = f"{m}, a, {self._asked}, proposed, w, inside, active"
             body.call(furthest_constraint, arguments, "cause = ")
         slack = "".join(f"0.0 if feasible else max(-{g}, 0.0), " for g in margin)
-        proposed = "".join(f"proposed[{j}], " for j in range(m)) if self._goal else "u"
+        proposed = "".join(f"proposed[{j}], " for j in range(m))
         body.add(
             f"acts = {' or '.join(f'active[{i}] > 0.0' for i in range(k))}",
             f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}",
-            f"action_given = ({''.join(f'{entry}, ' for entry in action)})",
+            f"chosen = ({''.join(f'{entry}, ' for entry in action)})",
             f"slack = ({slack})",
-            f"return action_given, {f'({proposed})' if self._goal else 'u'}, acts, feasible, slack,"
-            f" {cause}, sound",
+            f"wanted = {f'({proposed})' if self._goal else 'u'}",
+            f"return chosen, wanted, acts, feasible, slack, {cause}, sound",
         )
 
 
@@ -280,6 +280,6 @@ def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int
     raise NotCompilableError(f"{k} constraints on {m} inputs need a solver")
 
 
-def pairs(m: int) -> list[tuple[int, int]]:
+def _pairs(m: int) -> list[tuple[int, int]]:
     """Return the places of the entries of an uncertainty in its symmetric matrix."""
     return list(itertools.combinations_with_replacement(range(m + 1), 2))

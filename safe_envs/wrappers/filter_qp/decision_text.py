@@ -9,6 +9,7 @@ import sympy as sp
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
+from safe_envs.wrappers.conditions.constraint import terms_source
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
 
@@ -34,7 +35,7 @@ class Values:
         calls = []
         for i, term in enumerate(qp.terms):
             name = f"filter_terms_{i}"
-            self._text += term.source(name, data)
+            self._text += terms_source(term, name, data)
             calls.append(f"{name}(x, data, work)")
         if calls:
             self._symbols["terms"] = tuple(s for term in qp.terms for s in term.symbols)
@@ -47,12 +48,15 @@ class Values:
         return self._text
 
     def call(self, name: str, expressions: Iterable[Any], inputs: str = "") -> str:
-        """Add a function of the state, and return a call of it, which gives a tuple.
+        """Add a function of the state that returns a tuple.
 
         Args:
             name: of the function.
             expressions: what it returns.
             inputs: text of a tuple of inputs, where the function takes some.
+
+        Returns:
+            The text of the call.
         """
         numbers = [self._model.numeric(e) for e in expressions]
         arguments, given = dict(self._symbols), list(self._symbols)
@@ -89,7 +93,12 @@ class Body:
         self._lines += lines
 
     def constants(self, name: str, numbers: Sequence[float]) -> None:
-        """Name an array of constant numbers."""
+        """Name an array of constant numbers.
+
+        Args:
+            name: of the array.
+            numbers: its entries.
+        """
         self.add(f"{name} = vector_view(data, {self._data.add(numbers)}, {len(numbers)})")
 
     def number(self, value: float) -> str:
@@ -97,28 +106,54 @@ class Body:
         return f"data[{self._data.add([value])}]"
 
     def call(self, kernel: Callable[..., Any], arguments: str, before: str = "") -> None:
-        """Append the call of a kernel, after the beginning of a statement."""
+        """Append the call of a kernel.
+
+        Args:
+            kernel: what is called.
+            arguments: their texts, with commas.
+            before: how the statement begins.
+        """
         self.uses.append(kernel)
         self.add(f"{before}{kernel.__name__}({arguments})")
 
     def room(self, name: str, count: int) -> None:
-        """Name a scratch array of so many entries."""
+        """Name a scratch array.
+
+        Args:
+            name: of the array.
+            count: number of entries.
+        """
         self.add(f"{name} = vector_view(work, {self._work}, {count})")
         self._work += count
 
     def vector(self, name: str, entries: Sequence[str]) -> None:
-        """Name an array of given entries."""
+        """Name an array of values.
+
+        Args:
+            name: of the array.
+            entries: texts of its entries.
+        """
         self.room(name, len(entries))
         self.fill(name, entries)
 
     def fill(self, name: str, entries: Sequence[str]) -> None:
-        """Write to the entries of an array."""
+        """Write values to an array.
+
+        Args:
+            name: of the array.
+            entries: texts of its entries.
+        """
         self.add(*(f"{name}[{i}] = {entry}" for i, entry in enumerate(entries)))
 
-    def table(self, name: str, rows: Sequence[Sequence[str]]) -> None:
-        """Name an array of given rows."""
-        width = len(rows[0])
-        self.add(f"{name} = table_view(work, {self._work}, {len(rows)}, {width})")
-        self._work += len(rows) * width
-        for i, row in enumerate(rows):
-            self.add(*(f"{name}[{i}, {j}] = {entry}" for j, entry in enumerate(row)))
+    def table(self, name: str, entries: Sequence[Sequence[str]]) -> None:
+        """Name an array of values with two axes.
+
+        Args:
+            name: of the array.
+            entries: texts of its entries.
+        """
+        height, width = len(entries), len(entries[0])
+        self.add(f"{name} = table_view(work, {self._work}, {height}, {width})")
+        self._work += height * width
+        for i, line in enumerate(entries):
+            self.add(*(f"{name}[{i}, {j}] = {entry}" for j, entry in enumerate(line)))

@@ -17,7 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_policy, make_problem, refine
 from safe_envs.agents.policies.base import BLOCK
-from safe_envs.agents.policies.network import NetworkPolicy, load_policy, save_policy
+from safe_envs.agents.policies.network import load_policy, save_policy
+from safe_envs.agents.policies.network_policy import NetworkPolicy
 from safe_envs.errors import InvalidInputError
 from safe_envs.wrappers.learning.data.files import load, save
 from safe_envs.wrappers.learning.data.signature import Signature

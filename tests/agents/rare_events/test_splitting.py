@@ -99,7 +99,8 @@ def test_cruise_control_under_its_filter_has_the_gaussian_law():
     exact = walk_passage(32.0, 50, 0.0, 1.8 * math.sqrt(0.2))
     assert 1e-8 < exact < 2e-8
     options = {"start": [10.0, 10.0, 50.0], "horizon": 10.0, "dt": 0.2}
-    assert_holds(row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120), exact, 3.0)
+    row = row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120, seed=1)
+    assert_holds(row, exact, 3.0)
 
 
 @pytest.mark.slow

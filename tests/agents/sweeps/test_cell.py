@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from safe_envs.agents.jobs import fingerprint
 from safe_envs.agents.jobs.job import outcome_of
+from safe_envs.agents.jobs.threads import available_threads
 from safe_envs.agents.sweeps import cell
 from safe_envs.agents.sweeps.spec import sweep_of
 
@@ -62,6 +63,7 @@ def test_a_cell_has_one_thread(monkeypatch: pytest.MonkeyPatch):
 
     def evaluate(*_: Any, **__: Any) -> Any:
         seen.extend(pool["num_threads"] for pool in threadpool_info())
+        seen.append(available_threads())
         raise RuntimeError("seen")
 
     monkeypatch.setattr(cell, "run_evaluation", evaluate)
@@ -70,3 +72,19 @@ def test_a_cell_has_one_thread(monkeypatch: pytest.MonkeyPatch):
         assert "seen" in str(outcome_of(one).error)
     assert seen
     assert set(seen) == {1}
+
+
+def test_the_engine_is_no_part_of_what_identifies_a_cell(monkeypatch: pytest.MonkeyPatch):
+    asked: list[str] = []
+
+    def evaluate(_: Any, settings: Any) -> Evaluated:
+        asked.append(settings.engine)
+        return Evaluated([SimpleNamespace(as_dict=dict)], {})
+
+    monkeypatch.setattr(cell, "run_evaluation", evaluate)
+    document = {"fixed": {"env": "Scalar-v0", "filter": "none"}}
+    found = [sweep_of(document, engine=engine).cells[0] for engine in ("auto", "numpy")]
+    assert found[0].key == found[1].key
+    for one in found:
+        assert outcome_of(one).error is None
+    assert asked == ["auto", "numpy"]

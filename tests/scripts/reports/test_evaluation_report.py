@@ -116,6 +116,20 @@ def test_an_early_end_is_noted_by_the_mean_length_of_all_episodes():
     assert "the mean episode" not in printed(taking(120))
 
 
+def test_the_compiled_engine_is_named_by_the_speed():
+    answer = evaluate(moving(0.5, 2 - X), filters=["none", "cbf"], episodes=2, bounds=False)
+    assert "compiled" not in printed(answer)
+    first, second = answer.timing.rows
+
+    def said(*rows):
+        return printed(replace(answer, timing=Timing(1, list(rows))))
+
+    fast, faster = (replace(row, engine="compiled", jobs=2) for row in (first, second))
+    assert "the steps/s are those of the compiled engine, in 2 threads" in said(fast, faster)
+    assert "the steps/s of cbf are those of the compiled engine" in said(first, faster)
+    assert "in one thread" in said(replace(fast, jobs=1), second)
+
+
 def test_violations_that_are_no_more_than_rounding_are_told():
     # h halves in each step, and is 0 once the sum of the halves is 1 to rounding.
     edge = moving(0.0, 1 - X, horizon=40.0, nominal=1)

@@ -11,6 +11,8 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.codegen import Components, compile_function, filled
 from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f
 from safe_envs.errors import ConfigurationError, shown
@@ -22,6 +24,7 @@ from safe_envs.wrappers.learning.data.values import LearnedFileError
 from safe_envs.wrappers.learning.models.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.diffusion import LearnedDiffusion
 from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.network_source import network_source, slopes_source
 
 ACTIVATION = "tanh"
 
@@ -30,8 +33,8 @@ ACTIVATION = "tanh"
 class LearnedGenerator:
     """The terms M_j that noise adds to the derivatives of a barrier: A^j h = L_f^j h + M_j + ....
 
-    Implements `safe_envs.wrappers.conditions.base.Terms`: a constraint takes M_r and, for r >= 2,
-    the slopes of M_(r-1), for
+    These are `safe_envs.wrappers.conditions.constraint.Terms`: a constraint takes M_r and, for
+    r >= 2, the slopes of M_(r-1), for
 
         A^r h(x, u) = L_f^r h + M_r + (L_g L_f^(r-1) h + grad M_(r-1) . g) u.
 
@@ -87,6 +90,24 @@ class LearnedGenerator:
         """Return the values of the symbols at a batch of states, components (B,) in and out."""
         value = self.networks[-1].arrays(self.coordinates_at(x))
         return value if self.degree == 1 else (*value, *self.slopes(self.degree - 1, x))
+
+    def source(self, name: str, data: Data) -> Source:
+        """See `safe_envs.wrappers.conditions.constraint.Terms.source`."""
+        read, value, slopes, chain = (
+            f"{name}_{part}" for part in ("coordinates", "value", "slopes", "by_states")
+        )
+        values = f"{value}(read, data, work)"
+        found = formulas(read, {"x": self.states}, self.coordinates, data)
+        found += network_source(self.networks[-1], value, data)
+        if self.degree > 1:
+            symbols = sp.symbols(f"_slope:{len(self.coordinates)}", real=True)
+            pairs = list(zip(symbols, self.coordinates, strict=True))
+            by_states = [sp.Add(*(k * sp.diff(c, s) for k, c in pairs)) for s in self.states]
+            found += slopes_source(self.networks[-2], slopes, data, 0)
+            found += formulas(chain, {"x": self.states, "slopes": symbols}, by_states, data)
+            values += f" + {chain}(x, {slopes}(read, data, work), data)"
+        text = f"def {name}(x, data, work):\n    read = {read}(x, data)\n    return {values}\n"
+        return found + Source(text)
 
     def slopes(self, order: int, x: Components) -> Components:
         """Return dM_j/dx_1..dx_n.

@@ -127,6 +127,11 @@ class Network:
         ends = (np.zeros(p), np.ones(p), np.zeros(q), np.ones(q))
         return cls(tuple(weights), tuple(biases), activation, *ends)
 
+    @property
+    def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Weights (outputs, inputs) and biases of each layer, with the standardisation in them."""
+        return [(weights, bias) for weights, _, bias in self._folded]
+
     def outputs(self, x: np.ndarray) -> np.ndarray:
         """Return the outputs (..., q) for inputs (..., p) in one matrix product a layer."""
         return self._layers(x)[-1]

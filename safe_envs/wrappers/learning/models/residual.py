@@ -10,6 +10,8 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
@@ -20,6 +22,7 @@ from safe_envs.wrappers.learning.checks import require_degrees
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.models.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.network import Network, require_activation
+from safe_envs.wrappers.learning.models.network_source import network_source
 
 _ROUNDING = 1e-12
 
@@ -79,6 +82,17 @@ class LearnedResidual:
     def arrays(self, x: Components) -> Components:
         """Return the residuals at states: n components (B,) in, r + m components (B,) out."""
         return self.network.arrays(tuple(stacked(self._arrays(*x), len(x[0])).T))
+
+    def source(self, name: str, data: Data) -> Source:
+        """See `safe_envs.wrappers.conditions.constraint.Terms.source`."""
+        chart, network = f"{name}_coordinates", f"{name}_network"
+        return (
+            formulas(chart, {"x": self.states}, self.coordinates, data)
+            + network_source(self.network, network, data)
+            + Source(
+                f"def {name}(x, data, work):\n    return {network}({chart}(x, data), data, work)\n"
+            )
+        )
 
     def eps(self, level: float) -> np.ndarray:
         """Return errors (r + m,) that a fresh state exceeds with probability at most 1 - level.

@@ -75,7 +75,7 @@ def project_interval(  # noqa: PLR0913
     for i in range(k):
         product = a[i, 0] * at
         reached = product + b[i]
-        missed = missed or (a[i, 0] != 0.0 and reached < -slack_of_rounding(product, b[i]))
+        missed = missed or (a[i, 0] != 0.0 and reached < -scalar_tolerance(product, b[i]))
     if missed:
         for i in range(k):
             unit = sqrt(priority[i])
@@ -86,14 +86,14 @@ def project_interval(  # noqa: PLR0913
     feasible = True
     for i in range(k):
         product = a[i, 0] * at
-        allowed = slack_of_rounding(product, b[i])
+        allowed = scalar_tolerance(product, b[i])
         margin[i] = product + b[i]
         active[i] = 1.0 if margin[i] <= allowed else 0.0
         feasible = feasible and not margin[i] < -allowed
     return feasible
 
 
-def slack_of_rounding(product: float, b: float) -> float:
+def scalar_tolerance(product: float, b: float) -> float:
     """Return by how much a constraint on one input may be violated and count as met.
 
     Args:

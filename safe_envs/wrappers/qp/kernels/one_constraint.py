@@ -6,7 +6,7 @@ import numpy as np
 
 ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
-CORRECTIONS = 3
+WAY_CORRECTIONS = 3
 """How often the rounding of a long way is taken back: each time it shrinks by a factor of 1e16."""
 
 
@@ -123,7 +123,7 @@ def project_onto_row(  # noqa: PLR0913
     follow_multiplier(a, i, b, v, low, high, w, u, work)
     margin = row_margin(a, i, b, u)
     allowed = row_tolerance(a, i, b, u)
-    for _ in range(CORRECTIONS):
+    for _ in range(WAY_CORRECTIONS):
         if -allowed <= margin <= allowed:
             break
         slope = 0.0

@@ -82,7 +82,7 @@ def project_plane(  # noqa: PLR0913
 
 
 def met_in_plane(a: np.ndarray, b: np.ndarray, u: np.ndarray, margin: np.ndarray) -> bool:
-    """Compute the margins, and return whether all constraints are met.
+    """Return whether all constraints are met, and record their margins.
 
     Args:
         a: constraints, shape (k, 2).

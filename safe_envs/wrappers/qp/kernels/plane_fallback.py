@@ -16,11 +16,11 @@ import numpy as np
 
 from safe_envs.wrappers.qp.kernels.plane_edges import unbounded_step_in_plane
 
-STEPS_OF_EACH = 20
+FALLBACK_STEPS = 20
 """Steps for each constraint and input: many times more than were ever seen."""
-NOTHING = 1e-12
+NO_FORCE = 1e-12
 """Part of the forces on an input that is rounding."""
-BEYOND = 2.0
+BEYOND_STEP = 2.0
 """Length of a step that meets nothing; it ends at 1."""
 
 
@@ -43,7 +43,7 @@ def bounded_least_squares_in_plane(
     for c in range(k + 4):
         work[barred + c] = 0.0
     freed = -1
-    for _ in range(STEPS_OF_EACH * (k + 2)):
+    for _ in range(FALLBACK_STEPS * (k + 2)):
         length = step_to_next_stop(k, low, high, u, work)
         if length < 1.0:
             if length > 0.0:
@@ -66,7 +66,7 @@ def bounded_least_squares_in_plane(
 
 
 def squares_of_slacks(k: int, u1: float, u2: float, work: np.ndarray) -> float:
-    """Compute the margins, and return the sum of squared slacks.
+    """Return the sum of squared slacks, and record the margins.
 
     Args:
         k: number of constraints.
@@ -118,12 +118,12 @@ def step_to_next_stop(
     """
     step1, step2 = free_step_in_plane(k, work)
     end1, end2 = high[0] if step1 > 0.0 else low[0], high[1] if step2 > 0.0 else low[1]
-    to_end1 = (end1 - u[0]) / step1 if step1 != 0.0 else BEYOND
-    to_end2 = (end2 - u[1]) / step2 if step2 != 0.0 else BEYOND
+    to_end1 = (end1 - u[0]) / step1 if step1 != 0.0 else BEYOND_STEP
+    to_end2 = (end2 - u[1]) / step2 if step2 != 0.0 else BEYOND_STEP
     length = min(min(to_end1, to_end2), 1.0)
     for i in range(k):
         change = work[k + i] * step1 + work[2 * k + i] * step2
-        to_row = BEYOND
+        to_row = BEYOND_STEP
         if work[16 * k + i] == 0.0 and change < 0.0:
             to_row = max(work[4 * k + i], 0.0) / -change
         work[6 * k + i] = to_row
@@ -165,7 +165,7 @@ def let_go_in_plane(k: int, high: np.ndarray, u: np.ndarray, work: np.ndarray) -
     for i in range(k):
         if work[missed + i] > 0.0 and work[barred + i] == 0.0:
             pull = work[4 * k + i] * max(abs(work[k + i]), abs(work[2 * k + i]))
-            if pull > NOTHING * largest and pull > strongest:
+            if pull > NO_FORCE * largest and pull > strongest:
                 freed, strongest = i, pull
     if freed >= 0:
         work[missed + freed] = 0.0
@@ -180,7 +180,7 @@ def let_go_in_plane(k: int, high: np.ndarray, u: np.ndarray, work: np.ndarray) -
                     terms += abs(force)
             if u[j] >= high[j]:
                 push = -push
-            if push > NOTHING * terms and push > strongest:
+            if push > NO_FORCE * terms and push > strongest:
                 freed, strongest = k + j, push
     if freed >= 0:
         work[held + freed - k] = 0.0

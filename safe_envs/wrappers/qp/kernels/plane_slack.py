@@ -27,8 +27,8 @@ from safe_envs.wrappers.qp.kernels.plane_fallback import bounded_least_squares_i
 
 ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
-STEPS = 20
-FAR = 1e150
+NEWTON_STEPS = 20
+FARTHEST_LINE = 1e150
 """A line further off than this meets no box. How far does not matter, and its square would
 overflow."""
 
@@ -65,8 +65,8 @@ def least_violating_in_plane(
         unit = sqrt(priority[i])
         work[x + i] = a[i, 0] * unit / size  # so that squares neither overflow nor vanish
         work[y + i] = a[i, 1] * unit / size
-        work[r + i] = min(max(b[i] * unit / size, -FAR), FAR)
-    for _ in range(STEPS):
+        work[r + i] = min(max(b[i] * unit / size, -FARTHEST_LINE), FARTHEST_LINE)
+    for _ in range(NEWTON_STEPS):
         measure_slacks(k, u, work)
         if forces_balance(k, low, high, u, work):
             return

@@ -14,7 +14,7 @@ from safe_envs.wrappers.qp.kernels.second_order_slack import least_violating_of_
 
 ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
-LARGEST = 1.7976931348623157e308
+ENDLESS = 1.7976931348623157e308
 """In place of infinity."""
 
 
@@ -80,7 +80,7 @@ def project_second_order(  # noqa: PLR0913
     if k > 1 and lo - hi <= ROUNDING * min(abs(lo), abs(hi)):
         at = max(min(max(proposed, lo), hi), lowest)
     else:
-        left, right = LARGEST, -LARGEST
+        left, right = ENDLESS, -ENDLESS
         for i in range(k):
             nearest = least_violating_of_one(
                 i, work[i], work[k + i], a, b, q, proposed, lowest, highest
@@ -168,24 +168,24 @@ def uncertain_interval(
     if q2 == 0.0:
         least = sqrt(max(q0, 0.0)) - b
         if a == 0.0:
-            return (LARGEST, LARGEST) if least > 0.0 else (-LARGEST, LARGEST)
-        return (least / a, LARGEST) if a > 0.0 else (-LARGEST, least / a)
+            return (ENDLESS, ENDLESS) if least > 0.0 else (-ENDLESS, ENDLESS)
+        return (least / a, ENDLESS) if a > 0.0 else (-ENDLESS, least / a)
     leading, middle, last = a * a - q2, a * b - q1, b * b - q0
     # (a b - q_1)^2 - leading last, without the products that cancel.
     discriminant = a * a * q0 - 2.0 * a * b * q1 + b * b * q2 - (q0 * q2 - q1 * q1)
     root = sqrt(max(discriminant, 0.0))
     if leading == 0.0:
         if middle * a <= 0.0:
-            return LARGEST, LARGEST
+            return ENDLESS, ENDLESS
         end = -last / (2.0 * middle)
-        return (end, LARGEST) if a > 0.0 else (-LARGEST, end)
+        return (end, ENDLESS) if a > 0.0 else (-ENDLESS, end)
     t = -(middle + copysign(root, middle))
     first = t / leading if t != 0.0 else 0.0
     second = last / t if t != 0.0 else 0.0
     if leading > 0.0:
-        return (max(first, second), LARGEST) if a > 0.0 else (-LARGEST, min(first, second))
+        return (max(first, second), ENDLESS) if a > 0.0 else (-ENDLESS, min(first, second))
     if discriminant < 0.0 or b - a * middle / leading < 0.0:
-        return LARGEST, LARGEST
+        return ENDLESS, ENDLESS
     return min(first, second), max(first, second)
 
 
@@ -213,7 +213,7 @@ def least_violating_of_one(  # noqa: PLR0913
         low: lower bound.
         high: upper bound.
     """
-    if start >= LARGEST:
+    if start >= ENDLESS:
         slope, _, q0, q1, q2 = in_unit_of_row(i, a, b, q)
         at = uncertain_maximiser(slope, q0, q1, q2, v, low, high)
     else:

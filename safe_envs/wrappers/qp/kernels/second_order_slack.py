@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-BISECTIONS = 64
+SLACK_BISECTIONS = 64
 """As many as halve an interval of doubles down to neighbours."""
 
 
@@ -56,7 +56,7 @@ def end_of_least_slacks(
         hi: where to end.
         first: whether it is the first.
     """
-    for _ in range(BISECTIONS):
+    for _ in range(SLACK_BISECTIONS):
         middle = 0.5 * (lo + hi)
         rate = 0.0
         for i in range(len(b)):

@@ -65,7 +65,7 @@ def project_single_active(  # noqa: PLR0913
     feasible, solved = True, True
     for i in range(k):
         margin[i] = row_margin(a, i, b[i], u)
-        work[flat + i] = 1.0 if says_nothing(a, i, m) else 0.0
+        work[flat + i] = 1.0 if row_says_nothing(a, i, m) else 0.0
         unmet = work[flat + i] > 0.0 and b[i] < 0.0
         active[i] = 1.0 if unmet else 0.0
         work[missed + i] = 1.0 if margin[i] < 0.0 and not unmet else 0.0
@@ -74,13 +74,13 @@ def project_single_active(  # noqa: PLR0913
     for i in range(k):
         if not solved and work[missed + i] > 0.0:
             _, _, met = project_onto_row(a, i, b[i], v, low, high, w, u, work)
-            if met and others_allow(k, flat, a, b, u, margin, active, work):
+            if met and other_rows_allow(k, flat, a, b, u, margin, active, work):
                 active[i] = 1.0  # whatever the rounding of the way there left of its margin
                 solved = True
     return solved, feasible
 
 
-def says_nothing(a: np.ndarray, i: int, m: int) -> bool:
+def row_says_nothing(a: np.ndarray, i: int, m: int) -> bool:
     """Return whether constraint i does not depend on the input.
 
     Args:
@@ -94,7 +94,7 @@ def says_nothing(a: np.ndarray, i: int, m: int) -> bool:
     return flat
 
 
-def others_allow(
+def other_rows_allow(
     k: int,
     flat: int,
     a: np.ndarray,

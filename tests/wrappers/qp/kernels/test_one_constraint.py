@@ -42,6 +42,19 @@ def test_is_the_plain_function_to_the_last_bits(m, kind):
         assert (found.active[i], found.feasible[i]) == (active, feasible)
 
 
+@pytest.mark.parametrize("m", [2, 3])
+def test_a_long_way_inside_the_box_ends_on_the_row(m):
+    problems = random_problems(np.random.default_rng(m), 100, 1, m, "plain")
+    wide = np.full((100, m), 1e9)
+    problems = problems._replace(v=1e6 * problems.v, low=-wide, high=wide)
+    found = solve(kernel.project_one_constraint, kernel.work_of_one_constraint(1, m), problems)
+    acts = found.active[:, 0] == 1.0
+    assert 20 < acts.sum() < 80
+    assert found.feasible.all()
+    terms = (np.abs(problems.a[:, 0]) * np.abs(found.u)).sum(axis=1) + np.abs(problems.b[:, 0])
+    assert np.all(np.abs(found.margin[:, 0]) <= rounding.ROUNDING * terms, where=acts)
+
+
 @np.errstate(all="ignore")
 def test_data_that_are_not_finite_end_in_numbers_that_are_not():
     for bad in (np.nan, np.inf, -np.inf):

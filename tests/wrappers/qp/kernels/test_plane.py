@@ -37,7 +37,7 @@ def test_says_what_the_dispatcher_does(k, kind):
 
 @pytest.mark.parametrize("kind", ["plain", "unmet", "integers", "parallel", "flat", "touching"])
 def test_fallback_finds_the_same_minimisers(kind, monkeypatch):
-    monkeypatch.setattr(plane_slack, "STEPS", 0)
+    monkeypatch.setattr(plane_slack, "NEWTON_STEPS", 0)
     problems = random_problems(np.random.default_rng(8), 100, 3, 2, kind)
     found, expected = solve(kernel.project_plane, length(3), problems), reference(problems)
     np.testing.assert_array_equal(found.feasible, expected.feasible)

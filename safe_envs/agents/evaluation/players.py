@@ -1,0 +1,184 @@
+"""Who simulates the episodes of an evaluation under a filter: NumPy, or a compiled program."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+
+from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
+from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
+from safe_envs.agents.evaluation.episode_batch import PlayedBatch
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.rollout import play, play_in_processes
+from safe_envs.agents.evaluation.spec import Progress, RunSettings
+from safe_envs.agents.evaluation.targets import Env
+from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.jobs.threads import available_threads
+from safe_envs.compiled.engine import compiled_or_none
+from safe_envs.errors import NotCompilableError
+from safe_envs.wrappers import Condition, SafetyFilter
+
+
+class NumpyPlayer:
+    """Steps many envs at once.
+
+    Args:
+        resolved: what to simulate.
+        conditions: of the filter; none for the unfiltered env.
+        settings: how it is run.
+
+    Attributes:
+        engine: "numpy".
+        jobs: processes.
+
+    Raises:
+        SafeEnvsError: The envs cannot be made, or fail at a first step.
+    """
+
+    engine = "numpy"
+
+    def __init__(
+        self, resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
+    ) -> None:
+        spec = self._spec = resolved.spec
+        self._resolved, self._conditions = resolved, conditions
+        self._size, self.jobs = min(settings.num_envs, spec.episodes), settings.jobs or 1
+        continuous = spec.monitoring == "continuous"
+        self._bridge = BrownianBridge(resolved.problem) if continuous else None
+        self._env: Env = resolved.env(conditions, self._size)
+
+    def play(
+        self, progress: Progress | None = None, trajectories: Trajectories | None = None
+    ) -> Iterator[PlayedBatch]:
+        """Simulate all episodes.
+
+        Args:
+            progress: called with the number of episodes that are done.
+            trajectories: is filled, if given.
+        """
+        spec = self._spec
+        if self.jobs == 1:
+            return self.part(range(spec.episodes), progress, trajectories)
+        return play_in_processes(
+            partial(self._resolved.env, self._conditions),
+            self._resolved.policy,
+            spec.episodes,
+            spec.seed,
+            self._size,
+            self.jobs,
+            self._bridge is not None,
+            progress,
+        )
+
+    def part(
+        self,
+        episodes: range,
+        progress: Progress | None = None,
+        trajectories: Trajectories | None = None,
+    ) -> Iterator[PlayedBatch]:
+        """Simulate some of the episodes in this process; see `play`."""
+        return play(
+            self._env,
+            self._resolved.policy,
+            episodes,
+            self._spec.seed,
+            progress,
+            trajectories,
+            self._bridge,
+        )
+
+    def close(self) -> None:
+        """Close the envs."""
+        self._env.close()
+
+
+class CompiledPlayer:
+    """Runs a compiled program; the arguments are those of `NumpyPlayer`.
+
+    Attributes:
+        engine: "compiled".
+        jobs: threads.
+
+    Raises:
+        NotCompilableError: Only NumPy can do this.
+        ConfigurationError: Numba is missing.
+        SafeEnvsError: The filter cannot be made.
+    """
+
+    engine = "compiled"
+
+    def __init__(
+        self, resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
+    ) -> None:
+        spec = self._spec = resolved.spec
+        if resolved.target.filter_spec is not None:
+            raise NotCompilableError(
+                f"{resolved.target.title} is a third-party env, which only its own code can step;"
+                " use the engine 'numpy'"
+            )
+        if settings.record:
+            raise NotCompilableError(
+                "trajectories for pictures are kept by the engine 'numpy' alone; use that, or leave"
+                " the picture out"
+            )
+        problem = resolved.problem
+        safety_filter = (
+            SafetyFilter.for_problem(problem, conditions, spec.knowledge, spec.objective)
+            if conditions
+            else None
+        )
+        continuous = spec.monitoring == "continuous"
+        self._episodes = CompiledEpisodes(
+            problem, resolved.policy, safety_filter and safety_filter.qp, continuous
+        )
+        self._functions = self._episodes.compiled()
+        self.jobs = settings.jobs or available_threads()
+        self._reference = partial(NumpyPlayer, resolved, conditions, settings)
+
+    @cached_property
+    def _numpy(self) -> NumpyPlayer:
+        return self._reference()
+
+    def play(
+        self, progress: Progress | None = None, trajectories: Trajectories | None = None
+    ) -> Iterator[PlayedBatch]:
+        """Simulate all episodes; see `NumpyPlayer.play`."""
+        done = 0
+        for batch in self._episodes.play(
+            self._functions,
+            range(self._spec.episodes),
+            self._spec.seed,
+            self.jobs,
+            lambda part: self._numpy.part(part),
+        ):
+            yield batch
+            done += len(batch.starts)
+            if progress:
+                progress(done)
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to close."""
+
+
+Player = NumpyPlayer | CompiledPlayer
+
+
+def player_of(
+    resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
+) -> Player:
+    """Return who simulates the episodes under a filter; see `RunSettings.engine`.
+
+    Args:
+        resolved: what to simulate.
+        conditions: of the filter; none for the unfiltered env.
+        settings: how it is run.
+
+    Raises:
+        NotCompilableError: The compiled engine was asked for, and cannot do this.
+        SafeEnvsError: What is to be simulated cannot be made.
+    """
+    periods = resolved.spec.episodes * resolved.problem.steps
+    compiled = compiled_or_none(
+        settings.engine, periods, partial(CompiledPlayer, resolved, conditions, settings)
+    )
+    return compiled or NumpyPlayer(resolved, conditions, settings)

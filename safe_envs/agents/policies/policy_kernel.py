@@ -1,0 +1,53 @@
+"""What policies do in compiled programs, as kernels."""
+
+from __future__ import annotations
+
+from safe_envs.compiled.draws import POLICY
+from safe_envs.compiled.plain_natives import philox_block, uniform_of
+
+
+def action_of_input(u: float, low: float, high: float, center: float, half: float) -> float:
+    """Return the action in [-1, 1] for an input, which is clipped to its bounds; NaN for NaN."""
+    clipped = low if u < low else high if u > high else u
+    return (clipped - center) / half
+
+
+def input_of_action(action: float, center: float, half: float) -> float:
+    """Return the input that an env executes for an action; NaN for NaN."""
+    if action > 1.0:
+        return center + half
+    if action < -1.0:
+        return center - half
+    return center + half * action
+
+
+def random_action(place: int, k0: int, k1: int) -> float:
+    """Return the action that a word of the policy's stream of an episode stands for.
+
+    Args:
+        place: of the word, from 0.
+        k0: first word of the key of the episode.
+        k1: second word.
+    """
+    block = philox_block(place // 4 + 1, 0, POLICY, 0, k0, k1)
+    return 2.0 * uniform_of(block[place % 4]) - 1.0
+
+
+def clip_to_bound(value: float, bound: float) -> float:
+    """Return a number, or the end of [-bound, bound] that it lies beyond; NaN for NaN."""
+    return -bound if value < -bound else bound if value > bound else value
+
+
+def action_in_another_box(
+    action: float, center: float, half: float, new_center: float, new_half: float
+) -> float:
+    """Return the action that stands for the same or the nearest input in other input bounds.
+
+    Args:
+        action: in the old bounds.
+        center: of the old bounds.
+        half: width of the old bounds, halved.
+        new_center: of the new bounds.
+        new_half: width of the new bounds, halved.
+    """
+    return clip_to_bound((center + half * action - new_center) / new_half, 1.0)

@@ -1,0 +1,43 @@
+"""Policies as functions of compiled programs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from safe_envs.agents.policies.base import Policy, not_compilable
+from safe_envs.agents.policies.policy_kernel import input_of_action
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.own_source import has_own_source
+from safe_envs.envs.spaces import center_and_half_width
+from safe_envs.problem.problem import SafetyProblem
+
+_COMPUTING = ("predict", "begin", "actions", "act")
+"""Methods of policies by which they compute, as far as they have them."""
+
+
+def policy_source(policy: Any, problem: SafetyProblem, data: Data) -> Source:
+    """Return the function `act` of `safe_envs.compiled.slots`.
+
+    Args:
+        policy: a `Policy`, or another object with its `predict`, which has no such function.
+        problem: which the policy acts in.
+        data: receives its numbers.
+
+    Raises:
+        NotCompilableError: The policy is more than formulas of an observation.
+    """
+    own = isinstance(policy, Policy) and has_own_source(policy, *_COMPUTING)
+    if not own:
+        raise not_compilable(policy)
+    chosen = policy.source(data)
+    entries = ""
+    for j, (center, half) in enumerate(zip(*center_and_half_width(problem), strict=True)):
+        place = data.add([center, half])
+        entries += f"input_of_action(actions[{j}], data[{place}], data[{place + 1}]), "
+    return chosen + Source(
+        "def act(observation, step, k0, k1, data, work):\n"
+        "    actions = choose(observation, step, k0, k1, data, work)\n"
+        f"    return ({entries})\n",
+        (input_of_action,),
+    )
