@@ -127,6 +127,8 @@ def step_batch(  # noqa: PLR0913
     """
     status = DONE
     width = PERIODS * channels
+    if stepping and channels:
+        draw_ahead(width, restarts, counts_before, keys, episodes, chunks, noise)
     for i in range(len(restarts)):
         u = resting_input(data)
         if restarts[i]:
@@ -163,15 +165,8 @@ def step_batch(  # noqa: PLR0913
                     if not sound:
                         return UNDEFINED_FILTER
                 store_entries(inputs, i, 0, u)
-                place = 0
-                if channels:
-                    place = (period % PERIODS) * channels
-                    if chunks[i] != period // PERIODS:
-                        chunks[i] = period // PERIODS
-                        first = (period - period % PERIODS) * channels
-                        ahead = vector_view(noise, i * width, width)
-                        fill_normals(ahead, first, episodes[i], NOISE, keys[i, 0], keys[i, 1])
-                x = advance(x, u, noise, i * width + place, data)
+                place = i * width + period % PERIODS * channels
+                x = advance(x, u, noise, place, data)
         time = counts[i, STEPS] * dt
         counted = stepping or restarts[i]
         if not read_state(
@@ -183,6 +178,34 @@ def step_batch(  # noqa: PLR0913
         flags[TRUNCATED, i] = counts[i, STEPS] >= limit
         flags[ENDED, i] = flags[TERMINATED, i] or flags[TRUNCATED, i]
     return status
+
+
+def draw_ahead(
+    width: int,
+    restarts: np.ndarray,
+    counts: np.ndarray,
+    keys: np.ndarray,
+    episodes: np.ndarray,
+    chunks: np.ndarray,
+    noise: np.ndarray,
+) -> None:
+    """Draw a chunk of noise for each env that has none of its coming period.
+
+    Args:
+        width: numbers of a chunk.
+        restarts: see `step_batch`, as for the other arguments.
+        counts: before the step.
+        keys: see `step_batch`.
+        episodes: see `step_batch`.
+        chunks: see `step_batch`.
+        noise: see `step_batch`.
+    """
+    for i in range(len(restarts)):
+        chunk = counts[i, PERIOD] // PERIODS
+        if not restarts[i] and chunks[i] != chunk:
+            chunks[i] = chunk
+            ahead = vector_view(noise, i * width, width)
+            fill_normals(ahead, chunk * width, episodes[i], NOISE, keys[i, 0], keys[i, 1])
 
 
 def filter_input(  # noqa: PLR0913
