@@ -67,6 +67,18 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         ConfigurationError: the folder does not exist or is not writable, or the file cannot be
             written, as on a full disk; what was at `path` before is still there.
     """
+    with replaced_at_the_end(path) as temporary, writing(path):
+        write(temporary)
+
+
+@contextmanager
+def replaced_at_the_end(path: Path) -> Iterator[Path]:
+    """Yield a temporary file in the same folder, and move it to `path` in one step at the end.
+
+    For a file that is written bit by bit during a long run; `write_atomically` is for all others.
+    After an error what was at `path` before is still there. Errors as for `write_atomically`, but
+    those of the writing itself, for which see `writing`.
+    """
     require_writable(path)
     with writing(path):
         # With more of its name, the temporary one could be too long.
@@ -74,13 +86,14 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
             prefix=f".{path.stem[:_STEM]}.", suffix=path.suffix[-_STEM:], dir=path.absolute().parent
         )
         os.close(handle)
-        temporary = Path(name)
-        try:
-            write(temporary)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with writing(path):
             temporary.chmod(0o644)
             temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 @contextmanager

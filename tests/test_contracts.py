@@ -85,7 +85,6 @@ PHRASES = {
     r"least h": "minimum h",
     r"missed by": "violated by",
     r"natural filter": "default filter",
-    r"programs?": "QP",
     r"promis(e|es|ed|ing)": "guarantee, bound",
     r"rests? on": "depends on, assumes",
     r"some(body|one) else's": "third-party",
@@ -100,6 +99,9 @@ LOCAL_PHRASES = {
     # (path, phrase): replacement
     (FILTERS, r"rows?"): "constraint (row only for rows of arrays and tables)",
     (r"(?!safe_envs/wrappers/qp/).*", r"the (physical )?box"): "the input bounds",
+    (r"safe_envs/wrappers/(qp|safety_filter|torch_layer).*", r"programs?"): (
+        "QP (program only for compiled programs)"
+    ),
 }
 """Retired in some files only. The solvers in `wrappers.qp` take the rows of a matrix."""
 

@@ -7,19 +7,24 @@ import numpy as np
 from safe_envs.compiled.plain_natives import philox_block, uniform_of
 from safe_envs.compiled.slots import State, no_state, start_margin, start_state
 from safe_envs.dynamics.normal_kernel import standard_normal
+from safe_envs.dynamics.philox import EPISODE, START
 
-NOISE = 0
-START = 1
-BRIDGE = 2
-POLICY = 3
-EPISODE = 4
 MOST_TRIES = 10000
 
 
 def fill_uniforms(
     out: np.ndarray, first: int, episode: int, purpose: int, k0: int, k1: int
 ) -> None:
-    """Fill `out` with the uniforms of a stream from word `first`, a multiple of 4, on."""
+    """Write consecutive uniforms of a stream.
+
+    Args:
+        out: receives them.
+        first: word of the stream to begin with, a multiple of 4.
+        episode: number of the episode since the env was seeded.
+        purpose: of the stream.
+        k0: first word of the key.
+        k1: second word.
+    """
     count = len(out)
     for i in range(0, count, 4):
         w0, w1, w2, w3 = philox_block((first + i) // 4 + 1, episode, purpose, 0, k0, k1)
@@ -33,14 +38,29 @@ def fill_uniforms(
 
 
 def fill_normals(out: np.ndarray, first: int, episode: int, purpose: int, k0: int, k1: int) -> None:
-    """Fill `out` with standard normals of a stream from word `first`, a multiple of 4, on."""
+    """Write consecutive standard normals of a stream.
+
+    Args:
+        out: receives them.
+        first: word of the stream to begin with, a multiple of 4.
+        episode: number of the episode since the env was seeded.
+        purpose: of the stream.
+        k0: first word of the key.
+        k1: second word.
+    """
     fill_uniforms(out, first, episode, purpose, k0, k1)
     for i in range(len(out)):
         out[i] = standard_normal(out[i])
 
 
 def episode_key(episode: int, k0: int, k1: int) -> int:
-    """Return the seed of an episode of an evaluation, which is the first word of its key."""
+    """Return the seed of an episode of an evaluation, which is the first word of its key.
+
+    Args:
+        episode: number of the episode.
+        k0: first word of the key of the evaluation's seed.
+        k1: second word.
+    """
     return philox_block(episode + 1, 0, EPISODE, 0, k0, k1)[0]
 
 
@@ -66,6 +86,11 @@ def draw_start(k0: int, k1: int, episode: int, uniforms: np.ndarray, data: np.nd
 
 
 def store_row(row: np.ndarray, values: tuple[float, ...]) -> None:
-    """Write a tuple to an array of its length."""
+    """Write numbers to an array.
+
+    Args:
+        row: receives them.
+        values: as many numbers.
+    """
     for i in range(len(values)):
         row[i] = values[i]

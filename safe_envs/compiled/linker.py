@@ -140,5 +140,5 @@ def _bare(node: ast.FunctionDef) -> ast.FunctionDef:
     for argument in node.args.args:
         argument.annotation = None
     if ast.get_docstring(node) is not None:
-        node.body = node.body[1:]
+        node.body = node.body[1:] or [ast.Pass()]
     return node

@@ -23,8 +23,13 @@ __all__ = [
     "vector_view",
 ]
 
-kernel = numba.njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
-entry = numba.njit(nogil=True, error_model="numpy", _nrt=False, cache=True)
+# Nothing is allocated, so that arrays need not be counted, which takes longer than most kernels.
+_SETTINGS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
+# Python calls entry points alone; kernels compile in less time without the wrappers for it.
+_UNWRAPPED: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+kernel = numba.njit(**_SETTINGS, **_UNWRAPPED, forceinline=True)
+entry = numba.njit(**_SETTINGS, cache=True)
+passing_entry = numba.njit(**_SETTINGS)
 
 _WORD = np.uint64
 _FIRST, _SECOND = _WORD(0xD2E7470EE14C6C93), _WORD(0xCA5A826395121157)

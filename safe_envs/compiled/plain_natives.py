@@ -21,7 +21,16 @@ Words = tuple[int, int, int, int]
 
 
 def philox_block(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> Words:
-    """Return the Philox 4x64-10 block of a counter (four words) under a key (two words)."""
+    """Return a Philox 4x64-10 block of four words.
+
+    Args:
+        c0: first word of the counter; whole numbers are taken modulo 2**64.
+        c1: second word.
+        c2: third word.
+        c3: fourth word.
+        k0: first word of the key.
+        k1: second word.
+    """
     c0, c1, c2, c3, k0, k1 = (int(word) & _MASK for word in (c0, c1, c2, c3, k0, k1))
     for _ in range(_ROUNDS):
         first, second = _FIRST * c0, _SECOND * c2

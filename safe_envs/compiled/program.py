@@ -87,7 +87,8 @@ def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     folder = cache_folder()
     if folder is None:
         _LOG.warning("compiling %s; there is no folder of yours to keep it in", title)
-        return _functions({**vars(numba_natives), "entry": numba_natives.kernel}, text, names)
+        natives = {**vars(numba_natives), "entry": numba_natives.passing_entry}
+        return _functions(natives, text, names)
     program = _KeptProgram(folder / digest, text, title)
     forget_old_programs(folder)
     return {name: program.entry(name) for name in names}

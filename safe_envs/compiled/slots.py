@@ -15,12 +15,22 @@ Input = tuple[float, ...]
 
 
 def start_state(uniforms: np.ndarray, data: np.ndarray) -> State:
-    """Return the start state that uniforms in [0, 1) stand for."""
+    """Return the start state that uniforms stand for.
+
+    Args:
+        uniforms: in [0, 1), one for each of the distribution's.
+        data: numbers of the program.
+    """
     raise NotImplementedError
 
 
 def start_margin(x: State, data: np.ndarray) -> float:
-    """Return a number that is positive where a start state is allowed."""
+    """Return a number that is positive where a start state is allowed.
+
+    Args:
+        x: the start state.
+        data: numbers of the program.
+    """
     raise NotImplementedError
 
 
@@ -30,12 +40,27 @@ def no_state(data: np.ndarray) -> State:
 
 
 def advance(x: State, u: Input, noise: np.ndarray, first: int, data: np.ndarray) -> State:
-    """Return the state one control period later, with standard normals from `noise[first]` on."""
+    """Return the state one control period later.
+
+    Args:
+        x: n components of the state.
+        u: m components of the physical input.
+        noise: standard normals.
+        first: index of the first one of the period.
+        data: numbers of the program.
+    """
     raise NotImplementedError
 
 
 def measure(x: State, u: Input, time: float, data: np.ndarray) -> tuple[float, ...]:
-    """Return the features, the barriers, the reward, and how far the workspace and goal are off."""
+    """Return the features, the barriers, the reward, and how far the workspace and goal are off.
+
+    Args:
+        x: n components of the state.
+        u: m components of the input that led to it.
+        time: since the start of the episode, in s.
+        data: numbers of the program.
+    """
     raise NotImplementedError
 
 
@@ -91,7 +116,12 @@ def has_ended(values: tuple[float, ...]) -> bool:
 
 
 def is_finite(x: State, values: tuple[float, ...]) -> bool:
-    """Return whether a state and what an env reads off it are finite; not so for huge numbers."""
+    """Return whether a state and what an env reads off it are finite; not so for huge numbers.
+
+    Args:
+        x: n components of the state.
+        values: what `measure` returns.
+    """
     raise NotImplementedError
 
 
@@ -135,20 +165,40 @@ def has_left(values: tuple[float, ...]) -> bool:
 
 
 def observation_within(observation: tuple[float, ...], data: np.ndarray) -> tuple[float, ...]:
-    """Return an observation, clipped to the bounds of its space."""
+    """Return an observation, clipped to the bounds of its space.
+
+    Args:
+        observation: features in single precision.
+        data: numbers of the program.
+    """
     raise NotImplementedError
 
 
 def state_at(table: np.ndarray, row: int) -> State:
-    """Return the state that the first entries of a row of a table hold."""
+    """Return the state that the first entries of a row of a table hold.
+
+    Args:
+        table: at least n columns.
+        row: its row.
+    """
     raise NotImplementedError
 
 
 def input_at(table: np.ndarray, row: int) -> Input:
-    """Return the input that the first entries of a row of a table hold."""
+    """Return the input that the first entries of a row of a table hold.
+
+    Args:
+        table: at least m columns.
+        row: its row.
+    """
     raise NotImplementedError
 
 
 def scaled_input(action: Input, data: np.ndarray) -> Input:
-    """Return the physical input of an action in [-1, 1], which is clipped to it."""
+    """Return the physical input of an action in [-1, 1], which is clipped to it.
+
+    Args:
+        action: m components.
+        data: numbers of the program.
+    """
     raise NotImplementedError

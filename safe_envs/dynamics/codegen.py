@@ -141,13 +141,21 @@ def _compile(
 def prepared(
     arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]
 ) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
-    """Prepare what both flavours share.
-
-    The arguments and formulas have plain names, these with rounded numbers, and common
-    subexpressions are taken out.
+    """Prepare what all flavours of code share.
 
     An env and a batch of it ask for the same formulas, one after the other, and to find what they
     share takes longest.
+
+    Args:
+        arguments: symbols of a function.
+        expressions: what it returns.
+
+    Returns:
+        The arguments and the formulas with plain names; the formulas with rounded numbers; and what
+        `sympy.cse` makes of these: the common subexpressions, and the formulas of them.
+
+    Raises:
+        SystemDefinitionError: See `compile_function`.
     """
     for expression in expressions:
         require_computable(expression, arguments)

@@ -87,22 +87,23 @@ def evaluate(
     third_party = filter_spec and env.env_id and not env.system
     common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "engine": engine}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
+    common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id
-    _evaluate(problem, policy, refine, (json, episodes_out, plot), common)
+    _evaluate(problem, policy, refine, (json, plot), common)
 
 
 def _evaluate(
     problem: Any,
     policy: str,
     refine: bool,
-    outputs: tuple[Path | None, Path | None, Path | None],
+    outputs: tuple[Path | None, Path | None],
     arguments: dict[str, Any],
 ) -> None:
     """Evaluate, print and write."""
     from safe_envs.agents.evaluation import evaluate, refinement
     from safe_envs.scripts.reports.evaluation_report import print_evaluation, print_refinement
 
-    json, episodes_out, plot = outputs
+    json, plot = outputs
     found: Any
     with progress_bar("Evaluating") as progress:
         run: Any = refinement.refine if refine else evaluate.evaluate
@@ -112,10 +113,6 @@ def _evaluate(
     if refine:
         print_refinement(stdout(), found)
     write_result(json, found.document)
-    if episodes_out is not None:
-        from safe_envs.agents.evaluation.episodes_file import write_episodes
-
-        write_episodes(episodes_out, first)
     if plot is not None:
         from safe_envs.scripts.figures.evaluation_figure import draw
 

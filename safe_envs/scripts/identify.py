@@ -80,7 +80,7 @@ def identify(
     states of the sampling domain, is that of the plant, with its --noise.
     """
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.identify_answer import IdentifyAnswer, Source, compare
+    from safe_envs.scripts.reports.identify_answer import DataFile, IdentifyAnswer, compare
     from safe_envs.scripts.reports.identify_report import print_report
     from safe_envs.wrappers.learning import learner_of
     from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning
@@ -110,7 +110,7 @@ def identify(
         functions=compare(learned, problem, seed),
         options=arguments,
         seed=seed,
-        source=None if data is None or transitions is None else Source(data, transitions),
+        source=None if data is None or transitions is None else DataFile(data, transitions),
         out=out,
         use=env.evaluate_command("--filter", _filter_of(method), "--learned", str(out)),
     )

@@ -13,7 +13,7 @@ import pytest
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.registry import make_problem
 from safe_envs.scripts.options.method_settings import SETTINGS, read_settings, settings_of
-from safe_envs.scripts.reports.identify_answer import Function, Source, unit_of
+from safe_envs.scripts.reports.identify_answer import DataFile, Function, unit_of
 from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning import METHODS, learner_of, load_learned
 from safe_envs.wrappers.learning.data.collection import collect
@@ -219,7 +219,7 @@ def test_what_is_said_of_data_from_elsewhere():
         data.signature, data.x, data.u, data.successors[:, 0], 0.01 * np.arange(1, data.points + 1)
     )
     assert (
-        str(Source(Path("log.npz"), logged))
+        str(DataFile(Path("log.npz"), logged))
         == f"in steps of 0.01 to {0.01 * data.points:g} s, from elsewhere"
     )
 

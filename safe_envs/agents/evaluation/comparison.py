@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
+from safe_envs.agents.evaluation.safe_flags import SafeFlags
 from safe_envs.agents.evaluation.statistics import (
     mcnemar_p,
     paired_difference_interval,
@@ -47,29 +48,37 @@ class Comparison:
     mcnemar_p: float | None
 
 
-def pair_counts(first: np.ndarray, second: np.ndarray) -> Table:
+def pair_counts(first: SafeFlags, second: SafeFlags) -> Table:
     """Count the episodes that are safe with both, the first only, the second only, and neither.
 
     Args:
-        first: which episodes are safe with the one, shape (E,).
+        first: which episodes are safe with the one.
         second: which of the same are with the other.
 
     Returns:
         The four counts.
+
+    Raises:
+        ValueError: one has more episodes than the other.
     """
-    counts = (first & second, first & ~second, second & ~first, ~(first | second))
-    both, only_first, only_second, neither = (int(np.count_nonzero(each)) for each in counts)
-    return both, only_first, only_second, neither
+    if len(first) != len(second):
+        raise ValueError(f"{len(first)} and {len(second)} episodes are not the same ones")
+    a, b = first.packed, second.packed
+    both, only_first, only_second = (_ones(each) for each in (a & b, a & ~b, b & ~a))
+    return both, only_first, only_second, len(first) - both - only_first - only_second
 
 
-def compare_all(safe: Mapping[str, Sequence[np.ndarray]], confidence: float) -> list[Comparison]:
+def _ones(packed: np.ndarray) -> int:
+    return int(np.bitwise_count(packed).sum())
+
+
+def compare_all(safe: Mapping[str, Sequence[SafeFlags]], confidence: float) -> list[Comparison]:
     """Compare each filter with those before it, by which of the same episodes are safe.
 
     A p value is of its pair alone: it is not adjusted for the number of pairs.
 
     Args:
-        safe: by filter, which episodes are safe, shape (E,): once, or with each of several
-            identifications.
+        safe: by filter, which episodes are safe: once, or with each of several identifications.
         confidence: of the interval of the difference of the rates.
 
     Returns:
@@ -81,7 +90,7 @@ def compare_all(safe: Mapping[str, Sequence[np.ndarray]], confidence: float) -> 
     ]
 
 
-def _tables(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> list[Table]:
+def _tables(first: Sequence[SafeFlags], second: Sequence[SafeFlags]) -> list[Table]:
     """Count with each identification; what has only one is paired with all of the other's."""
     count = max(len(first), len(second))
     return [pair_counts(first[r % len(first)], second[r % len(second)]) for r in range(count)]

@@ -1,4 +1,4 @@
-"""Episodes that run side by side, and the statistics of many of them."""
+"""Episodes that run side by side."""
 
 from __future__ import annotations
 
@@ -7,16 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_envs.agents.evaluation.rounding import touching
-from safe_envs.agents.evaluation.rows import EpisodeResults, EpisodeSummary
-from safe_envs.agents.evaluation.running_sum import RunningSum
-from safe_envs.agents.evaluation.statistics import rate_interval, safety_curve, share
+from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.visited_states import StateWatch, VisitedStates
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.problem.problem import SafetyProblem
-
-_QUANTILES_OF = 65_536
-"""Episodes of which quantiles are taken, the first ones: enough, as they are independent."""
 
 
 class EpisodeBatch:
@@ -120,58 +115,3 @@ class PlayedBatch:
     starts: np.ndarray
     touching: int
     visited: VisitedStates
-
-
-class EpisodeStatistics:
-    """The episodes under one filter, batch by batch.
-
-    Args:
-        problem: whose episodes they are.
-
-    Attributes:
-        visited: states that may contradict a bound.
-    """
-
-    def __init__(self, problem: SafetyProblem) -> None:
-        self._problem = problem
-        self._parts: list[EpisodeResults] = []
-        self._touching = 0
-        self.visited = VisitedStates.nothing(problem)
-
-    def add(self, batch: PlayedBatch) -> None:
-        """Add a batch."""
-        self._parts.append(batch.results)
-        self._touching += batch.touching
-        self.visited = self.visited.joined(batch.visited)
-
-    @property
-    def results(self) -> EpisodeResults:
-        """The results of all episodes."""
-        if len(self._parts) > 1:
-            self._parts = [EpisodeResults.joined(self._parts)]
-        return self._parts[0]
-
-    def summary(self, confidence: float) -> EpisodeSummary:
-        """Return statistics with intervals of a confidence; None where no step counts."""
-        found, problem = self.results, self._problem
-        episodes, safe = len(found.safe), int(found.safe.sum())
-        low, high = rate_interval(safe, episodes, confidence)
-        p05, median = np.quantile(found.min_h[:_QUANTILES_OF], (0.05, 0.5)).tolist()
-        counted = int(found.counted.sum())
-        efforts = found.effort[found.counted > 0]
-        return EpisodeSummary(
-            episodes=episodes,
-            safe=safe,
-            safety_rate=safe / episodes,
-            ci_low=low,
-            ci_high=high,
-            min_h_median=median,
-            min_h_p05=p05,
-            violations=episodes - safe,
-            touching=self._touching,
-            intervention_rate=share(int(found.interventions.sum()), counted),
-            infeasible_rate=share(int(found.infeasible.sum()), counted),
-            effort_mean=share(RunningSum.of(efforts), len(efforts)),
-            return_mean=RunningSum.of(found.returns) / episodes,
-            curve=safety_curve(found.first_violation, problem.steps, problem.dt, confidence),
-        )

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from safe_envs.compiled.draws import (
-    BRIDGE,
-    NOISE,
     draw_start,
     episode_key,
     fill_normals,
@@ -39,6 +37,7 @@ from safe_envs.compiled.slots import (
     smallest_barrier,
 )
 from safe_envs.dynamics.normal_kernel import standard_exponential
+from safe_envs.dynamics.philox import BRIDGE, NOISE
 
 FIRST_STATE = 0
 DEEPEST_STATE = 1

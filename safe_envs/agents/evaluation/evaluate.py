@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
-from safe_envs.agents.evaluation.episode_batch import EpisodeStatistics
+from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
+from safe_envs.agents.evaluation.episodes_file import episodes_file
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
+from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
 from safe_envs.agents.evaluation.players import Player, player_of
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
@@ -46,6 +49,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     progress: Progress | None = None,
     record: bool = False,
     engine: str = "auto",
+    keep_episodes: bool | None = None,
+    episodes_out: Path | str | None = None,
 ) -> Evaluation:
     """Estimate the safety of a policy under each filter.
 
@@ -89,6 +94,9 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
         engine: "auto", "numpy" or "compiled": see `RunSettings`.
+        keep_episodes: keep the results of each episode; by default where there are at most
+            1,000,000 of them, under all filters. Without it memory does not grow with them.
+        episodes_out: FILE.parquet to which they are written while they are simulated.
 
     Raises:
         ConfigurationError: An argument names something unknown or is out of range.
@@ -112,7 +120,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         repeats=repeats,
         monitoring=monitoring,
     )
-    return run_evaluation(spec, RunSettings(num_envs, jobs, record, progress, engine))
+    settings = RunSettings(num_envs, jobs, record, progress, engine, keep_episodes, episodes_out)
+    return run_evaluation(spec, settings)
 
 
 def run_evaluation(spec: EvaluationSpec, settings: RunSettings | None = None) -> Evaluation:
@@ -132,6 +141,8 @@ class _Runner:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
         parts = len(resolved.learning.missing()) + sum(map(resolved.repeats, resolved.names))
         self._work = WorkParts(settings.progress, parts)
+        identifications = sum(map(resolved.repeats, resolved.names))
+        self._keeps = settings.keeps(self._spec.episodes * identifications)
         asked = None if self._spec.bounds else "it was not asked for"
         self._why_no_bound = resolved.target.why_no_bound or asked
 
@@ -149,35 +160,44 @@ class _Runner:
         trajectories = (
             {name: Trajectories(*shape) for name in resolved.names} if settings.record else {}
         )
-        rows, timings, episodes, visited = [], [], {}, {}
-        for name in resolved.names:
-            begun = time.perf_counter()
-            totals, averagers = self._simulated(name, players[name], trajectories.get(name))
-            rows.append(self._row(name, totals, averagers, config["policy"]["name"]))
-            episodes[name] = [each.results for each in totals]
-            visited[name] = [each.visited for each in totals]
-            timings.append(
-                self._timing(name, totals, players[name][0], time.perf_counter() - begun)
-            )
+        rows, timings, safe, visited = [], [], {}, {}
+        kept = KeptEpisodes() if self._keeps else None
+        sinks: list[EpisodeSink] = [kept] if kept else []
+        with ExitStack() as opened:
+            if settings.episodes_out is not None:
+                path = Path(settings.episodes_out)
+                sinks.append(opened.enter_context(episodes_file(path, resolved.problem.dt)))
+            for name in resolved.names:
+                begun = time.perf_counter()
+                totals, averagers = self._simulated(
+                    name, players[name], trajectories.get(name), sinks
+                )
+                rows.append(self._row(name, totals, averagers, config["policy"]["name"]))
+                safe[name] = [each.safe for each in totals]
+                visited[name] = [each.visited for each in totals]
+                seconds = time.perf_counter() - begun
+                timings.append(self._timing(name, totals, players[name][0], seconds))
         return Evaluation(
             resolved.problem,
             spec,
             config,
             rows,
-            compare_all(
-                {name: [each.safe for each in found] for name, found in episodes.items()},
-                spec.confidence,
-            ),
+            compare_all(safe, spec.confidence),
             Timing(settings.num_envs, timings),
             trajectories,
-            episodes,
+            safe,
             visited,
             resolved.learning.models(),
             resolved.is_deterministic,
+            kept and kept.joined(),
         )
 
     def _simulated(
-        self, name: str, players: Sequence[Player], trajectories: Trajectories | None
+        self,
+        name: str,
+        players: Sequence[Player],
+        trajectories: Trajectories | None,
+        sinks: Sequence[EpisodeSink],
     ) -> tuple[list[EpisodeStatistics], list[GuaranteeAverager]]:
         """Run the episodes under a filter, with each identification."""
         resolved, episodes = self._resolved, self._spec.episodes
@@ -189,9 +209,13 @@ class _Runner:
         for repeat, (player, averager) in enumerate(zip(players, averagers, strict=True)):
             statistics = EpisodeStatistics(resolved.problem)
             recorded = trajectories if repeat == 0 else None
+            for sink in sinks:
+                sink.begin(name, repeat)
             for batch in player.play(self._work.part(episodes), recorded):
                 averager.add(batch.starts)
                 statistics.add(batch)
+                for sink in sinks:
+                    sink.add(batch.results)
             player.close()
             found.append(statistics)
         return found, averagers
@@ -221,7 +245,7 @@ class _Runner:
     def _timing(
         self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float
     ) -> FilterTiming:
-        steps = sum(int(each.results.length.sum()) for each in totals)
+        steps = sum(each.steps for each in totals)
         learning = seconds_of(self._resolved.filters[name])
         return FilterTiming(
             name, seconds, steps, steps / seconds, learning, player.engine, player.jobs

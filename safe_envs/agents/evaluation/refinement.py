@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.comparison import pair_counts
@@ -83,6 +84,7 @@ def refine(
     *,
     progress: Progress | None = None,
     record: bool = False,
+    episodes_out: Path | str | None = None,
     **arguments: Any,
 ) -> Refinement:
     """Evaluate with the control periods dt, dt/2 and dt/4: has the safety rate converged?
@@ -105,6 +107,7 @@ def refine(
         policy: as for `evaluate`.
         progress: called with the part of the work of all three that is done, from 0 to 1.
         record: keep trajectories of the first evaluation for pictures.
+        episodes_out: FILE.parquet for the results of each episode of the first evaluation.
         **arguments: the others of `evaluate`.
 
     Returns:
@@ -123,7 +126,8 @@ def refine(
         raise ConfigurationError(
             "the control period of a third-party env is its own, and cannot be refined"
         )
-    first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
+    of_first = {"record": record, "episodes_out": episodes_out}
+    first = evaluate(problem, policy, progress=_share(progress, 0), **of_first, **arguments)
     arguments |= {
         "options": None,
         "filters": first.spec.filters or [row.filter for row in first.rows],
@@ -163,7 +167,7 @@ def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
 
 def _row(name: str, evaluations: tuple[Evaluation, ...]) -> RefinementRow:
     rows = [evaluation.row(name) for evaluation in evaluations]
-    coarse, fine = (evaluation.episodes[name][0].safe for evaluation in evaluations[-2:])
+    coarse, fine = (evaluation.safe[name][0] for evaluation in evaluations[-2:])
     low, high = paired_difference_interval(
         *pair_counts(fine, coarse), evaluations[0].spec.confidence
     )

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.rows import EpisodeSummary
-from safe_envs.agents.evaluation.statistics import Curve, rate_interval, repeated_interval
+from safe_envs.agents.evaluation.safety_curve import Curve
+from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 
 _MEANS = (
     "min_h_median",

@@ -10,6 +10,7 @@ import numpy as np
 from safe_envs.agents.evaluation.comparison import Comparison
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
+from safe_envs.agents.evaluation.safe_flags import SafeFlags
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.evaluation.visited_states import VisitedStates
@@ -69,11 +70,12 @@ class Evaluation:
         comparisons: of every two rows, by which of the same episodes were safe.
         timing: the only part that depends on the machine and on `num_envs`.
         trajectories: of each filter, if they were asked for.
-        episodes: results of each episode, for each filter and identification.
+        safe: which episodes are safe, for each filter and identification.
         visited: states of the episodes that contradict a bound, if any do, for each filter and
             identification.
         learned: models of the first identifications.
         is_deterministic: whether nothing is random, so that all episodes are one and the same.
+        episodes_if_kept: see `episodes`; None where they were not kept.
     """
 
     problem: SafetyProblem
@@ -83,15 +85,34 @@ class Evaluation:
     comparisons: list[Comparison]
     timing: Timing
     trajectories: dict[str, Trajectories]
-    episodes: dict[str, list[EpisodeResults]]
+    safe: dict[str, list[SafeFlags]]
     visited: dict[str, list[VisitedStates]]
     learned: list[LearnedModel]
     is_deterministic: bool
+    episodes_if_kept: dict[str, list[EpisodeResults]] | None
 
     @property
     def title(self) -> str:
         """How results call what was evaluated."""
         return self.config["title"]
+
+    @property
+    def episodes(self) -> dict[str, list[EpisodeResults]]:
+        """Results of each episode, for each filter and identification.
+
+        They are there where the evaluation was to keep them: see `RunSettings.keep_episodes`.
+
+        Raises:
+            ConfigurationError: they were not kept.
+        """
+        if self.episodes_if_kept is None:
+            count = sum(len(flags) for each in self.safe.values() for flags in each)
+            raise ConfigurationError(
+                f"the results of the {count:,} episodes were not kept one by one; evaluate with"
+                " keep_episodes=True for that, or with episodes_out='FILE.parquet' to write them"
+                " to a file, which takes no memory"
+            )
+        return self.episodes_if_kept
 
     def row(self, name: str) -> EvaluationRow:
         """Return the row of a filter.
@@ -118,25 +139,14 @@ class Evaluation:
             Arrays of equal length: filter, identification, episode, safe, return, min_h,
             first_violation (s, NaN where there is none), length (steps), interventions,
             infeasible, effort.
+
+        Raises:
+            ConfigurationError: they were not kept: see `episodes`.
         """
         found: dict[str, list[Any]] = {}
         for name, identifications in self.episodes.items():
             for repeat, results in enumerate(identifications):
-                count = len(results.length)
-                time = self.problem.dt * results.first_violation
-                columns = {
-                    "filter": np.full(count, name),
-                    "identification": np.full(count, repeat),
-                    "episode": np.arange(count),
-                    "safe": results.safe,
-                    "return": results.returns,
-                    "min_h": results.min_h,
-                    "first_violation": np.where(results.safe, np.nan, time),
-                    "length": results.length,
-                    "interventions": results.interventions,
-                    "infeasible": results.infeasible,
-                    "effort": results.effort,
-                }
+                columns = results.columns(name, repeat, 0, self.problem.dt)
                 for key, values in columns.items():
                     found.setdefault(key, []).append(values)
         return {key: np.concatenate(parts) for key, parts in found.items()}
@@ -148,7 +158,8 @@ class Evaluation:
             episodes: whether to return the columns of `episode_columns`.
 
         Raises:
-            ConfigurationError: pandas is not installed.
+            ConfigurationError: pandas is not installed, or the episodes were not kept: see
+                `episodes`.
         """
         try:
             import pandas as pd  # pyright: ignore[reportMissingImports]

@@ -26,7 +26,10 @@ from safe_envs.wrappers import SafetyMonitorVector
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
 
 _PARTS = 4
-"""Parts into which the work of each process is divided, so that there is progress to report."""
+"""Parts at least into which the work of each process is divided, so that there is progress."""
+
+_LARGEST_PART = 65_536
+"""Episodes of a part at most, as the results of all of them are sent at once."""
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -116,7 +119,7 @@ def play_in_processes(
         ConfigurationError: Something cannot be sent to a process, mostly a custom policy.
         WorkersLostError: A process was ended from outside.
     """
-    size = max(1, math.ceil(episodes / (jobs * _PARTS)))
+    size = min(max(1, math.ceil(episodes / (jobs * _PARTS))), _LARGEST_PART)
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
     shared = (make_env, policy, seed, num_envs, continuous)
     for part, batches in zip(parts, compute_in_order(_played, shared, parts, jobs), strict=True):

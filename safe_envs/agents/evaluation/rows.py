@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.statistics import Curve
+from safe_envs.agents.evaluation.safety_curve import Curve
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,37 @@ class EpisodeResults:
     def counted(self) -> np.ndarray:
         """Periods up to a first violation, those in which conditions mean something."""
         return np.where(self.safe, self.length, self.first_violation)
+
+    def columns(self, name: str, repeat: int, first: int, dt: float) -> dict[str, np.ndarray]:
+        """Return the results as columns, of which the first three say whose they are.
+
+        Args:
+            name: of the filter.
+            repeat: number of the identification.
+            first: number of the first of these episodes.
+            dt: control period in s.
+
+        Returns:
+            What `Evaluation.episode_columns` tells, shape (E,) each.
+        """
+        count = len(self.length)
+        return {
+            "filter": np.full(count, name),
+            "identification": np.full(count, repeat),
+            "episode": np.arange(first, first + count),
+            "safe": self.safe,
+            "return": self.returns,
+            "min_h": self.min_h,
+            "first_violation": np.where(self.safe, np.nan, dt * self.first_violation),
+            "length": self.length,
+            "interventions": self.interventions,
+            "infeasible": self.infeasible,
+            "effort": self.effort,
+        }
+
+    def part(self, where: slice) -> EpisodeResults:
+        """Return the results of some of the episodes."""
+        return EpisodeResults(*(getattr(self, field.name)[where] for field in fields(self)))
 
     @classmethod
     def joined(cls, parts: Sequence[EpisodeResults]) -> EpisodeResults:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
+from safe_envs.agents.evaluation.episodes_file import require_parquet
 from safe_envs.agents.evaluation.statistics import require_confidence
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
@@ -165,6 +166,9 @@ class EvaluationSpec:
         return cls(**data, trust=trust)
 
 
+_MOST_KEPT = 1_000_000
+"""Episodes whose results are kept where it is not said whether to: 40 MB."""
+
 _WRITTEN = tuple(each.name for each in fields(EvaluationSpec) if each.name != "trust")
 """Fields that are written as data."""
 
@@ -182,9 +186,14 @@ class RunSettings:
         engine: "numpy"; "compiled", which compiles each kind of simulation once, and needs Numba;
             or "auto" for the compiled one from 5e6 control periods of a filter on, if it is there
             and can do it. They agree to rounding, but for steps within rounding of a threshold.
+        keep_episodes: keep the results of each episode in memory, 40 bytes for one; None for that
+            where there are at most 1,000,000 of them, under all filters. What they are needed for
+            is an error where they are not kept.
+        episodes_out: FILE.parquet to which they are written while they are simulated.
 
     Raises:
-        ConfigurationError: A value is out of range, or trajectories are asked of several processes.
+        ConfigurationError: A value is out of range, trajectories are asked of several processes,
+            or the file cannot be written.
     """
 
     num_envs: int = 1024
@@ -192,10 +201,19 @@ class RunSettings:
     record: bool = False
     progress: Progress | None = None
     engine: str = "auto"
+    keep_episodes: bool | None = None
+    episodes_out: Path | str | None = None
 
     def __post_init__(self) -> None:
         require_whole("num_envs", self.num_envs, 1)
         require_engine(self.engine)
+        if not isinstance(self.keep_episodes, bool | np.bool_ | None):
+            raise ConfigurationError(
+                f"keep_episodes = {shown(self.keep_episodes)}; give True, False or None"
+            )
+        if self.episodes_out is not None:
+            object.__setattr__(self, "episodes_out", Path(self.episodes_out))
+            require_parquet(Path(self.episodes_out), "episodes_out")
         if self.jobs is None:
             return
         require_whole("jobs", self.jobs, 1)
@@ -204,6 +222,10 @@ class RunSettings:
                 f"jobs = {self.jobs}: trajectories for pictures are kept in one process; leave jobs"
                 " out, or the picture"
             )
+
+    def keeps(self, episodes: int) -> bool:
+        """Return whether the results of each of so many episodes are kept."""
+        return episodes <= _MOST_KEPT if self.keep_episodes is None else self.keep_episodes
 
 
 def _plain(value: Any) -> Any:

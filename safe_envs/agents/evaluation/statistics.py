@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from safe_envs.errors import ConfigurationError
-
-_MOST_INTERVALS = 200
 
 
 def require_confidence(confidence: Any) -> None:
@@ -240,48 +237,6 @@ def _counts(successes: float, trials: float) -> np.ndarray:
             " successes"
         )
     return np.asarray(successes)
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A safety rate over time, with its pointwise interval.
-
-    Attributes:
-        time: instants in s, at most 201.
-        safe: number of episodes without a violation up to each.
-        rate: their share.
-        ci_low: lower end of its interval.
-        ci_high: upper end.
-    """
-
-    time: list[float]
-    safe: list[int]
-    rate: list[float]
-    ci_low: list[float]
-    ci_high: list[float]
-
-
-def safety_curve(first_violation: np.ndarray, steps: int, dt: float, confidence: float) -> Curve:
-    """Return the rate of the episodes that are safe so far, at instants spread over the horizon.
-
-    Args:
-        first_violation: control instant of the first violation of each episode, shape (E,); -1
-            where there is none.
-        steps: number of control periods of the horizon.
-        dt: control period in s.
-        confidence: of the intervals.
-    """
-    instants = curve_instants(steps)
-    lost = np.searchsorted(instants, first_violation[first_violation >= 0])
-    safe = len(first_violation) - np.cumsum(np.bincount(lost, minlength=len(instants)))
-    low, high = rate_band(safe, len(first_violation), confidence)
-    columns = (instants * dt, safe, safe / len(first_violation), low, high)
-    return Curve(*(values.tolist() for values in columns))
-
-
-def curve_instants(steps: int) -> np.ndarray:
-    """Return the control instants of a curve, evenly spaced with both ends: at most 201."""
-    return np.append(np.arange(0, steps, -(-steps // _MOST_INTERVALS)), steps)
 
 
 def share(part: float, whole: float) -> float | None:

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
-from safe_envs.compiled.draws import POLICY
 from safe_envs.compiled.plain_natives import philox_block, uniform_of
+from safe_envs.dynamics.philox import POLICY
 
 
 def action_of_input(u: float, low: float, high: float, center: float, half: float) -> float:
-    """Return the action in [-1, 1] for an input, which is clipped to its bounds; NaN for NaN."""
+    """Return the action in [-1, 1] for an input, which is clipped to its bounds; NaN for NaN.
+
+    Args:
+        u: physical input.
+        low: lower bound.
+        high: upper bound.
+        center: middle of the bounds.
+        half: half of their distance.
+    """
     clipped = low if u < low else high if u > high else u
     return (clipped - center) / half
 
 
 def input_of_action(action: float, center: float, half: float) -> float:
-    """Return the input that an env executes for an action; NaN for NaN."""
+    """Return the input that an env executes for an action; NaN for NaN.
+
+    Args:
+        action: what lies beyond [-1, 1] is clipped.
+        center: middle of the input bounds.
+        half: half of their distance.
+    """
     if action > 1.0:
         return center + half
     if action < -1.0:
@@ -34,7 +48,12 @@ def random_action(place: int, k0: int, k1: int) -> float:
 
 
 def clip_to_bound(value: float, bound: float) -> float:
-    """Return a number, or the end of [-bound, bound] that it lies beyond; NaN for NaN."""
+    """Return a number, or the end of [-bound, bound] that it lies beyond; NaN for NaN.
+
+    Args:
+        value: the number.
+        bound: not negative.
+    """
     return -bound if value < -bound else bound if value > bound else value
 
 

@@ -78,11 +78,7 @@ def require_outputs(
     if episodes_out is not None:
         from safe_envs.agents.evaluation.episodes_file import require_parquet
 
-        require_parquet()
-        if episodes_out.suffix != ".parquet":
-            raise ConfigurationError(
-                f"--episodes-out {episodes_out} is no name of a Parquet file; give FILE.parquet"
-            )
+        require_parquet(episodes_out, "--episodes-out")
     if plot is not None:
         _require_format(plot)
 

@@ -79,7 +79,7 @@ class Function:
 
 
 @dataclass(frozen=True)
-class Source:
+class DataFile:
     """A file of data that was learned from.
 
     Attributes:
@@ -120,7 +120,7 @@ class IdentifyAnswer:
     functions: tuple[Function, ...] | str
     options: dict[str, Any]
     seed: int
-    source: Source | None
+    source: DataFile | None
     out: Path
     use: str
 

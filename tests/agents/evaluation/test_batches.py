@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError, RelativeDegreeError
 from safe_envs.agents import NominalController, evaluate, make_problem
+from safe_envs.agents.evaluation import rollout
 from safe_envs.agents.evaluation.rollout import play
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -183,7 +185,7 @@ def test_trajectories_keep_a_bounded_number_of_episodes():
 
 
 @pytest.mark.slow
-def test_memory_grows_with_the_results_of_episodes_alone():
+def test_memory_does_not_grow_with_episodes():
     problem = make_problem("Scalar-v0", horizon=0.02)
 
     def peak(episodes):
@@ -196,16 +198,36 @@ def test_memory_grows_with_the_results_of_episodes_alone():
                 num_envs=256,
                 record=True,
                 bounds=False,
+                keep_episodes=False,
             )
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
 
     peak(256)
-    few, many = peak(256), peak(2560)
-    # Of an episode its 40 bytes of results are kept, joined and copied for quantiles and sums: that
-    # is far less than its steps.
-    assert many - few < 16 * 8 * (2560 - 256)
+    few, many = peak(512), peak(5120)
+    # The results of an episode, of which one bit is kept, take 40 bytes, and more to be joined.
+    assert many - few < 10 * (5120 - 512)
+
+
+def test_parts_of_processes_do_not_grow_with_episodes(monkeypatch):
+    def largest(episodes):
+        sizes, told = [], []
+
+        def done(function, shared, parts, jobs):
+            sizes.extend(map(len, parts))
+            return ([] for _ in parts)
+
+        monkeypatch.setattr(rollout, "compute_in_order", done)
+        how = (episodes, 0, 1024, 2, False, told.append)
+        no_env: Any = None
+        assert list(rollout.play_in_processes(no_env, None, *how)) == []
+        assert sum(sizes) == told[-1] == episodes
+        return max(sizes)
+
+    assert largest(5) == 1
+    assert largest(800) == 100
+    assert largest(10**7) == largest(10**8) == 65_536
 
 
 def test_progress_goes_from_nothing_to_all():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import pyarrow.parquet as pq
 import pytest
 
 from safe_envs import ConfigurationError
@@ -45,7 +46,7 @@ def test_rates_are_those_of_evaluations_with_smaller_periods():
                 assert getattr(refined, key)[i] == getattr(row, key)
     for row in answer.rows:
         assert row.change == pytest.approx((row.safe[2] - row.safe[1]) / 24)
-        fine, coarse = (e.episodes[row.filter][0].safe for e in answer.evaluations[:0:-1])
+        fine, coarse = (e.safe[row.filter][0] for e in answer.evaluations[:0:-1])
         table = pair_counts(fine, coarse)
         assert table[0] + table[1] == row.safe[2]
         assert table[0] + table[2] == row.safe[1]
@@ -136,3 +137,19 @@ def test_errors_are_those_of_an_evaluation():
     ):
         with pytest.raises(ConfigurationError):
             refine("Scalar-v0", **arguments)
+
+
+def test_the_file_of_episodes_is_of_the_first_evaluation(tmp_path):
+    path = tmp_path / "out.parquet"
+    answer = refine(
+        "Scalar-v0",
+        "random",
+        episodes_out=path,
+        filters=["none"],
+        options={"horizon": 0.4, "noise": 0.8},
+        episodes=12,
+    )
+    table = pq.read_table(path)
+    first = answer.evaluations[0]
+    assert table["return"].to_pylist() == first.episode_columns()["return"].tolist()
+    assert max(table["length"].to_pylist()) == first.problem.steps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -12,7 +13,7 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import episodes_file
-from safe_envs.agents.evaluation.episodes_file import write_episodes
+from safe_envs.agents.evaluation.spec import RunSettings
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +58,32 @@ def test_results_of_episodes_are_those_of_the_rows(found):
         assert row.intervention_rate == pytest.approx(share)
 
 
+def test_episodes_that_were_not_kept_are_an_error_that_says_what_to_do(found):
+    without = measured(keep_episodes=False)
+    assert without.rows == found.rows
+    assert without.comparisons == found.comparisons
+    for use in (lambda: without.episodes, without.episode_columns):
+        with pytest.raises(ConfigurationError, match=r"the 80 episodes .* keep_episodes=True"):
+            use()
+    for name, (flags,) in without.safe.items():
+        np.testing.assert_array_equal(flags.array, found.episodes[name][0].safe)
+
+
+def test_episodes_are_kept_up_to_a_million_unless_it_is_said():
+    assert RunSettings().keeps(1_000_000)
+    assert not RunSettings().keeps(1_000_001)
+    assert RunSettings(keep_episodes=True).keeps(1_000_001)
+    assert not RunSettings(keep_episodes=False).keeps(1)
+    word: Any = "no"
+    with pytest.raises(ConfigurationError, match="keep_episodes = 'no'; give True, False or None"):
+        RunSettings(keep_episodes=word)
+
+
 @pytest.mark.slow
 def test_the_file_is_the_same_for_every_num_envs_and_jobs(found, tmp_path):
     contents = set()
     for i, how in enumerate(({}, {"num_envs": 7}, {"jobs": 2})):
-        write_episodes(tmp_path / f"{i}.parquet", measured(**how))
+        measured(episodes_out=str(tmp_path / f"{i}.parquet"), **how)
         contents.add((tmp_path / f"{i}.parquet").read_bytes())
     assert len(contents) == 1
     table = pq.read_table(tmp_path / "0.parquet")
@@ -74,7 +96,7 @@ def test_the_file_is_the_same_for_every_num_envs_and_jobs(found, tmp_path):
 def test_without_pyarrow_or_pandas_errors_say_what_to_install(found, monkeypatch, tmp_path):
     monkeypatch.setattr(episodes_file, "find_spec", lambda _: None)
     with pytest.raises(ConfigurationError, match=r"pip install \"safe-envs\[sweep\]\""):
-        write_episodes(tmp_path / "out.parquet", found)
+        RunSettings(episodes_out=tmp_path / "out.parquet")
     assert not (tmp_path / "out.parquet").exists()
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigurationError, match="pip install pandas"):

@@ -17,8 +17,8 @@ from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, Z
 from safe_envs.agents.policies.policy_source import policy_source
 from safe_envs.compiled import slots
 from safe_envs.compiled.data import Data
-from safe_envs.compiled.draws import POLICY
 from safe_envs.compiled.program import Program
+from safe_envs.dynamics.philox import POLICY
 from safe_envs.envs.spaces import BatchActions
 from safe_envs.errors import NotCompilableError
 from safe_envs.problem.clf import CLF

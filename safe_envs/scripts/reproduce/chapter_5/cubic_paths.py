@@ -69,7 +69,7 @@ def paths(sample: Workload) -> dict[str, PlaneTrajectories]:
         recorded, row = run.trajectories[name], run.rows[0]
         found[key] = PlaneTrajectories(
             MeasuredFilter(
-                row, [row.safety_rate], [each.safe for each in run.episodes[name]], row.episodes
+                row, [row.safety_rate], [each.array for each in run.safe[name]], row.episodes
             ),
             recorded.states,
             recorded.barrier[:, : recorded.states.shape[1]],

@@ -110,7 +110,15 @@ def violations(
         episodes: number of them.
         seed: of all of them.
     """
-    found = evaluate(problem, policy, [condition], episodes=episodes, seed=seed, bounds=False)
+    found = evaluate(
+        problem,
+        policy,
+        [condition],
+        episodes=episodes,
+        seed=seed,
+        bounds=False,
+        keep_episodes=True,
+    )
     results = next(iter(found.episodes.values()))[0]
     instant = np.where(results.safe, problem.steps + 1, results.first_violation)
     return Violations(instant, results.infeasible.sum() / max(results.counted.sum(), 1))

@@ -13,6 +13,7 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.rows import EpisodeSummary
+from safe_envs.agents.evaluation.safe_flags import SafeFlags
 from safe_envs.errors import RelativeDegreeError
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
 from safe_envs.wrappers import Condition
@@ -104,7 +105,7 @@ def measure(
                 raise
             found.append(evaluate(problem, filters=["none"], **common))
     rows = [each.rows[0] for each in found]
-    flags = [results.safe for each in found for results in next(iter(each.episodes.values()))]
+    flags = [flags.array for each in found for flags in next(iter(each.safe.values()))]
     rates = [row.safety_rate for row in rows]
     return MeasuredFilter(pooled(rows, _CONFIDENCE), rates, flags, episodes)
 
@@ -121,7 +122,8 @@ def difference(name: str, first: Sequence[np.ndarray], second: Sequence[np.ndarr
     Returns:
         The difference with its 95 % interval over episodes and identifications.
     """
-    (found,) = compare_all({"second": second, "first": first}, _CONFIDENCE)
+    flags = {"second": second, "first": first}
+    (found,) = compare_all({k: [*map(SafeFlags.of, v)] for k, v in flags.items()}, _CONFIDENCE)
     middle, low, high = (100 * end for end in (found.difference, found.ci_low, found.ci_high))
     return Number(name, middle, low, high, unit="points")
 
