@@ -6,7 +6,7 @@ from math import inf, isfinite
 
 import numpy as np
 
-from safe_envs.compiled.draws import NOISE, draw_start, fill_normals
+from safe_envs.compiled.draws import draw_start, fill_normals
 from safe_envs.compiled.plain_natives import vector_view
 from safe_envs.compiled.slots import (
     Input,
@@ -27,6 +27,7 @@ from safe_envs.compiled.slots import (
     smallest_barrier,
     state_at,
 )
+from safe_envs.dynamics.philox import NOISE
 
 DONE = 0
 BAD_ACTION = 1

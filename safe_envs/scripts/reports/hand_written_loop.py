@@ -13,6 +13,7 @@ import numpy as np
 
 from safe_envs.compiled.plain_natives import philox_block, uniform_of
 from safe_envs.dynamics.normal_kernel import standard_normal
+from safe_envs.dynamics.philox import NOISE, START
 
 SPEED = 2.0
 SIGMA = 0.2
@@ -25,7 +26,7 @@ WORKSPACE = 6.0
 
 def uniform_by_hand(word: int, key: int, episode: int) -> float:
     """Return a uniform of the stream of starts."""
-    return uniform_of(philox_block(word // 4 + 1, episode, 1, 0, key, 0)[word % 4])
+    return uniform_of(philox_block(word // 4 + 1, episode, START, 0, key, 0)[word % 4])
 
 
 def start_by_hand(key: int, episode: int) -> tuple[float, float, float]:
@@ -65,7 +66,7 @@ def step_by_hand(
         else:
             x, y, theta = states[i, 0], states[i, 1], states[i, 2]
             if k % 2 == 0:
-                w = philox_block(k // 2 + 1, episodes[i], 0, 0, keys[i], 0)
+                w = philox_block(k // 2 + 1, episodes[i], NOISE, 0, keys[i], 0)
                 first, second = standard_normal(uniform_of(w[0])), standard_normal(uniform_of(w[1]))
                 spare[i, 0] = standard_normal(uniform_of(w[2]))
                 spare[i, 1] = standard_normal(uniform_of(w[3]))
