@@ -174,22 +174,22 @@ def observation_within(observation: tuple[float, ...], data: np.ndarray) -> tupl
     raise NotImplementedError
 
 
-def state_at(table: np.ndarray, row: int) -> State:
-    """Return the state that the first entries of a row of a table hold.
+def state_at(table: np.ndarray, i: int) -> State:
+    """Return the state of an env, which the first columns of a table hold.
 
     Args:
-        table: at least n columns.
-        row: its row.
+        table: shape (num_envs, n or more).
+        i: index of the env.
     """
     raise NotImplementedError
 
 
-def input_at(table: np.ndarray, row: int) -> Input:
-    """Return the input that the first entries of a row of a table hold.
+def input_at(table: np.ndarray, i: int) -> Input:
+    """Return the input of an env, which the first columns of a table hold.
 
     Args:
-        table: at least m columns.
-        row: its row.
+        table: shape (num_envs, m or more).
+        i: index of the env.
     """
     raise NotImplementedError
 

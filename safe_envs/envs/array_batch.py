@@ -67,7 +67,18 @@ class ArrayBatch:
         return self._read(tuple(self._actions.center), counted=envs)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
-        """Hold actions in [-1, 1], see `step_physical`."""
+        """Hold actions in [-1, 1]; see `step_physical`.
+
+        Args:
+            actions: shape (num_envs, m).
+            due: see there.
+
+        Returns:
+            What is read off the states.
+
+        Raises:
+            InvalidInputError: See `BatchActions.physical`.
+        """
         return self.step_physical(self._actions.physical(actions), due)
 
     def step_physical(self, u: Sequence[Any], due: np.ndarray | None) -> VectorStep:
@@ -76,6 +87,9 @@ class ArrayBatch:
         Args:
             u: components of the physical inputs.
             due: the envs that begin an episode instead, bool (num_envs,); None for none.
+
+        Returns:
+            What is read off the states.
 
         Raises:
             NumericalError: A state is not finite any more.

@@ -9,51 +9,32 @@ import numpy as np
 from safe_envs.compiled.draws import draw_start, fill_normals
 from safe_envs.compiled.plain_natives import vector_view
 from safe_envs.compiled.slots import (
-    Input,
-    State,
     advance,
-    barriers_of,
-    decide,
-    has_ended,
-    has_left,
     input_at,
-    is_finite,
-    measure,
-    observation_of,
-    observation_within,
     resting_input,
-    reward_of,
     scaled_input,
-    smallest_barrier,
     state_at,
 )
 from safe_envs.dynamics.philox import NOISE
-
-DONE = 0
-BAD_ACTION = 1
-UNDEFINED_FILTER = 2
-NO_START = 3
-NOT_FINITE = 4
-
-PERIODS = 8
-"""Control periods of noise that are drawn at once. With a multiple of 4, whole blocks are."""
-
-STEPS = 0
-PERIOD = 1
-COST = 0
-H_MIN = 1
-EPISODE_COST = 2
-BARRIERS = 3
-TERMINATED = 0
-TRUNCATED = 1
-ENDED = 2
-VIOLATION = 3
-INTERVENTION = 4
-ACTIVE = 5
-FEASIBLE = 6
-INTERVENTIONS = 0
-INFEASIBLE = 1
-ACTIVE_BARRIER = 2
+from safe_envs.envs.batch_layout import (
+    BAD_ACTION,
+    DONE,
+    ENDED,
+    NO_START,
+    NOT_FINITE,
+    PERIOD,
+    PERIODS,
+    STEPS,
+    TERMINATED,
+    TRUNCATED,
+    UNDEFINED_FILTER,
+)
+from safe_envs.envs.batch_part_kernels import (
+    filter_input,
+    read_state,
+    rest_filter,
+    store_from,
+)
 
 
 def step_batch(  # noqa: PLR0913
@@ -118,7 +99,7 @@ def step_batch(  # noqa: PLR0913
         inputs: receives the executed input, and of the filter the proposed and the executed one,
             the largest slack and the slacks.
         choices: receives interventions, infeasible steps and the active barrier.
-        flags: receives rows of flags.
+        flags: receives for each flag those of all envs.
         observations: receives the observations.
         rewards: receives the rewards.
         readings: receives cost, smallest barrier and cost of the episode, and the barriers.
@@ -144,7 +125,7 @@ def step_batch(  # noqa: PLR0913
             if filtered:
                 rest_filter(i, u, rest, inputs, tallies, choices, flags)
             if stepping:
-                store_entries(inputs, i, 0, scaled_input(input_at(actions, i), data))
+                store_from(inputs, i, 0, scaled_input(input_at(actions, i), data))
         else:
             x = state_at(states_before, i)
             states[i, len(x)] = states_before[i, len(x)]
@@ -165,7 +146,7 @@ def step_batch(  # noqa: PLR0913
                     )
                     if not sound:
                         return UNDEFINED_FILTER
-                store_entries(inputs, i, 0, u)
+                store_from(inputs, i, 0, u)
                 place = i * width + period % PERIODS * channels
                 x = advance(x, u, noise, place, data)
         time = counts[i, STEPS] * dt
@@ -207,118 +188,3 @@ def draw_ahead(
             chunks[i] = chunk
             ahead = vector_view(noise, i * width, width)
             fill_normals(ahead, chunk * width, episodes[i], NOISE, keys[i, 0], keys[i, 1])
-
-
-def filter_input(  # noqa: PLR0913
-    i: int,
-    x: State,
-    u: Input,
-    data: np.ndarray,
-    work: np.ndarray,
-    inputs: np.ndarray,
-    tallies_before: np.ndarray,
-    tallies: np.ndarray,
-    choices: np.ndarray,
-    flags: np.ndarray,
-) -> tuple[Input, bool]:
-    """Decide on the proposed input of an env, report and count it.
-
-    Returns:
-        The input to execute, and whether the constraints have finite values.
-    """
-    action, proposed, active, feasible, slacks, cause, sound = decide(x, u, data, work)
-    slack = slacks[0]
-    for each in slacks:
-        slack = max(slack, each)
-    m = len(u)
-    store_entries(inputs, i, m, proposed)
-    store_entries(inputs, i, 2 * m, action)
-    inputs[i, 3 * m] = slack
-    store_entries(inputs, i, 3 * m + 1, slacks)
-    intervened = active and action != proposed
-    tallies[i, INTERVENTIONS] = tallies_before[i, INTERVENTIONS] + intervened
-    tallies[i, INFEASIBLE] = tallies_before[i, INFEASIBLE] + (not feasible)
-    choices[i, INTERVENTIONS] = tallies[i, INTERVENTIONS]
-    choices[i, INFEASIBLE] = tallies[i, INFEASIBLE]
-    choices[i, ACTIVE_BARRIER] = cause if intervened else -1
-    flags[INTERVENTION, i] = intervened
-    flags[ACTIVE, i] = active
-    flags[FEASIBLE, i] = feasible
-    return action, sound
-
-
-def rest_filter(
-    i: int,
-    u: Input,
-    rest: np.ndarray,
-    inputs: np.ndarray,
-    tallies: np.ndarray,
-    choices: np.ndarray,
-    flags: np.ndarray,
-) -> None:
-    """Report of an env what a filter reports at reset."""
-    for j in range(len(rest)):
-        inputs[i, len(u) + j] = rest[j]
-    tallies[i, INTERVENTIONS] = 0
-    tallies[i, INFEASIBLE] = 0
-    choices[i, INTERVENTIONS] = 0
-    choices[i, INFEASIBLE] = 0
-    choices[i, ACTIVE_BARRIER] = -1
-    flags[INTERVENTION, i] = False
-    flags[ACTIVE, i] = False
-    flags[FEASIBLE, i] = True
-
-
-def read_state(  # noqa: PLR0913
-    i: int,
-    x: State,
-    u: Input,
-    time: float,
-    counted: bool,
-    data: np.ndarray,
-    states: np.ndarray,
-    flags: np.ndarray,
-    observations: np.ndarray,
-    rewards: np.ndarray,
-    readings: np.ndarray,
-) -> bool:
-    """Store the state of an env and what it reads off it; return whether all is finite."""
-    values = measure(x, u, time, data)
-    barriers = barriers_of(values)
-    h = smallest_barrier(barriers)
-    cost = 1.0 if h < 0.0 else 0.0
-    n = len(x)
-    store_entries(states, i, 0, x)
-    h_min = states[i, n]
-    if not h >= h_min:
-        h_min = h
-    episode_cost = states[i, n + 1]
-    if counted:
-        episode_cost += cost
-    states[i, n] = h_min
-    states[i, n + 1] = episode_cost
-    readings[i, COST] = cost
-    readings[i, H_MIN] = h_min
-    readings[i, EPISODE_COST] = episode_cost
-    store_entries(readings, i, BARRIERS, barriers)
-    flags[VIOLATION, i] = h < 0.0
-    flags[TERMINATED, i] = has_ended(values)
-    if has_left(values):
-        store_entries(observations, i, 0, observation_within(observation_of(values), data))
-    else:
-        store_entries(observations, i, 0, observation_of(values))
-    rewards[i] = reward_of(values)
-    return is_finite(x, values)
-
-
-def store_entries(table: np.ndarray, row: int, first: int, values: tuple[float, ...]) -> None:
-    """Write a tuple to a row of a table.
-
-    Args:
-        table: to write to.
-        row: its row.
-        first: column of the first entry.
-        values: the entries.
-    """
-    for j in range(len(values)):
-        table[row, first + j] = values[j]

@@ -20,8 +20,8 @@ def batch_source(problem: SafetyProblem, data: Data) -> Source:
     bounds = list(zip(space.low.tolist(), space.high.tolist(), strict=True))
     scales = list(zip(*center_and_half_width(problem), strict=True))
     return Source(
-        f"def state_at(table, row):\n    return ({_entries(problem.plant.n)})\n"
-        f"def input_at(table, row):\n    return ({_entries(len(scales))})\n"
+        f"def state_at(table, i):\n    return ({_entries(problem.plant.n)})\n"
+        f"def input_at(table, i):\n    return ({_entries(len(scales))})\n"
         "def scaled_input(action, data):\n"
         f"    return ({_calls('scaled_action', 'action', scales, data)})\n"
         "def observation_within(observation, data):\n"
@@ -31,7 +31,7 @@ def batch_source(problem: SafetyProblem, data: Data) -> Source:
 
 
 def _entries(count: int) -> str:
-    return "".join(f"table[row, {i}], " for i in range(count))
+    return "".join(f"table[i, {j}], " for j in range(count))
 
 
 def _calls(function: str, array: str, numbers: list[tuple[float, float]], data: Data) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.info import Info, safety_info
+from safe_envs.envs.info import Info, safety_info, with_masks
 from safe_envs.errors import ConfigurationError
 
 _COUNTERS = ("steps", "h_min", "episode_cost", "ended")
@@ -158,3 +158,17 @@ class Episodes:
         self.started = True
         for name in _COUNTERS:
             setattr(self, name, np.array(snapshot[name]))
+
+
+def last_of_episode(ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
+    """Return what Gymnasium's same-step autoreset reports of ended episodes.
+
+    Args:
+        ended: their envs, bool (num_envs,).
+        observation: last observations, (num_envs, k).
+        info: last info, changed in place.
+    """
+    final = np.full(len(ended), None, dtype=object)
+    for i in np.flatnonzero(ended).tolist():
+        final[i] = observation[i]
+    return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)

@@ -14,8 +14,9 @@ from gymnasium.vector.utils import batch_space
 from safe_envs.compiled.engine import compiled_or_none, require_engine
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.array_batch import ArrayBatch
-from safe_envs.envs.compiled_batch import BatchFilter, BatchStepper, CompiledBatch
-from safe_envs.envs.episode import Episodes
+from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
+from safe_envs.envs.compiled_batch import CompiledBatch
+from safe_envs.envs.episode import Episodes, last_of_episode
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.seeding import EpisodeStreams, Seeds
 from safe_envs.envs.simulation import steps_until
@@ -138,7 +139,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Returns:
             The observations, float32 (num_envs, k), and the info.
         """
-        return self._restarted(self._batch, seed, options)
+        return self.reset_filtered(self._batch, seed, options)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
@@ -183,14 +184,37 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._told(self._batch, self._batch.step_physical(u, self._due()))
 
     def step_filtered(self, stepper: BatchStepper, actions: Any) -> VectorStep:
-        """Step with actions in [-1, 1], which a filter corrects; see `filtered`."""
+        """Step with actions in [-1, 1], which a filter corrects.
+
+        Args:
+            stepper: of `filtered`.
+            actions: see `step`.
+
+        Returns:
+            As `step`; the info has what the filter reports.
+        """
         return self._told(stepper, stepper.step(actions, self._due()))
 
     def reset_filtered(
-        self, stepper: BatchStepper, seed: Seeds = None, options: dict[str, Any] | None = None
+        self, stepper: _Stepper, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes as `reset` does; the info has what the filter reports."""
-        return self._restarted(stepper, seed, options)
+        """Start episodes as `reset` does; the info has what the filter reports.
+
+        Args:
+            stepper: of `filtered`, or the batch itself.
+            seed: see `reset`.
+            options: see `reset`.
+
+        Returns:
+            The observations and the info.
+        """
+        seeds = self._streams.for_each_env(seed)
+        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
+        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
+        observation, _, _, _, info = stepper.begin(mask)
+        if self.viewer is not None:
+            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
+        return observation, with_masks(info, mask)
 
     def filtered(self, batch_filter: BatchFilter) -> BatchStepper | None:
         """Return what steps these envs with a filter in one compiled function.
@@ -225,17 +249,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return None
         return self.viewer.frames() if self.components else None
 
-    def _restarted(
-        self, stepper: _Stepper, seed: Seeds, options: dict[str, Any] | None
-    ) -> tuple[np.ndarray, Info]:
-        seeds = self._streams.for_each_env(seed)
-        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
-        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
-        observation, _, _, _, info = stepper.begin(mask)
-        if self.viewer is not None:
-            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
-        return observation, with_masks(info, mask)
-
     def _due(self) -> np.ndarray | None:
         """Return the envs whose coming step begins an episode; None for none."""
         if not self.episodes.started:
@@ -257,7 +270,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
-                last = _last_of_episode(ended, observation, info)
+                last = last_of_episode(ended, observation, info)
                 observation, _, _, _, info = stepper.begin(ended)
             episodes.begun = ended
         else:
@@ -273,14 +286,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     @property
     def _times(self) -> np.ndarray:
         return self.episodes.steps * self.problem.dt
-
-
-def _last_of_episode(ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
-    """Keep the last observation and info of the ended envs."""
-    final = np.full(len(ended), None, dtype=object)
-    for i in np.flatnonzero(ended).tolist():
-        final[i] = observation[i]
-    return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
 
 
 def _without_state() -> gym.error.ResetNeeded:

@@ -25,12 +25,23 @@ WORKSPACE = 6.0
 
 
 def uniform_by_hand(word: int, key: int, episode: int) -> float:
-    """Return a uniform of the stream of starts."""
+    """Return a uniform of the stream of starts.
+
+    Args:
+        word: its place.
+        key: of the env.
+        episode: number of the episode.
+    """
     return uniform_of(philox_block(word // 4 + 1, episode, START, 0, key, 0)[word % 4])
 
 
 def start_by_hand(key: int, episode: int) -> tuple[float, float, float]:
-    """Return a start in the disk from which the barrier rises."""
+    """Return a start in the disk from which the barrier rises.
+
+    Args:
+        key: of the env.
+        episode: number of the episode.
+    """
     word = 0
     while True:
         rho = RADIUS * sqrt(uniform_by_hand(word, key, episode))
@@ -53,7 +64,20 @@ def step_by_hand(
     rewards: np.ndarray,
     ended: np.ndarray,
 ) -> None:
-    """Step all vehicles, or begin an episode where one has ended."""
+    """Step all vehicles, or begin an episode where one has ended.
+
+    Args:
+        actions: in [-1, 1], float32 (num_envs, 1).
+        keys: of the envs.
+        episodes: their numbers.
+        steps: of each episode.
+        states: of the vehicles.
+        spare: noise of the following step.
+        counters: smallest barrier, cost, interventions and infeasible steps of each episode.
+        observations: receives the observations.
+        rewards: receives the rewards.
+        ended: which episodes have ended.
+    """
     root = SIGMA * sqrt(PERIOD)
     for i in range(len(steps)):
         k = steps[i]

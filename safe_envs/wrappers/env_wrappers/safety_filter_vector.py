@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.envs.compiled_batch import BatchFilter, BatchStepper
+from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.conditions.spec_text import Conditions
