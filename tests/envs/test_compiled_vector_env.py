@@ -5,6 +5,11 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers.vector import (
+    DictInfoToList,
+    NormalizeObservation,
+    RecordEpisodeStatistics,
+)
 
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.compiled import engine as engines
@@ -198,6 +203,21 @@ def test_constraints_without_a_finite_value(plain):
     assert messages[0] == messages[1]
     assert "scbf" not in messages[0]
     assert "has no finite value at x = 1e+308" in messages[0]
+
+
+def test_wrappers_of_gymnasium(plain):
+    shown = []
+    for env in pair(DUBINS, "scbf", horizon=0.2):
+        wrapped = DictInfoToList(RecordEpisodeStatistics(NormalizeObservation(env)))
+        wrapped.reset(seed=0)
+        found = [wrapped.step(np.full((3, 1), 0.9, dtype=np.float32)) for _ in range(9)]
+        shown.append([(step[0], step[4]) for step in found])
+    for (theirs, infos), (ours, my_infos) in zip(*shown, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+        for info, mine in zip(infos, my_infos, strict=True):
+            assert mine.keys() == info.keys()
+            np.testing.assert_allclose(mine["h_min"], info["h_min"], rtol=1e-9)
+    assert shown[1][3][1][0]["episode"]["l"] == 4
 
 
 def test_filters_that_need_a_solver(plain):
