@@ -44,7 +44,7 @@ class BatchState:
         self.problem, self.streams, self.episodes = problem, streams, episodes
         self.actions = BatchActions(problem, n)
         self.shape = (n, len(problem.inputs))
-        self.settings = (limit, problem.dt, channels)
+        self.settings = (int(limit), float(problem.dt), channels)
         self.states = np.full((n, problem.plant.n + 2), np.nan)
         self.counts = np.zeros((n, 2), dtype=np.int64)
         self.inputs = np.empty((0, 0))

@@ -87,7 +87,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     ) -> None:
         """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
-        self._counted.tallies = np.column_stack([snapshot[name] for name in _TALLIES])
+        counts = [np.asarray(snapshot[name], dtype=np.int64) for name in _TALLIES]
+        self._counted.tallies = np.column_stack(counts)
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
