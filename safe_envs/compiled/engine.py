@@ -47,3 +47,13 @@ def compiled_or_none(engine: str, periods: float, make: Callable[[], _Found]) ->
                 f"engine = 'compiled': {error}; use 'numpy', or 'auto'"
             ) from error
         return None
+
+
+def engine_for(engine: str, periods: float) -> str:
+    """Return "numpy" in place of "auto" for short work, and any other word as it is.
+
+    Args:
+        engine: one of `ENGINES`.
+        periods: control periods to simulate, about.
+    """
+    return "numpy" if engine == "auto" and periods < LONG else engine

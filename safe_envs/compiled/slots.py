@@ -116,7 +116,7 @@ def has_ended(values: tuple[float, ...]) -> bool:
 
 
 def is_finite(x: State, values: tuple[float, ...]) -> bool:
-    """Return whether a state and what an env reads off it are finite numbers.
+    """Return whether a state and what an env reads off it are finite; not so for huge numbers.
 
     Args:
         x: n components of the state.
@@ -155,5 +155,50 @@ def decide(x: State, u: Input, data: np.ndarray, work: np.ndarray) -> tuple[Any,
     of a joint QP), whether a constraint is active, whether all can be met, the slacks of the
     constraints (a tuple), the number of the constraint that caused an intervention (without meaning
     where none is active), and whether all numbers of the QP are finite; see `FilterDecision`.
+    """
+    raise NotImplementedError
+
+
+def has_left(values: tuple[float, ...]) -> bool:
+    """Return whether the workspace was left."""
+    raise NotImplementedError
+
+
+def observation_within(observation: tuple[float, ...], data: np.ndarray) -> tuple[float, ...]:
+    """Return an observation, clipped to the bounds of its space.
+
+    Args:
+        observation: features in single precision.
+        data: numbers of the program.
+    """
+    raise NotImplementedError
+
+
+def state_at(table: np.ndarray, i: int) -> State:
+    """Return the state of an env, which the first columns of a table hold.
+
+    Args:
+        table: shape (num_envs, n or more).
+        i: index of the env.
+    """
+    raise NotImplementedError
+
+
+def input_at(table: np.ndarray, i: int) -> Input:
+    """Return the input of an env, which the first columns of a table hold.
+
+    Args:
+        table: shape (num_envs, m or more).
+        i: index of the env.
+    """
+    raise NotImplementedError
+
+
+def scaled_input(action: Input, data: np.ndarray) -> Input:
+    """Return the physical input of an action in [-1, 1], which is clipped to it.
+
+    Args:
+        action: m components.
+        data: numbers of the program.
     """
     raise NotImplementedError

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.info import Info, safety_info
+from safe_envs.envs.info import Info, safety_info, with_masks
 from safe_envs.errors import ConfigurationError
 
 _COUNTERS = ("steps", "h_min", "episode_cost", "ended")
@@ -61,6 +61,7 @@ class Episodes:
         ended: the envs that are still to be reset, bool (num_envs,).
         begun: the envs whose episode began in the last step, bool (num_envs,).
         everywhere: True for each env; not to be written to.
+        started: whether all envs have a state.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -70,7 +71,7 @@ class Episodes:
         self.ended = np.zeros(num_envs, dtype=bool)
         self.begun = self._nowhere = np.zeros(num_envs, dtype=bool)
         self.everywhere = np.ones(num_envs, dtype=bool)
-        self._started = False
+        self.started = False
 
     def due(self) -> np.ndarray | None:
         """Return the envs that the coming step restarts (next-step autoreset); None without any."""
@@ -96,7 +97,7 @@ class Episodes:
                 f"reset_mask must be a bool array of shape {self.steps.shape} with a True in it;"
                 f" given {given!r}"
             )
-        if not self._started and not mask.all():
+        if not self.started and not mask.all():
             raise gym.error.ResetNeeded(
                 "some envs have no state yet: the first reset takes no reset_mask"
             )
@@ -104,11 +105,31 @@ class Episodes:
 
     def restart(self, envs: np.ndarray) -> None:
         """Begin the episodes of some envs, given by indices or by a mask."""
-        self._started = True
+        self.started = True
         self.steps[envs] = 0
         self.h_min[envs] = np.inf
         self.episode_cost[envs] = 0.0
         self.ended[envs] = False
+
+    def take(
+        self,
+        steps: np.ndarray,
+        h_min: np.ndarray,
+        episode_cost: np.ndarray,
+        restarted: np.ndarray | None,
+    ) -> None:
+        """Take the counters of a step that were counted elsewhere.
+
+        Args:
+            steps: see the class.
+            h_min: see the class.
+            episode_cost: see the class.
+            restarted: the envs whose episodes began, bool (num_envs,); None for none.
+        """
+        self.started = True
+        self.steps, self.h_min, self.episode_cost = steps, h_min, episode_cost
+        if restarted is not None:
+            self.ended[restarted] = False
 
     def count(self, barriers: np.ndarray, h: np.ndarray, counted: np.ndarray | None = None) -> Info:
         """Count the states of a step.
@@ -134,6 +155,20 @@ class Episodes:
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Take the counters from a snapshot."""
-        self._started = True
+        self.started = True
         for name in _COUNTERS:
             setattr(self, name, np.array(snapshot[name]))
+
+
+def last_of_episode(ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
+    """Return what Gymnasium's same-step autoreset reports of ended episodes.
+
+    Args:
+        ended: their envs, bool (num_envs,).
+        observation: last observations, (num_envs, k).
+        info: last info, changed in place.
+    """
+    final = np.full(len(ended), None, dtype=object)
+    for i in np.flatnonzero(ended).tolist():
+        final[i] = observation[i]
+    return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)

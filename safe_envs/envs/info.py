@@ -38,6 +38,9 @@ import numpy as np
 
 Info = dict[str, Any]
 
+VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
+"""What is read off the states of a batch: observation, reward, terminated, truncated and info."""
+
 
 def safety_info(
     violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any

@@ -20,6 +20,7 @@ class EpisodeStreams:
     Attributes:
         reader: reads the streams.
         keys: of the seed of each env; empty before the first use.
+        words: the same, uint64 (num_envs, 2).
         episodes: number of the episode of each env since its seed, int64 (num_envs,); -1 before
             the first.
         seeds: of each env.
@@ -29,6 +30,7 @@ class EpisodeStreams:
         self.num_envs = num_envs
         self.reader = StreamReader()
         self.keys: list[Key] = []
+        self.words = np.zeros((num_envs, 2), dtype=np.uint64)
         self.episodes = np.full(num_envs, -1, dtype=np.int64)
         self.seeds: list[int] = []
         self._generators: list[np.random.Generator | None] = [None] * num_envs
@@ -72,7 +74,7 @@ class EpisodeStreams:
         if not self.keys:
             self.keys, self.seeds = [(0, 0)] * self.num_envs, [0] * self.num_envs
         for i, (seed, key) in chosen.items():
-            self.seeds[i], self.keys[i] = seed, key
+            self.seeds[i], self.keys[i], self.words[i] = seed, key, key
             self.episodes[i], self._generators[i] = -1, None
         return list(chosen)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.errors import require_whole
+from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.initial_distribution import StartSampler
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
@@ -34,9 +35,7 @@ class Simulation:
         self._measure = compile_function(
             (*problem.plant.states, *problem.plant.inputs, TIME), read, flavour
         )
-        self.starts = StartSampler(
-            problem.starts[problem.start], problem.model, f"{problem.name!r} ({problem.start})"
-        )
+        self.starts = start_sampler(problem)
 
     def measure(
         self, x: Components, u: Sequence[Any], time: Any
@@ -57,6 +56,12 @@ class Simulation:
         return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
 
 
+def start_sampler(problem: SafetyProblem) -> StartSampler:
+    """Return what draws the start states of a problem."""
+    title = f"{problem.name!r} ({problem.start})"
+    return StartSampler(problem.starts[problem.start], problem.model, title)
+
+
 def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
     """Return the control periods until an episode is truncated.
 
@@ -71,3 +76,25 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
         return problem.steps
     require_whole("max_episode_steps", max_episode_steps, 1)
     return min(problem.steps, max_episode_steps)
+
+
+def require_sound(
+    x: Components, h: np.ndarray, observation: np.ndarray, problem: SafetyProblem
+) -> None:
+    """Check that the states of a batch and what is read off them are finite.
+
+    Args:
+        x: components of the states.
+        h: smallest barrier of each.
+        observation: of each.
+        problem: that is simulated.
+
+    Raises:
+        NumericalError: Some are not.
+    """
+    sound = np.isfinite(x).all(axis=0) & np.isfinite(observation).all(axis=1) & np.isfinite(h)
+    if not sound.all():
+        raise NumericalError(
+            f"the states of envs {np.flatnonzero(~sound)[:5].tolist()} of {problem.name!r}"
+            " have left the finite numbers; reduce dt or raise substeps"
+        )

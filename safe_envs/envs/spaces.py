@@ -50,6 +50,19 @@ class BatchActions:
         self._shape = (num_envs, len(problem.inputs))
         self.center, self._half = (constants(c) for c in center_and_half_width(problem))
 
+    def checked(self, actions: Any) -> np.ndarray:
+        """Return actions as doubles of shape (num_envs, m), in C order.
+
+        Raises:
+            InvalidInputError: The actions have another shape, or are not real numbers.
+        """
+        given = real_array("array of actions", actions)
+        if given.shape != self._shape:
+            raise InvalidInputError(
+                f"actions have shape {given.shape}; the envs take {self._shape}"
+            )
+        return np.ascontiguousarray(given, dtype=np.float64)
+
     def physical(self, actions: Any) -> Components:
         """Scale actions in [-1, 1], clipped to them.
 
@@ -62,11 +75,7 @@ class BatchActions:
         Raises:
             InvalidInputError: The actions have another shape, or are not finite real numbers.
         """
-        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
-        if given.shape != self._shape:
-            raise InvalidInputError(
-                f"actions have shape {given.shape}; the envs take {self._shape}"
-            )
+        given = self.checked(actions)
         with np.errstate(over="ignore"):
             suspicious = not finite(given)
         if suspicious and not np.isfinite(given).all():

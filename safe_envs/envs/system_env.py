@@ -56,6 +56,7 @@ class SystemVectorEnv(SafeVectorEnv):
         autoreset_mode: see `SafeVectorEnv`.
         max_episode_steps: see `SafeVectorEnv`.
         render_mode: see `SafeVectorEnv`.
+        engine: see `SafeVectorEnv`.
         **options: as for `SystemEnv`.
     """
 
@@ -67,7 +68,8 @@ class SystemVectorEnv(SafeVectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        engine: str = "numpy",
         **options: Any,
     ) -> None:
         problem = self.env_class.make_problem(**options)
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
+        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode, engine)

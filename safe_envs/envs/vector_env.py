@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,18 +11,21 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
-from safe_envs.envs.episode import Episodes
-from safe_envs.envs.info import Info, with_masks
-from safe_envs.envs.noise import NoiseStreams
+from safe_envs.compiled.engine import compiled_or_none, require_engine
+from safe_envs.dynamics.codegen import Components
+from safe_envs.envs.array_batch import ArrayBatch
+from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
+from safe_envs.envs.compiled_batch import CompiledBatch
+from safe_envs.envs.episode import Episodes, last_of_episode
+from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.seeding import EpisodeStreams, Seeds
-from safe_envs.envs.simulation import Simulation, steps_until
+from safe_envs.envs.simulation import steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
+from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
-VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
+_Stepper = ArrayBatch | CompiledBatch | BatchStepper
 
 
 class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -33,7 +37,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     of `SafeEnv` with the batch in front.
 
     Attributes:
-        executed: the components of the physical inputs of the last step.
+        engine: that was asked for.
         viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
@@ -45,9 +49,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             `infos["final_info"]`) or "Disabled" (reset by `options={"reset_mask": mask}`).
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
         render_mode: "rgb_array" for pictures by `render()`, or None.
+        engine: "numpy"; "compiled" for one function that Numba compiles, many times faster for
+            small batches and a few times for large ones, with results that differ by rounding; or
+            "auto" for that where it can be had.
 
     Raises:
-        ConfigurationError: an argument is out of range.
+        ConfigurationError: an argument is out of range, or Numba is missing.
     """
 
     def __init__(
@@ -57,6 +64,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        engine: str = "numpy",
     ) -> None:
         require_whole("num_envs", num_envs, 1)
         self.viewer = open_viewer(problem, render_mode, num_envs)
@@ -68,27 +76,31 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             "render_fps": frames_a_second(problem),
             "autoreset_mode": self._autoreset,
         }
-        self.single_observation_space = self._bounds = observation_box(problem)
+        self.single_observation_space = observation_box(problem)
         self.single_action_space = action_box(problem)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._simulation = Simulation(problem, "arrays")
         self._actions = BatchActions(problem, num_envs)
-        observed = {f.expression for f in problem.features}
-        self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
-        self._limit = steps_until(problem, max_episode_steps)
         self._streams = EpisodeStreams(num_envs)
-        self._noise = NoiseStreams(self._streams, self._simulation.integrator.channels, self._limit)
-        self.executed: Sequence[Any] = ()
-        self._x: Components = ()
         self.episodes = Episodes(num_envs)
+        limit = steps_until(problem, max_episode_steps)
+        require_engine(engine)
+        self.engine = engine
+        parts = (problem, self._streams, self.episodes, limit)
+        compiled = compiled_or_none(engine, math.inf, lambda: CompiledBatch(*parts))
+        self._batch = ArrayBatch(*parts) if compiled is None else compiled
 
     @property
     def components(self) -> Components:
         """The exact states: for each state an array (num_envs,), not to be written to."""
-        if not self._x:
-            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
-        return self._x
+        if not self.episodes.started:
+            raise _without_state()
+        return self._batch.components
+
+    @property
+    def executed(self) -> Sequence[Any]:
+        """The components of the physical inputs of the last step."""
+        return self._batch.executed
 
     @property
     def state(self) -> np.ndarray:
@@ -127,14 +139,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Returns:
             The observations, float32 (num_envs, k), and the info.
         """
-        seeds = self._streams.for_each_env(seed)
-        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
-        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
-        self._restart(np.flatnonzero(mask))
-        observation, _, _, _, info = self._observe(tuple(self._actions.center), counted=mask)
-        if self.viewer is not None:
-            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
-        return observation, with_masks(info, mask)
+        return self.reset_filtered(self._batch, seed, options)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
@@ -158,10 +163,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f" {(self.num_envs, self.problem.plant.n)}"
             )
         seeded = self._streams.seed(self._streams.for_each_env(seed))
-        self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         self.episodes.restore(snapshot)
         self._streams.begin_episodes(seeded)
-        self._noise.seek(seeded, self.episodes.steps[seeded])
+        self._batch.place(snapshot["state"], seeded)
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, range(self.num_envs))
 
@@ -173,44 +177,58 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             NumericalError: the state of an env is not finite any more.
             ResetNeeded: an episode has ended, and autoreset is disabled.
         """
-        return self.step_physical(self.physical_action(actions))
+        return self._told(self._batch, self._batch.step(actions, self._due()))
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
         """Step with components of physical inputs inside their bounds, as a filter returns them."""
-        x = self.components
-        self.executed = u
-        episodes = self.episodes
-        due = episodes.due()
-        if due is not None and self._autoreset == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded(
-                f"the episodes of envs {np.flatnonzero(due)[:5].tolist()} have ended: reset them"
-            )
-        draws = self._noise.next(None if due is None else ~due)
-        # A state that overflows is found by `_observe`, which says so better than a warning.
-        with np.errstate(over="ignore", invalid="ignore"):
-            self._x = self._simulation.integrator.step(x, u, draws)
-            episodes.steps += 1
-            if due is not None:
-                self._restart(np.flatnonzero(due))
-            observation, reward, terminated, truncated, info = self._observe(u)
-        if due is not None:
-            reward = np.where(due, 0.0, reward)
-        ended = terminated | truncated
-        last: Info = {}
-        if self._autoreset == AutoresetMode.SAME_STEP:
-            if np.count_nonzero(ended):
-                last = self._last_of_episode(ended, observation, info)
-                observation, _, _, _, info = self._observe(
-                    tuple(self._actions.center), counted=ended
-                )
-            episodes.begun = ended
-        else:
-            episodes.ended = ended
+        return self._told(self._batch, self._batch.step_physical(u, self._due()))
+
+    def step_filtered(self, stepper: BatchStepper, actions: Any) -> VectorStep:
+        """Step with actions in [-1, 1], which a filter corrects.
+
+        Args:
+            stepper: of `filtered`.
+            actions: see `step`.
+
+        Returns:
+            As `step`; the info has what the filter reports.
+        """
+        return self._told(stepper, stepper.step(actions, self._due()))
+
+    def reset_filtered(
+        self, stepper: _Stepper, seed: Seeds = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
+        """Start episodes as `reset` does; the info has what the filter reports.
+
+        Args:
+            stepper: of `filtered`, or the batch itself.
+            seed: see `reset`.
+            options: see `reset`.
+
+        Returns:
+            The observations and the info.
+        """
+        seeds = self._streams.for_each_env(seed)
+        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
+        self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
+        observation, _, _, _, info = stepper.begin(mask)
         if self.viewer is not None:
-            begun = np.flatnonzero(episodes.begun).tolist()
-            self.viewer.advance(self.state, self._times, np.stack(u, axis=-1), begun)
-        info = {**with_masks(info, episodes.everywhere.copy()), **last}
-        return observation, reward, terminated, truncated, info
+            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
+        return observation, with_masks(info, mask)
+
+    def filtered(self, batch_filter: BatchFilter) -> BatchStepper | None:
+        """Return what steps these envs with a filter in one compiled function.
+
+        Returns:
+            None where NumPy has to filter.
+
+        Raises:
+            NotCompilableError: The compiled engine was asked for, and cannot do the filter.
+        """
+        if not isinstance(self._batch, CompiledBatch) or self.viewer is not None:
+            return None
+        batch = self._batch
+        return compiled_or_none(self.engine, math.inf, lambda: batch.filtered(batch_filter))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every env, with the trail of its episode and what a filter decided.
@@ -231,65 +249,47 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return None
         return self.viewer.frames() if self.components else None
 
-    def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
-        """Keep the last observation and info of the ended envs, and restart them."""
-        final = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(ended).tolist():
-            final[i] = observation[i]
-        self._restart(np.flatnonzero(ended))
-        return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
+    def _due(self) -> np.ndarray | None:
+        """Return the envs whose coming step begins an episode; None for none."""
+        if not self.episodes.started:
+            raise _without_state()
+        due = self.episodes.due()
+        if due is not None and self._autoreset == AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded(
+                f"the episodes of envs {np.flatnonzero(due)[:5].tolist()} have ended: reset them"
+            )
+        return due
+
+    def _told(
+        self, stepper: ArrayBatch | CompiledBatch | BatchStepper, found: VectorStep
+    ) -> VectorStep:
+        """Return what a step tells, with autoreset."""
+        observation, reward, terminated, truncated, info = found
+        episodes = self.episodes
+        ended = terminated | truncated
+        last: Info = {}
+        if self._autoreset == AutoresetMode.SAME_STEP:
+            if np.count_nonzero(ended):
+                last = last_of_episode(ended, observation, info)
+                observation, _, _, _, info = stepper.begin(ended)
+            episodes.begun = ended
+        else:
+            episodes.ended = ended
+        if self.viewer is not None:
+            begun = np.flatnonzero(episodes.begun).tolist()
+            self.viewer.advance(self.state, self._times, np.stack(self.executed, axis=-1), begun)
+        info = with_masks(info, episodes.everywhere.copy())
+        if last:
+            info.update(last)
+        return observation, reward, terminated, truncated, info
 
     @property
     def _times(self) -> np.ndarray:
         return self.episodes.steps * self.problem.dt
 
-    def _restart(self, envs: np.ndarray) -> None:
-        """Put some envs at the start of an episode."""
-        begun = self._streams.begin_episodes(envs)
-        self._noise.begin(envs)
-        start = self._simulation.starts.draw_batch(self._streams.reader, *begun)
-        if envs.size == self.num_envs:
-            self._x = tuple(start)
-        else:
-            self._x = tuple([x.copy() for x in self._x])
-            for x, fresh in zip(self._x, start, strict=True):
-                x[envs] = fresh
-        self.episodes.restart(envs)
 
-    def _observe(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
-        """Read the states; `counted` are the envs whose states are new (None: all)."""
-        self._x = x = settled(self.components, (self.num_envs,))
-        time = self._times if self._simulation.timed else 0.0
-        features, barriers, reward, outside, goal = self._simulation.measure(x, u, time)
-        rows = np.empty((len(features), self.num_envs), dtype=np.float32)
-        for row, feature in zip(rows, features, strict=True):
-            row[:] = feature
-        observation = rows.T
-        barrier = stacked(barriers, self.num_envs)
-        h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
-        info = self.episodes.count(barrier, h, counted)
-        terminated = filled(outside > 0.0, (self.num_envs,))
-        sound = finite(h) and finite(rows)
-        for i in self._unobserved:
-            sound = sound and finite(x[i])
-        if np.count_nonzero(terminated):
-            envs = np.flatnonzero(terminated)
-            observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
-        if not sound:
-            self._report_breakdown(h, observation)
-        if self.problem.goal is not None:
-            terminated = terminated | (goal >= 0.0)
-        reward = filled(reward, (self.num_envs,)).copy()
-        return observation, reward, terminated, self.episodes.steps >= self._limit, info
-
-    def _report_breakdown(self, h: np.ndarray, observation: np.ndarray) -> None:
-        sound = np.isfinite(self._x).all(axis=0) & np.isfinite(observation).all(axis=1)
-        broken = ~(sound & np.isfinite(h))
-        if broken.any():
-            raise NumericalError(
-                f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r}"
-                " have left the finite numbers; reduce dt or raise substeps"
-            )
+def _without_state() -> gym.error.ResetNeeded:
+    return gym.error.ResetNeeded("the envs have no state yet: call reset() first")
 
 
 def _mode(given: str | AutoresetMode) -> AutoresetMode:

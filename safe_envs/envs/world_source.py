@@ -13,6 +13,9 @@ from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
 
+_LARGEST = 3e38
+"""Below it single precision has all numbers."""
+
 
 def world_source(problem: SafetyProblem, data: Data) -> Source:
     """Return the functions of `safe_envs.compiled.slots` that describe a problem's world.
@@ -110,7 +113,9 @@ def _measure(problem: SafetyProblem, data: Data) -> Source:
     measure = formulas("measure", {"x": plant.states, "u": plant.inputs, "time": TIME}, read, data)
     seen = [f"single(values[{i}])" for i in range(features)]
     heights = [f"values[{features + i}]" for i in range(barriers)]
-    sizes = [f"abs({entry})" for entry in (*seen, *heights, *(f"x[{i}]" for i in range(plant.n)))]
+    observed = {f.expression for f in problem.features}
+    unseen = [f"x[{i}]" for i, state in enumerate(plant.states) if state not in observed]
+    sizes = [f"abs(values[{i}])" for i in range(last)] + [f"abs({entry})" for entry in unseen]
     smaller = "".join(
         f"    h = h if barriers[{i}] >= h else barriers[{i}]\n" for i in range(1, barriers)
     )
@@ -119,7 +124,16 @@ def _measure(problem: SafetyProblem, data: Data) -> Source:
         f"def barriers_of(values):\n    return ({', '.join(heights)},)\n"
         f"def smallest_barrier(barriers):\n    h = barriers[0]\n{smaller}    return h\n"
         f"def reward_of(values):\n    return values[{last}]\n"
+        f"def has_left(values):\n    return values[{last + 1}] > 0.0\n"
         f"def has_ended(values):\n"
         f"    return values[{last + 1}] > 0.0 or values[{last + 2}] >= 0.0\n"
-        f"def is_finite(x, values):\n    return isfinite({' + '.join(sizes)})\n"
+        f"def is_finite(x, values):\n    return {_sum(sizes)} < {_LARGEST}\n"
     )
+
+
+def _sum(terms: list[str]) -> str:
+    """Return a sum as a tree, whose additions do not wait for each other."""
+    if len(terms) == 1:
+        return terms[0]
+    half = len(terms) // 2
+    return f"({_sum(terms[:half])} + {_sum(terms[half:])})"

@@ -38,6 +38,9 @@ def benchmark(
     cores = f"one of {os.cpu_count()} cores"
     say(console, f"{ENV_ID} with scbf, safe-envs {__version__}, on {cores}\n")
     console.print(_table(figures, earlier))
+    sides = benchmark_figures.side_by_side(figures)
+    if sides:
+        console.print(_engines(sides))
     write_result(json, lambda: figures)
 
 
@@ -73,6 +76,15 @@ def _table(figures: Mapping[str, float], earlier: Mapping[str, float]) -> Table:
         before = earlier.get(name)
         ratio = ["-", "-"] if not before else [f"{before:.3g}", f"{value / before:.2f}"]
         table.add_row(name, f"{value:.3g}", *ratio * bool(earlier))
+    return table
+
+
+def _engines(sides: Mapping[str, tuple[float, float]]) -> Table:
+    """Return the speeds of the engines side by side."""
+    table = make_table("pr", "engines side by side", "numpy", "compiled", "ratio", tight=False)
+    for name, (numpy_engine, compiled) in sides.items():
+        ratio = compiled / numpy_engine
+        table.add_row(name, f"{numpy_engine:.3g}", f"{compiled:.3g}", f"{ratio:.2f}")
     return table
 
 

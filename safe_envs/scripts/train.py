@@ -89,6 +89,7 @@ def train(
     ] = None,
     eval_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 200,
     threads: Annotated[int, typer.Option(help="Threads of torch and BLAS.")] = 1,
+    engine: text_options.Engine = "auto",
     tensorboard: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")
     ] = None,
@@ -133,6 +134,7 @@ def train(
         eval_freq=eval_freq,
         eval_episodes=eval_episodes,
         threads=threads,
+        engine=engine,
     )
     from safe_envs.agents.policies.base import POLICY_FILE
     from safe_envs.agents.training.trainer import train as train_agent

@@ -136,7 +136,7 @@ def test_envs_take_the_substeps_of_their_problem_with_noise(make, substeps, monk
     env.reset(seed=0)
     row = drawn.ravel()
     monkeypatch.setattr(
-        env._noise,
+        env._noise if isinstance(env, SafeEnv) else env._batch.noise,
         "next",
         lambda *_: row.tolist() if isinstance(env, SafeEnv) else np.array([row, row]).T,
     )

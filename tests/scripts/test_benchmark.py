@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.training import vec_env_speed as sb3_speed
+from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import benchmark
 from safe_envs.scripts.reports import benchmark_cases, benchmark_figures
-from safe_envs.wrappers import SafetyFilterWrapper
+from safe_envs.scripts.reports.benchmark_cases import Case
+from safe_envs.scripts.reports.hand_written_loop import step_by_hand
+from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+
+STEPS = ("env.step, filtered", "env.step, unfiltered")
 
 pytestmark = pytest.mark.slow
 
@@ -36,10 +41,12 @@ def quick(monkeypatch):
         for name, (env_id, method, settings) in benchmark_figures._LEARNED.items()
     }
     monkeypatch.setattr(benchmark_figures, "_LEARNED", learned)
+    monkeypatch.setattr(benchmark_figures, "_EPISODES", {"numpy": 20, "compiled": 2})
 
 
 @pytest.mark.slow
-def test_figures_are_finite_and_positive_and_ratios_fit(quick):
+def test_figures_are_finite_and_positive_and_ratios_fit(quick, monkeypatch):
+    monkeypatch.setattr(benchmark_figures, "is_available", lambda: False)
     figures = benchmark_figures.measure()
     faults = [figures.pop(name) for name in list(figures) if name.startswith("page faults")]
     assert all(fault >= 0 for fault in faults)
@@ -57,6 +64,54 @@ def test_figures_are_finite_and_positive_and_ratios_fit(quick):
     assert figures["speed of the filtered vector env / fused loop"] == pytest.approx(
         figures["hand-fused loop"] / figures[vector.format("filtered")]
     )
+    assert benchmark_figures.side_by_side(figures) == {}
+
+
+def test_engines_stand_side_by_side(quick, monkeypatch, capsys):
+    monkeypatch.setattr(Program, "compiled", Program.plain)
+    monkeypatch.setattr(benchmark_cases, "NUM_ENVS", 1)
+    for name in ("filter_calls", "several_constraints"):
+        monkeypatch.setattr(benchmark_figures, name, dict)
+    monkeypatch.setattr(benchmark_figures, "_LEARNED", {})
+    monkeypatch.setattr(
+        benchmark_figures, "scalar_steps", lambda: dict.fromkeys(STEPS, Case(lambda: None))
+    )
+    benchmark.benchmark()
+    lines = capsys.readouterr().out.split("engines side by side")[1].splitlines()[2:]
+    rows = {line.split("  ")[0].strip(): line.split()[-3:] for line in lines if line.strip()}
+    assert len(rows) == 5
+    for numpy_engine, compiled, ratio in rows.values():
+        assert float(ratio) == pytest.approx(float(compiled) / float(numpy_engine), rel=0.1)
+
+
+def test_the_hand_written_loop_does_the_work_of_the_env():
+    n, limit = 4, 100
+    env = SafetyFilterVectorWrapper(gym.make_vec(benchmark_cases.ENV_ID, num_envs=n), "scbf")
+    observed, _ = env.reset(seed=0)
+    observations, rewards = np.empty((n, 4), dtype=np.float32), np.empty(n)
+    counters, ended = np.zeros((n, 4)), np.ones(n, dtype=bool)
+    arrays = (
+        np.arange(n, dtype=np.uint64),
+        *np.array([[-1] * n, [0] * n]),
+        np.zeros((n, 3)),
+        np.zeros((n, 2)),
+        counters,
+        observations,
+        rewards,
+        ended,
+    )
+    step_by_hand(np.zeros((n, 1), dtype=np.float32), *arrays)
+    np.testing.assert_allclose(observations, observed, rtol=1e-6)
+    for k in range(limit):
+        actions = np.full((n, 1), 0.3 - 0.01 * k, dtype=np.float32)
+        observed, reward, terminated, truncated, info = env.step(actions)
+        # In plain Python products of single precision would be rounded to it.
+        step_by_hand(actions.astype(np.float64), *arrays)
+        np.testing.assert_allclose(observations, observed, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(rewards, reward, rtol=1e-9)
+        np.testing.assert_array_equal(ended, terminated | truncated)
+    np.testing.assert_array_equal(counters[:, 2], info["episode_interventions"])
+    assert ended.all()
 
 
 def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):

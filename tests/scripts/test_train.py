@@ -42,6 +42,8 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
         "learning_rate=lin_1e-3",
         "--set",
         "ent_coef=1e-3",
+        "--engine",
+        "numpy",
         "--out",
         "run",
     )
@@ -53,6 +55,7 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
     config = json.loads((tmp_path / "run" / "config.json").read_text())["training"]
     assert config["hyperparameters"]["learning_rate"] == "lin_1e-3"
     assert config["hyperparameters"]["ent_coef"] == 1e-3
+    assert config["engine"] == "numpy"
     status, out, err = safe_envs_command(
         "evaluate",
         DUBINS,

@@ -13,6 +13,7 @@ from safe_envs.agents.rare_events.path_noise import PathNoise
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.envs.world_source import noise_channels
 from safe_envs.problem.problem import SafetyProblem
 
 
@@ -49,7 +50,8 @@ class TiltedNoiseEnv(SafeVectorEnv):
         self._shape = (len(problem.barriers), len(plant.noise_channels), len(lengths))
         self._lengths = lengths
         self.girsanov_integrals = np.zeros((len(lengths), 2))
-        self._noise = _TiltedNoise(self, self._simulation.integrator.channels)
+        batch: Any = self._batch
+        batch.noise = _TiltedNoise(self)
 
     def tilt_direction(self) -> np.ndarray:
         """Return the direction e of the coming period, shape (noise channels, num_envs)."""
@@ -87,10 +89,6 @@ class TiltedNoiseEnv(SafeVectorEnv):
         super().restore(snapshot, seed)
         self.girsanov_integrals = np.array(snapshot["girsanov_integrals"])
 
-    def _restart(self, envs: np.ndarray) -> None:
-        super()._restart(envs)
-        self.girsanov_integrals[envs] = 0.0
-
 
 def barrier_slopes(problem: SafetyProblem) -> list[sp.Expr]:
     """Return sigma' grad h of each barrier, entry by entry for the channels with noise."""
@@ -106,9 +104,15 @@ def barrier_slopes(problem: SafetyProblem) -> list[sp.Expr]:
 class _TiltedNoise(PathNoise):
     """The draws of an env with its drift."""
 
-    def __init__(self, env: TiltedNoiseEnv, channels: int) -> None:
-        super().__init__(env._streams, channels, env._limit)
+    def __init__(self, env: TiltedNoiseEnv) -> None:
+        problem = env.problem
+        super().__init__(env._streams, noise_channels(problem), problem.steps)
         self._env = env
+
+    def begin(self, envs: np.ndarray) -> None:
+        """See `PathNoise.begin`."""
+        super().begin(envs)
+        self._env.girsanov_integrals[envs] = 0.0
 
     def next(self, stepping: np.ndarray | None) -> np.ndarray:
         """See `PathNoise.next`."""

@@ -14,6 +14,7 @@ from safe_envs.agents.training.hyperparameters import (
     hyperparameters,
     whole_batches,
 )
+from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.registry import full_id
 
@@ -53,6 +54,7 @@ class Training:
         eval_episodes: of each evaluation.
         threads: of torch and BLAS. Small networks are many times slower on several threads of a
             busy machine.
+        engine: of the envs, see `SafeVectorEnv`; "auto" is NumPy for short trainings.
 
     Raises:
         ConfigurationError: a value is not allowed.
@@ -72,6 +74,7 @@ class Training:
     intervention_penalty: float = 0.0
     eval_episodes: int = 200
     threads: int = 1
+    engine: str = "auto"
 
     def __post_init__(self) -> None:
         try:
@@ -82,6 +85,7 @@ class Training:
             ) from error
         for name, least in _LEAST.items():
             require_whole(name, getattr(self, name), least)
+        require_engine(self.engine)
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
         if self.action not in ACTIONS:

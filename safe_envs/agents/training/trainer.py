@@ -49,6 +49,7 @@ from safe_envs.agents.training.run_folder import (
 )
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.atomic_io import write_json
+from safe_envs.compiled.engine import engine_for
 from safe_envs.errors import ConfigurationError, SafeEnvsError
 from safe_envs.file_locks import locked
 from safe_envs.registry import make_problem
@@ -143,6 +144,7 @@ class TrainingSession:
                 training.filter,
                 knowledge=training.knowledge,
                 intervention_penalty=training.intervention_penalty,
+                engine=engine_for(training.engine, training.n_timesteps),
                 **training.options,
             )
         )

@@ -39,6 +39,7 @@ def make_sb3_env(
     objective: str = "nearest",
     intervention_penalty: float = 0.0,
     seed: int | None = None,
+    engine: str = "numpy",
     **options: Any,
 ) -> SafeVecEnv:
     """Make the `VecEnv` of a registered env for the algorithms of Stable-Baselines3.
@@ -53,10 +54,12 @@ def make_sb3_env(
         intervention_penalty: see `SafeVecEnv`.
         seed: Env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later
             and replaces it.
+        engine: "numpy", "compiled" or "auto"; see `SafeVectorEnv`.
         **options: arguments of `gym.make`; those that are None are left out.
 
     Raises:
         ConfigurationError: an id, a filter or an argument is unknown or out of range.
+        NotCompilableError: the compiled engine was asked for, and the filter needs a solver.
         RelativeDegreeError: the filter does not suit the env's barrier.
     """
     require_whole("num_envs", num_envs, 1)
@@ -70,6 +73,7 @@ def make_sb3_env(
         int(num_envs),
         "vector_entry_point",
         autoreset_mode=AutoresetMode.SAME_STEP.value,
+        engine=engine,
         **given,
     )
     if filter is not None and filter != UNFILTERED:

@@ -20,6 +20,7 @@ def speeds(
     filter: str | None = None,  # noqa: A002
     steps: int = 100,
     rounds: int = 6,
+    engine: str = "numpy",
 ) -> dict[str, float]:
     """Measure the speed of `SafeVecEnv` and of DummyVecEnv, reading infos as every algorithm does.
 
@@ -29,6 +30,7 @@ def speeds(
         filter: text of a condition; None for the unfiltered env.
         steps: of a batch in a round.
         rounds: of which the fastest counts.
+        engine: of `SafeVecEnv`.
 
     Returns:
         Steps of single envs per second, by the name of the class.
@@ -38,7 +40,10 @@ def speeds(
         env = gym.make(full_id(env_id))
         return env if filter is None else SafetyFilterWrapper(env, filter)
 
-    venvs = (make_sb3_env(env_id, num_envs, filter), DummyVecEnv([scalar] * num_envs))
+    venvs = (
+        make_sb3_env(env_id, num_envs, filter, engine=engine),
+        DummyVecEnv([scalar] * num_envs),
+    )
     inputs = len(venvs[0].get_attr("problem")[0].inputs)
     actions = (
         np.random.default_rng(0).uniform(-1.0, 1.0, (steps, num_envs, inputs)).astype(np.float32)

@@ -10,6 +10,9 @@ import numpy as np
 import sympy as sp
 
 from safe_envs import Barrier, ControlAffineSDE
+from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.program import Program
+from safe_envs.scripts.reports.hand_written_loop import LIMIT, step_by_hand
 from safe_envs.wrappers import (
     CBF,
     HOCBF,
@@ -112,9 +115,9 @@ def scalar_steps() -> dict[str, Case]:
     }
 
 
-def vector_steps() -> dict[str, Case]:
+def vector_steps(engine: str = "numpy") -> dict[str, Case]:
     """Return steps of a vector env, unfiltered and filtered."""
-    unfiltered, other = (gym.make_vec(ENV_ID, num_envs=NUM_ENVS) for _ in range(2))
+    unfiltered, other = (gym.make_vec(ENV_ID, num_envs=NUM_ENVS, engine=engine) for _ in range(2))
     envs = {"unfiltered": unfiltered, "filtered": SafetyFilterVectorWrapper(other, "scbf")}
     actions = np.full((NUM_ENVS, 1), 0.3, dtype=np.float32)
     cases = {}
@@ -128,8 +131,35 @@ def vector_steps() -> dict[str, Case]:
     return cases
 
 
+def hand_written_loop() -> Case:
+    """Return a step of the Dubins SCBF by a kernel that is written by hand."""
+    program = Program("the hand-written loop", [step_by_hand], Source(""))
+    step, n = program.compiled()["step_by_hand"], NUM_ENVS
+    actions, keys = np.full((n, 1), 0.3, dtype=np.float32), np.arange(n, dtype=np.uint64)
+    episodes, steps = np.zeros((2, n), dtype=np.int64)
+    states, spare, counters = np.zeros((n, 3)), np.zeros((n, 2)), np.zeros((n, 4))
+    observations, rewards = np.empty((n, 4), dtype=np.float32), np.empty(n)
+    ended = np.ones(n, dtype=bool)
+    return Case(
+        lambda: step(
+            actions,
+            keys,
+            episodes,
+            steps,
+            states,
+            spare,
+            counters,
+            observations,
+            rewards,
+            ended,
+        ),
+        n,
+        calls=10 * (LIMIT + 1),
+    )
+
+
 def fused_loop() -> Case:
-    """Return a step of the Dubins SCBF written by hand, without reward, info, reset and checks."""
+    """Return a step of the Dubins SCBF by a NumPy loop, without reward, info, reset and checks."""
     problem = gym.make(ENV_ID).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
     values = {parameter.name: value for parameter, value in problem.plant.parameters.items()}
     v, dt, (low, high) = values["v"], problem.dt, problem.box[0]

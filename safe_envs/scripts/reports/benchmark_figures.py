@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.compiled.program import is_available
 from safe_envs.registry import make_problem
 from safe_envs.scripts.reports.benchmark_cases import (
     ENV_ID,
@@ -17,6 +18,7 @@ from safe_envs.scripts.reports.benchmark_cases import (
     Case,
     filter_calls,
     fused_loop,
+    hand_written_loop,
     scalar_steps,
     several_constraints,
     vector_steps,
@@ -29,6 +31,13 @@ Figures = dict[str, float]
 """Numbers by name; times of cases are in microseconds for each state."""
 
 FUSED = "hand-fused loop"
+BY_HAND = "hand-written compiled loop"
+COMPILED = "compiled: "
+"""Beginning of the names of what the compiled engine does; the rest is that of NumPy."""
+
+_SPEED = "million steps a second"
+_VECTOR = ("vector env, unfiltered", "vector env, filtered")
+_EPISODES = {"numpy": 5000, "compiled": 200_000}
 _ROUNDS = 15
 _SECONDS_PER_ROUND = 0.08
 _NEW_BYTES = 1 << 20
@@ -55,21 +64,65 @@ def measure() -> Figures:
         **scalar_steps(),
         **vector_steps(),
     }
-    times = _times({**cases, FUSED: fused_loop()})
+    compiled = _compiled_cases() if is_available() else {}
+    times = _times({**cases, FUSED: fused_loop(), **compiled})
     return {
         **times,
         "filtered / unfiltered env.step": (
             times["env.step, filtered"] / times["env.step, unfiltered"]
         ),
-        "vector env, unfiltered, million steps a second": 1.0 / times["vector env, unfiltered"],
-        "vector env, filtered, million steps a second": 1.0 / times["vector env, filtered"],
-        "speed of the filtered vector env / fused loop": (
-            times[FUSED] / times["vector env, filtered"]
-        ),
+        **_ratios_of_vector_envs(times),
         **_page_faults(cases["vector env, filtered"]),
         **seconds,
-        **_vec_envs(),
+        **_of_engine("numpy"),
+        **({COMPILED + name: v for name, v in _of_engine("compiled").items()} if compiled else {}),
     }
+
+
+def side_by_side(figures: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Return the speeds of both engines, NumPy first, by what they do."""
+    return {
+        name: (value, figures[COMPILED + name])
+        for name, value in figures.items()
+        if COMPILED + name in figures and (_SPEED in name or "DummyVecEnv" in name)
+    }
+
+
+def _compiled_cases() -> dict[str, Case]:
+    """Return what is compared with the hand-written loop; it is compiled before it is timed."""
+    cases = {COMPILED + name: case for name, case in vector_steps("compiled").items()}
+    return {**cases, BY_HAND: hand_written_loop()}
+
+
+def _ratios_of_vector_envs(times: Mapping[str, float]) -> Figures:
+    found = {
+        f"{name}, {_SPEED}": 1.0 / times[name]
+        for name in (*_VECTOR, *(COMPILED + name for name in _VECTOR))
+        if name in times
+    }
+    found["speed of the filtered vector env / fused loop"] = times[FUSED] / times[_VECTOR[1]]
+    if BY_HAND in times:
+        ours = times[COMPILED + _VECTOR[1]]
+        found["speed of the compiled filtered vector env / hand-written"] = times[BY_HAND] / ours
+    return found
+
+
+def _of_engine(engine: str) -> Figures:
+    """Return the speed of evaluations and of the native VecEnv with an engine."""
+    return {f"evaluation, filtered, {_SPEED}": _evaluation(engine), **_vec_envs(engine)}
+
+
+def _evaluation(engine: str) -> float:
+    """Return the million steps of an evaluation in a second, with all processors of the engine."""
+    from safe_envs.agents import evaluate
+
+    def run(episodes: int) -> Any:
+        return evaluate(ENV_ID, "nominal", "scbf", episodes=episodes, bounds=False, engine=engine)
+
+    run(10)
+    steps = _EPISODES[engine] * make_problem(ENV_ID).steps
+    seconds = min(timeit.repeat(lambda: run(_EPISODES[engine]), number=1, repeat=2))
+    return 1e-6 * steps / seconds
 
 
 def _times(cases: dict[str, Case]) -> Figures:
@@ -131,13 +184,13 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
     return cases
 
 
-def _vec_envs() -> Figures:
+def _vec_envs(engine: str) -> Figures:
     """Return the speed of the native VecEnv over that of DummyVecEnv, with 64 envs each."""
     from safe_envs.agents.training.vec_env_speed import speeds
 
     found = {}
     for name, text in (("unfiltered", None), ("filtered", "scbf")):
-        measured = speeds(ENV_ID, filter=text)
+        measured = speeds(ENV_ID, filter=text, engine=engine)
         found[f"SB3 VecEnv of 64 / DummyVecEnv, {name}"] = (
             measured["SafeVecEnv"] / measured["DummyVecEnv"]
         )

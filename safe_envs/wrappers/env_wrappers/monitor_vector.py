@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.episode import Episodes
-from safe_envs.envs.info import Info, with_masks
-from safe_envs.envs.vector_env import VectorStep
+from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec

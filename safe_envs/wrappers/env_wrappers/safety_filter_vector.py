@@ -9,8 +9,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.envs.info import Info, filter_info, with_masks
-from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
+from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
+from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
+from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
@@ -20,6 +21,9 @@ from safe_envs.wrappers.env_wrappers.layers import (
 )
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.filter_qp.filter_source import filter_source
+
+_TALLIES = ("interventions", "infeasible")
 
 
 class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
@@ -28,7 +32,11 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     A step that only resets an env (next-step autoreset) ignores its action: there the filter
     reports what it reports at reset, and counts nothing.
 
+    Over envs with the engine "compiled" or "auto", made without a render mode, the filter is part
+    of their compiled function, if it has a closed form; "auto" leaves other filters to NumPy.
+
     Raises:
+        NotCompilableError: the engine of the env is "compiled", and the filter needs a solver.
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
@@ -51,13 +59,15 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         gym.vector.VectorWrapper.__init__(self, env)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
-        self._interventions = np.zeros(self.num_envs, dtype=np.int64)
-        self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
+        self._stepper = self._compiled() if env is inner else None
+        self._counted = _Counted(self.num_envs) if self._stepper is None else self._stepper
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
+        if self._stepper is not None:
+            return self._inner.reset_filtered(self._stepper, seed, options)
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
@@ -69,10 +79,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
-        counts = {
-            "interventions": self._interventions.copy(),
-            "infeasible": self._infeasible.copy(),
-        }
+        counts = {name: self._counted.tallies[:, j].copy() for j, name in enumerate(_TALLIES)}
         return {**self._inner.snapshot(), **counts}
 
     def restore(
@@ -80,12 +87,13 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     ) -> None:
         """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
-        self._interventions, self._infeasible = (
-            np.array(snapshot[name]) for name in ("interventions", "infeasible")
-        )
+        counts = [np.asarray(snapshot[name], dtype=np.int64) for name in _TALLIES]
+        self._counted.tallies = np.column_stack(counts)
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
+        if self._stepper is not None:
+            return self._inner.step_filtered(self._stepper, actions)
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
         active = (
@@ -117,8 +125,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         for u, v in zip(decision.action[1:], nominal[1:], strict=True):
             differs |= u != v
         differs &= active
-        self._interventions += differs
-        self._infeasible += ~decision.feasible
+        now = np.column_stack([differs, ~decision.feasible])
+        self._counted.tallies = tallies = self._counted.tallies + now
         return filter_info(
             nominal_action=_as_columns(nominal),
             safe_action=_as_columns(decision.action),
@@ -130,8 +138,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             ),
             slacks=_as_columns(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
-            episode_interventions=self._interventions.copy(),
-            episode_infeasible=self._infeasible.copy(),
+            episode_interventions=tallies[:, 0].copy(),
+            episode_infeasible=tallies[:, 1].copy(),
         )
 
     def _restart(self, added: Info, envs: np.ndarray) -> None:
@@ -143,8 +151,28 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             added[key][envs] = value
 
     def _forget(self, envs: np.ndarray) -> None:
-        self._interventions[envs] = 0
-        self._infeasible[envs] = 0
+        self._counted.tallies = np.where(envs[:, None], 0, self._counted.tallies)
+
+    def _compiled(self) -> BatchStepper | None:
+        """Return what filters and steps in one compiled function, where the env is compiled."""
+        if not isinstance(self._inner, SafeVectorEnv):
+            return None
+        qp, rest = self.safety_filter.qp, self._rest
+        at_rest = [rest[key] for key in ("nominal_action", "safe_action", "slack", "slacks")]
+        return self._inner.filtered(
+            BatchFilter(
+                lambda data: filter_source(qp, data),
+                self.safety_filter.decide_arrays,
+                np.hstack(at_rest),
+            )
+        )
+
+
+class _Counted:
+    """What `BatchStepper` counts."""
+
+    def __init__(self, num_envs: int) -> None:
+        self.tallies = np.zeros((num_envs, 2), dtype=np.int64)
 
 
 def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:

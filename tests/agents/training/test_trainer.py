@@ -20,6 +20,8 @@ from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled, whole_batches
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import make_sb3_env
+from safe_envs.compiled import engine as engines
+from safe_envs.compiled.program import Program
 from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.data.files import load
 
@@ -317,6 +319,16 @@ def test_the_learning_rate_falls_over_the_whole_training_and_never_below_zero(tm
     }
     assert max(found) > 700
     assert found == pytest.approx({step: 1e-3 * max(0.0, 1 - step / 700) for step in found})
+
+
+def test_long_trainings_take_the_compiled_engine(tmp_path, monkeypatch):
+    monkeypatch.setattr(Program, "compiled", Program.plain)
+    for long, engine in ((769, "numpy"), (768, "auto")):
+        monkeypatch.setattr(engines, "LONG", long)
+        session = TrainingSession(training(), tmp_path)
+        assert session._model.get_env().get_attr("engine") == [engine] * 4
+    with pytest.raises(ConfigurationError, match="engine = 'fast'"):
+        training(engine="fast")
 
 
 def test_the_figures_are_those_of_the_infos():

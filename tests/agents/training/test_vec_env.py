@@ -12,6 +12,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
 
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
+from safe_envs.compiled.program import Program
+from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 
@@ -383,3 +385,16 @@ def test_wrong_actions_are_errors():
         env.step(np.zeros(2, dtype=np.float32))
     with pytest.raises(InvalidInputError, match=r"envs \[1\] are not finite"):
         env.step(np.array([[0.0], [np.nan]], dtype=np.float32))
+
+
+@pytest.mark.parametrize("condition", [None, "scbf"])
+def test_engines_give_the_same_steps_to_rounding(condition, monkeypatch):
+    monkeypatch.setattr(Program, "compiled", Program.plain)
+    ours, theirs = (
+        make_sb3_env("Scalar-v0", 3, condition, seed=7, engine=engine, horizon=0.04)
+        for engine in ("compiled", "numpy")
+    )
+    shown = assert_same_steps(ours, theirs, drawn_actions(ours, 10))
+    assert sum(dones.sum() for dones, _ in shown) >= 3
+    with pytest.raises(NotCompilableError, match="need a solver"):
+        make_sb3_env("QuadrotorLimits-v0", 2, "hocbf", engine="compiled")

@@ -1,0 +1,147 @@
+"""The states of a batch of envs, moved and read by NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
+from safe_envs.envs.episode import Episodes
+from safe_envs.envs.info import VectorStep
+from safe_envs.envs.noise import NoiseStreams
+from safe_envs.envs.seeding import EpisodeStreams
+from safe_envs.envs.simulation import Simulation, require_sound
+from safe_envs.envs.spaces import BatchActions, observation_box
+from safe_envs.problem.problem import SafetyProblem
+
+
+class ArrayBatch:
+    """The states of a batch of envs, with the interface of `CompiledBatch`.
+
+    Attributes:
+        components: of the states, () before the first episode.
+        executed: components of the physical inputs of the last step.
+        noise: that drives the states.
+
+    Args:
+        problem: what to simulate.
+        streams: of the envs.
+        episodes: of the envs; counted here.
+        limit: control periods until an episode is truncated.
+    """
+
+    def __init__(
+        self, problem: SafetyProblem, streams: EpisodeStreams, episodes: Episodes, limit: int
+    ) -> None:
+        self.components: Components = ()
+        self.executed: Sequence[Any] = ()
+        self._problem, self._streams, self._episodes, self._limit = (
+            problem,
+            streams,
+            episodes,
+            limit,
+        )
+        self._shape = (streams.num_envs,)
+        self._bounds = observation_box(problem)
+        self._simulation = Simulation(problem, "arrays")
+        self._actions = BatchActions(problem, streams.num_envs)
+        self.noise = NoiseStreams(streams, self._simulation.integrator.channels, limit)
+        observed = {f.expression for f in problem.features}
+        self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
+
+    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
+        """Put the envs into states, where their episodes are.
+
+        Args:
+            states: shape (num_envs, n).
+            seeded: indices of the envs whose noise goes to the step of their episode.
+        """
+        self.components = tuple(np.array(states, dtype=float).T.copy())
+        self.noise.seek(seeded, self._episodes.steps[seeded])
+
+    def begin(self, envs: np.ndarray) -> VectorStep:
+        """Begin the next episode of some envs, bool (num_envs,), and read all states."""
+        self._restart(np.flatnonzero(envs))
+        return self._read(tuple(self._actions.center), counted=envs)
+
+    def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
+        """Hold actions in [-1, 1]; see `step_physical`.
+
+        Args:
+            actions: shape (num_envs, m).
+            due: see there.
+
+        Returns:
+            What is read off the states.
+
+        Raises:
+            InvalidInputError: See `BatchActions.physical`.
+        """
+        return self.step_physical(self._actions.physical(actions), due)
+
+    def step_physical(self, u: Sequence[Any], due: np.ndarray | None) -> VectorStep:
+        """Hold inputs for one control period.
+
+        Args:
+            u: components of the physical inputs.
+            due: the envs that begin an episode instead, bool (num_envs,); None for none.
+
+        Returns:
+            What is read off the states.
+
+        Raises:
+            NumericalError: A state is not finite any more.
+        """
+        self.executed = u
+        draws = self.noise.next(None if due is None else ~due)
+        # A state that overflows is found by `_read`, which says so better than a warning.
+        with np.errstate(over="ignore", invalid="ignore"):
+            self.components = self._simulation.integrator.step(self.components, u, draws)
+            self._episodes.steps += 1
+            if due is not None:
+                self._restart(np.flatnonzero(due))
+            observation, reward, terminated, truncated, info = self._read(u)
+        if due is not None:
+            reward = np.where(due, 0.0, reward)
+        return observation, reward, terminated, truncated, info
+
+    def _restart(self, envs: np.ndarray) -> None:
+        """Put some envs, given by their indices, at the start of an episode."""
+        begun = self._streams.begin_episodes(envs)
+        self.noise.begin(envs)
+        start = self._simulation.starts.draw_batch(self._streams.reader, *begun)
+        if (envs.size,) == self._shape:
+            self.components = tuple(start)
+        else:
+            self.components = tuple([x.copy() for x in self.components])
+            for x, fresh in zip(self.components, start, strict=True):
+                x[envs] = fresh
+        self._episodes.restart(envs)
+
+    def _read(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
+        """Read the states; `counted` are the envs whose states are new (None: all)."""
+        self.components = x = settled(self.components, self._shape)
+        time = self._episodes.steps * self._problem.dt if self._simulation.timed else 0.0
+        features, barriers, reward, outside, goal = self._simulation.measure(x, u, time)
+        rows = np.empty((len(features), *self._shape), dtype=np.float32)
+        for row, feature in zip(rows, features, strict=True):
+            row[:] = feature
+        observation = rows.T
+        barrier = stacked(barriers, *self._shape)
+        h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
+        info = self._episodes.count(barrier, h, counted)
+        terminated = filled(outside > 0.0, self._shape)
+        sound = finite(h) and finite(rows)
+        for i in self._unobserved:
+            sound = sound and finite(x[i])
+        if np.count_nonzero(terminated):
+            envs = np.flatnonzero(terminated)
+            observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
+        if not sound:
+            require_sound(x, h, observation, self._problem)
+        if self._problem.goal is not None:
+            terminated = terminated | (goal >= 0.0)
+        reward = filled(reward, self._shape).copy()
+        return observation, reward, terminated, self._episodes.steps >= self._limit, info
