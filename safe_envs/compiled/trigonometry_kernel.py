@@ -5,9 +5,9 @@ sine and the cosine of an angle have in common once, and goes on while it waits 
 Errors are below 1 unit in the last place for sine and cosine, and about 1 for the arc tangent.
 
 What they do not reach is left to the C library: angles beyond 2**17, sines of 0, vectors with tiny
-components, infinities. That is found out at the end, by a result that is no number. A question
-about the argument would let the compiler move the sums and products into one of its branches, where
-they could not be shared.
+components, infinities. Of an angle that is found out at the end, by a result that is no number:
+a question about the argument would let the compiler move the sums and products into one of its
+branches, where they could not be shared.
 
 The coefficients are those of minimax polynomials of z = r * r for the relative error, by Lawson's
 algorithm: sin(r) = r + r z S(z) to 2**-57.8 and cos(r) = 1 - z / 2 + z z C(z) to 2**-63.8, both up
