@@ -10,6 +10,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from safe_envs.compiled.data import Data
+from safe_envs.compiled.trigonometry_kernel import arc_tangent, cosine, sine
 from safe_envs.dynamics.codegen import prepared
 from safe_envs.dynamics.computable import excerpt
 from safe_envs.dynamics.printers import FloatPrinter
@@ -41,11 +42,29 @@ class Source:
 
 
 class _KernelPrinter(FloatPrinter):
-    """Prints numbers as entries of the program's data."""
+    """Prints numbers as entries of the program's data, and names functions of kernels.
+
+    Attributes:
+        uses: the functions that it has named.
+    """
 
     def __init__(self, data: Data) -> None:
         super().__init__()
         self._data = data
+        self.uses: list[Callable[..., Any]] = []
+
+    def _call(self, function: Callable[..., Any], expr: Any) -> str:
+        self.uses.append(function)
+        return f"{function.__name__}({', '.join(map(self._print, expr.args))})"
+
+    def _print_sin(self, expr: Any) -> str:
+        return self._call(sine, expr)
+
+    def _print_cos(self, expr: Any) -> str:
+        return self._call(cosine, expr)
+
+    def _print_atan2(self, expr: Any) -> str:
+        return self._call(arc_tangent, expr)
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
         # By way of its digits, as plain floats get it: that may round differently.
@@ -103,4 +122,4 @@ def formulas(
             f"{excerpt(exprs)} has no numerical form: {str(error).splitlines()[0]}"
         ) from error
     lines.append(f"    return ({' '.join(entries)})")
-    return Source("\n".join(lines) + "\n")
+    return Source("\n".join(lines) + "\n", tuple(dict.fromkeys(printer.uses)))

@@ -60,7 +60,9 @@ def test_inputs_are_those_that_envs_execute(env_id, kind):
     problem = problem_of(env_id)
     policy, seen = kind(problem), observations_of(problem)
     found = inputs_of(policy, problem, seen)
-    np.testing.assert_array_equal(found, executed(problem, predicted(policy, seen)))
+    # The arc tangent of programs is not that of the C library to the last bit.
+    expected = executed(problem, predicted(policy, seen))
+    np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14 * np.abs(expected).max())
     assert np.isfinite(found).all()
 
 
