@@ -76,7 +76,7 @@ class BatchStepper:
 
     def begin(self, envs: np.ndarray) -> VectorStep:
         """Begin the next episode of some envs; the others keep what their filter told."""
-        return self._run(self._nothing, True, False, np.ascontiguousarray(envs))
+        return self._run(self._nothing, True, False, envs)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`."""
@@ -103,7 +103,10 @@ class BatchStepper:
         self, given: np.ndarray, scaled: bool, stepping: bool, restarts: np.ndarray | None
     ) -> VectorStep:
         batch, filtered = self._batch, self._filter is not None
+        # For an array that cannot be written to, Numba would compile once more.
+        given = given if given.flags.carray else given.copy()
         if restarts is not None:
+            restarts = restarts if restarts.flags.carray else restarts.copy()
             batch.streams.begin_episodes(np.flatnonzero(restarts))
         n, problem = len(given), batch.problem
         states, counts = np.empty(batch.states.shape), np.empty((n, 2), dtype=np.int64)
@@ -142,12 +145,13 @@ class BatchStepper:
         if status not in (layout.DONE, layout.NOT_FINITE):
             self._refuse(status, given, restarts)
         batch.commit(states, counts, restarts)
-        self.tallies, self._told = tallies, told
         if stepping:
             batch.inputs = told.inputs
         if status:
             h = readings[:, layout.BARRIERS :].min(axis=1)
             require_sound(batch.components, h, observations, problem)
+        # As with NumPy's filter, a step that raises is in no count of the filter.
+        self.tallies, self._told = tallies, told
         flags = told.flags
         info = self._info(readings, told)
         return observations, rewards, flags[layout.TERMINATED], flags[layout.TRUNCATED], info
