@@ -209,6 +209,18 @@ def test_any_array_needs_one_compilation(monkeypatch):
     env.step([[0.1]] * 3)
 
 
+def test_a_filter_that_comes_late_tells_what_it_tells_at_rest(plain):
+    _, env = pair(DUBINS)
+    env.reset(seed=0)
+    mask = np.array([False, True, False])
+    _, info = SafetyFilterVectorWrapper(env, "scbf").reset(options={"reset_mask": mask})
+    for key in ("nominal_action", "safe_action", "slacks", "slack", "episode_interventions"):
+        np.testing.assert_array_equal(info[key], np.zeros_like(info[key]))
+    np.testing.assert_array_equal(info["active_barrier"], [-1, -1, -1])
+    assert info["feasible"].all()
+    assert not info["intervention"].any()
+
+
 def test_without_a_state_there_is_no_step(plain):
     for env in pair(SCALAR):
         for act in (lambda e=env: e.step(np.zeros((3, 1))), lambda e=env: e.unwrapped.components):
