@@ -10,9 +10,7 @@ from safe_envs.compiled.draws import draw_start, fill_normals
 from safe_envs.compiled.plain_natives import vector_view
 from safe_envs.compiled.slots import (
     advance,
-    input_at,
     resting_input,
-    scaled_input,
     state_at,
 )
 from safe_envs.dynamics.philox import NOISE
@@ -31,6 +29,7 @@ from safe_envs.envs.batch_layout import (
 )
 from safe_envs.envs.batch_part_kernels import (
     filter_input,
+    given_input,
     read_state,
     rest_filter,
     store_from,
@@ -125,7 +124,10 @@ def step_batch(  # noqa: PLR0913
             if filtered:
                 rest_filter(i, u, rest, inputs, tallies, choices, flags)
             if stepping:
-                store_from(inputs, i, 0, scaled_input(input_at(actions, i), data))
+                u, sound = given_input(i, actions, scaled, data)
+                if not sound:
+                    return BAD_ACTION
+                store_from(inputs, i, 0, u)
         else:
             x = state_at(states_before, i)
             states[i, len(x)] = states_before[i, len(x)]
@@ -134,12 +136,9 @@ def step_batch(  # noqa: PLR0913
             counts[i, STEPS] = counts_before[i, STEPS] + stepping
             counts[i, PERIOD] = period + stepping
             if stepping:
-                u = input_at(actions, i)
-                if not scaled:
-                    for a in u:
-                        if not isfinite(a):
-                            return BAD_ACTION
-                    u = scaled_input(u, data)
+                u, sound = given_input(i, actions, scaled, data)
+                if not sound:
+                    return BAD_ACTION
                 if filtered:
                     u, sound = filter_input(
                         i, x, u, data, work, inputs, tallies_before, tallies, choices, flags

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 
 from safe_envs.compiled.slots import (
@@ -11,11 +13,13 @@ from safe_envs.compiled.slots import (
     decide,
     has_ended,
     has_left,
+    input_at,
     is_finite,
     measure,
     observation_of,
     observation_within,
     reward_of,
+    scaled_input,
     smallest_barrier,
 )
 from safe_envs.envs.batch_layout import (
@@ -32,6 +36,27 @@ from safe_envs.envs.batch_layout import (
     TERMINATED,
     VIOLATION,
 )
+
+
+def given_input(i: int, actions: np.ndarray, scaled: bool, data: np.ndarray) -> tuple[Input, bool]:
+    """Return the physical input that an env is given.
+
+    Args:
+        i: index of the env.
+        actions: see `batch_kernel.step_batch`.
+        scaled: whether they are physical inputs.
+        data: numbers of the program.
+
+    Returns:
+        The input, and whether the action is finite.
+    """
+    u = input_at(actions, i)
+    if scaled:
+        return u, True
+    for a in u:
+        if not isfinite(a):
+            return u, False
+    return scaled_input(u, data), True
 
 
 def filter_input(  # noqa: PLR0913

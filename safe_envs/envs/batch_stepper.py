@@ -67,16 +67,16 @@ class BatchStepper:
         self._data, self._work = data.array(), np.empty(max(generated.work, 1))
         self._nowhere = np.zeros(n, dtype=bool)
         self._nothing = np.zeros(batch.shape)
-        self._told: _Told | None = None
         self._observation_shape = (n, len(problem.features))
         self._reading_shape = (n, layout.BARRIERS + len(problem.barriers))
         self._rows = n if batch_filter is not None else 0
         self._width = m + len(self._rest)
         self.tallies = np.zeros((self._rows, 2), dtype=np.int64)
+        self._told = self._at_rest()
 
     def begin(self, envs: np.ndarray) -> VectorStep:
         """Begin the next episode of some envs; the others keep what their filter told."""
-        return self._run(self._nothing, True, False, np.ascontiguousarray(envs))
+        return self._run(self._nothing, True, False, envs)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`."""
@@ -103,12 +103,15 @@ class BatchStepper:
         self, given: np.ndarray, scaled: bool, stepping: bool, restarts: np.ndarray | None
     ) -> VectorStep:
         batch, filtered = self._batch, self._filter is not None
+        # For an array that cannot be written to, Numba would compile once more.
+        given = given if given.flags.carray else given.copy()
         if restarts is not None:
+            restarts = restarts if restarts.flags.carray else restarts.copy()
             batch.streams.begin_episodes(np.flatnonzero(restarts))
         n, problem = len(given), batch.problem
         states, counts = np.empty(batch.states.shape), np.empty((n, 2), dtype=np.int64)
         tallies = np.empty((self._rows, 2), np.int64) if stepping else self.tallies.copy()
-        told = self._new_told() if stepping or self._told is None else self._told.copied()
+        told = self._new_told() if stepping else self._told.copied()
         observations, rewards = np.empty(self._observation_shape, np.float32), np.empty(n)
         readings = np.empty(self._reading_shape)
         status = self._step(
@@ -142,12 +145,13 @@ class BatchStepper:
         if status not in (layout.DONE, layout.NOT_FINITE):
             self._refuse(status, given, restarts)
         batch.commit(states, counts, restarts)
-        self.tallies, self._told = tallies, told
         if stepping:
             batch.inputs = told.inputs
         if status:
             h = readings[:, layout.BARRIERS :].min(axis=1)
             require_sound(batch.components, h, observations, problem)
+        # As with NumPy's filter, a step that raises is in no count of the filter.
+        self.tallies, self._told = tallies, told
         flags = told.flags
         info = self._info(readings, told)
         return observations, rewards, flags[layout.TERMINATED], flags[layout.TRUNCATED], info
@@ -159,6 +163,15 @@ class BatchStepper:
             np.empty((self._rows, 3), dtype=np.int64),
             np.empty((7, n), dtype=bool),
         )
+
+    def _at_rest(self) -> _Told:
+        """Return what is told of envs whose filter has decided nothing yet."""
+        inputs, choices, flags = told = self._new_told()
+        inputs[:] = [0.0] * self._batch.shape[1] + self._rest.tolist()
+        choices[:] = [0, 0, -1]
+        flags[:] = False
+        flags[layout.FEASIBLE] = True
+        return told
 
     def _info(self, readings: np.ndarray, told: _Told) -> Info:
         inputs, choices, flags = told

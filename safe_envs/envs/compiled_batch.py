@@ -44,7 +44,7 @@ class CompiledBatch:
 
     @property
     def executed(self) -> Components:
-        """Components of the physical inputs of the last step; what was proposed at a restart."""
+        """Components of the physical inputs of the last step; where it restarted, as given."""
         return tuple(self._state.inputs.T[: self._state.shape[1]])
 
     def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
@@ -59,7 +59,8 @@ class CompiledBatch:
         counts[:, STEPS] = episodes.steps
         counts[seeded, PERIOD] = episodes.steps[seeded]
         state.chunks[seeded] = -1
-        state.commit(np.column_stack([states, episodes.h_min, episodes.episode_cost]), counts, None)
+        rows = np.column_stack([states, episodes.h_min, episodes.episode_cost])
+        state.commit(np.ascontiguousarray(rows, dtype=float), counts, None)
 
     def begin(self, envs: np.ndarray) -> VectorStep:
         """Begin the next episode of some envs; see `ArrayBatch.begin`."""

@@ -101,7 +101,8 @@ class Episodes:
             raise gym.error.ResetNeeded(
                 "some envs have no state yet: the first reset takes no reset_mask"
             )
-        return mask
+        # It is in the info, and the caller may use theirs again.
+        return mask.copy()
 
     def restart(self, envs: np.ndarray) -> None:
         """Begin the episodes of some envs, given by indices or by a mask."""

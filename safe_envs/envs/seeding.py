@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from safe_envs.dynamics.philox import Key, StreamReader, key_of
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, require_whole
 
 Seeds = int | Sequence[int | None] | None
 """A seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env."""
@@ -50,15 +50,20 @@ class EpisodeStreams:
             seed: that of env 0, with env i seeded by seed + i, or one (or None) for each env.
 
         Raises:
-            ConfigurationError: There are not as many seeds as envs.
+            ConfigurationError: There are not as many seeds as envs, or one is no whole number from
+                0.
         """
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
+        if not isinstance(seed, Sequence | np.ndarray):
+            require_whole("seed", seed, 0)
             return [int(seed) + i for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ConfigurationError(f"{len(seed)} seeds were given for {self.num_envs} envs")
-        return [None if s is None else int(s) for s in seed]
+        for each in seed:
+            if each is not None:
+                require_whole("seed", each, 0)
+        return [None if each is None else int(each) for each in seed]
 
     def seed(self, seeds: Sequence[int | None]) -> list[int]:
         """Seed the envs that have a seed, at the first use all; return their indices.

@@ -167,6 +167,60 @@ def test_refused_actions_change_nothing(plain):
     assert_same_results(envs, lambda env: env.step(np.zeros((3, 1))), "afterwards")
 
 
+@pytest.mark.parametrize("condition", [None, "scbf"])
+def test_actions_are_checked_where_an_episode_begins(condition, plain):
+    envs = pair(DUBINS, condition, horizon=0.1)
+    assert sum(assert_same_steps(envs, 2)) == 3
+    for env in envs:
+        with pytest.raises(InvalidInputError, match=r"envs \[1\] are not finite"):
+            env.step(np.array([[0.0], [np.nan], [0.0]]))
+    begun = assert_same_results(envs, lambda env: env.step(np.zeros((3, 1))), "afterwards")
+    assert not begun[1].any()
+
+
+def test_inputs_in_physical_units_are_held_as_they_are(plain):
+    envs = [env.unwrapped for env in pair(DUBINS, horizon=0.1)]
+    assert_same_results(envs, lambda env: env.reset(seed=0), "reset")
+    for k in range(4):
+        assert_same_results(envs, lambda env: env.step_physical((np.full(3, 3.0),)), f"step {k}")
+        np.testing.assert_array_equal(envs[1].executed, [np.full(3, 3.0)])
+
+
+def test_any_array_needs_one_compilation(monkeypatch):
+    def checked(program):
+        (step,) = program.plain().values()
+
+        def call(*arguments):
+            for k, argument in enumerate(arguments):
+                assert not isinstance(argument, np.ndarray) or argument.flags.carray, k
+            return step(*arguments)
+
+        return {"step_batch": call}
+
+    monkeypatch.setattr(Program, "compiled", checked)
+    _, env = pair(DUBINS, "scbf")
+    everywhere = np.broadcast_to(True, (3,))
+    env.reset(seed=0, options={"reset_mask": everywhere})
+    env.step(np.broadcast_to(0.5, (3, 1)))
+    env.restore({key: np.asfortranarray(v) for key, v in env.snapshot().items()})
+    env.step(np.zeros((6, 1))[::2])
+    env.restore({key: v.tolist() for key, v in env.snapshot().items()})
+    env.reset(options={"reset_mask": np.array([True, False] * 3)[::2]})
+    env.step([[0.1]] * 3)
+
+
+def test_a_filter_that_comes_late_tells_what_it_tells_at_rest(plain):
+    _, env = pair(DUBINS)
+    env.reset(seed=0)
+    mask = np.array([False, True, False])
+    _, info = SafetyFilterVectorWrapper(env, "scbf").reset(options={"reset_mask": mask})
+    for key in ("nominal_action", "safe_action", "slacks", "slack", "episode_interventions"):
+        np.testing.assert_array_equal(info[key], np.zeros_like(info[key]))
+    np.testing.assert_array_equal(info["active_barrier"], [-1, -1, -1])
+    assert info["feasible"].all()
+    assert not info["intervention"].any()
+
+
 def test_without_a_state_there_is_no_step(plain):
     for env in pair(SCALAR):
         for act in (lambda e=env: e.step(np.zeros((3, 1))), lambda e=env: e.unwrapped.components):
@@ -174,19 +228,22 @@ def test_without_a_state_there_is_no_step(plain):
                 act()
 
 
-def test_states_that_leave_the_finite_numbers(plain):
-    messages = []
-    for env in pair(DUBINS):
-        env.reset(seed=0)
-        snapshot = env.unwrapped.snapshot()
-        snapshot["state"][1] = 1e200
-        env.unwrapped.restore(snapshot)
+@pytest.mark.parametrize("condition", [None, "scbf"])
+def test_states_that_leave_the_finite_numbers(condition, plain):
+    messages, envs = [], pair(DUBINS, condition)
+    for env in envs:
+        env.reset(seed=1)
+        snapshot = env.snapshot()
+        snapshot["state"][1] = [1e200, 0.0, 0.0]
+        env.restore(snapshot)
         # Compiled code does not warn.
         with np.errstate(all="ignore"), pytest.raises(NumericalError) as error:
-            env.step(np.zeros((3, 1)))
+            env.step(np.full((3, 1), -1.0))
         messages.append(str(error.value))
+        env.reset(options={"reset_mask": np.array([False, True, False])})
     assert messages[0] == messages[1]
     assert "envs [1]" in messages[0]
+    assert_same_results(envs, lambda env: env.step(np.full((3, 1), -1.0)), "afterwards")
 
 
 def test_constraints_without_a_finite_value(plain):

@@ -197,6 +197,9 @@ def test_seeds_may_be_a_list():
     np.testing.assert_array_equal(env.reset(seed=np.int64(4))[0], env.reset(seed=4)[0])
     with pytest.raises(ConfigurationError, match="3 seeds were given for 2 envs"):
         env.reset(seed=[1, 2, 3])
+    for seed in (1.5, [4, 9.7], "ab", [True, 1], [-1, 1]):
+        with pytest.raises(ConfigurationError, match="give a whole number from 0"):
+            env.reset(seed=seed)
 
 
 @pytest.mark.parametrize(
@@ -209,6 +212,15 @@ def test_seeds_may_be_a_list():
 def test_arguments_out_of_range_are_named(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
         gym.make_vec("safe_envs/Scalar-v0", **arguments)
+
+
+def test_reset_masks_may_be_used_again():
+    env = gym.make_vec("safe_envs/Scalar-v0", num_envs=2)
+    env.reset(seed=0)
+    mask = np.array([True, False])
+    _, info = env.reset(options={"reset_mask": mask})
+    mask[:] = False
+    np.testing.assert_array_equal(info["_cost"], [True, False])
 
 
 def test_reset_masks_are_checked():

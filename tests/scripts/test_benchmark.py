@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from safe_envs.agents import evaluate
 from safe_envs.agents.training import vec_env_speed as sb3_speed
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError
@@ -69,6 +70,13 @@ def test_figures_are_finite_and_positive_and_ratios_fit(quick, monkeypatch):
 
 def test_engines_stand_side_by_side(quick, monkeypatch, capsys):
     monkeypatch.setattr(Program, "compiled", Program.plain)
+    ran = []
+
+    def noting(*arguments, **options):
+        ran.append((options["engine"], options["jobs"]))
+        return evaluate(*arguments, **options)
+
+    monkeypatch.setattr("safe_envs.agents.evaluate", noting)
     monkeypatch.setattr(benchmark_cases, "NUM_ENVS", 1)
     for name in ("filter_calls", "several_constraints"):
         monkeypatch.setattr(benchmark_figures, name, dict)
@@ -80,6 +88,8 @@ def test_engines_stand_side_by_side(quick, monkeypatch, capsys):
     lines = capsys.readouterr().out.split("engines side by side")[1].splitlines()[2:]
     rows = {line.split("  ")[0].strip(): line.split()[-3:] for line in lines if line.strip()}
     assert len(rows) == 5
+    # The ratio is that of one core to one core.
+    assert set(ran) == {("numpy", 1), ("compiled", 1), ("compiled", None)}
     for numpy_engine, compiled, ratio in rows.values():
         assert float(ratio) == pytest.approx(float(compiled) / float(numpy_engine), rel=0.1)
 
@@ -110,7 +120,10 @@ def test_the_hand_written_loop_does_the_work_of_the_env():
         np.testing.assert_allclose(observations, observed, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(rewards, reward, rtol=1e-9)
         np.testing.assert_array_equal(ended, terminated | truncated)
-    np.testing.assert_array_equal(counters[:, 2], info["episode_interventions"])
+    names = ("h_min", "episode_cost", "episode_interventions", "episode_infeasible")
+    for column, name in zip(counters.T, names, strict=True):
+        np.testing.assert_allclose(column, info[name], rtol=1e-6, err_msg=name)
+    assert info["h_min"].max() > 0.0
     assert ended.all()
 
 

@@ -54,7 +54,8 @@ class Training:
         eval_episodes: of each evaluation.
         threads: of torch and BLAS. Small networks are many times slower on several threads of a
             busy machine.
-        engine: of the envs, see `SafeVectorEnv`; "auto" is NumPy for short trainings.
+        engine: of the envs, see `SafeVectorEnv`; "auto" is NumPy for short trainings. Evaluations
+            choose theirs by their own length, unless it is "numpy".
 
     Raises:
         ConfigurationError: a value is not allowed.

@@ -66,6 +66,12 @@ def _require_same_training(folder: Path, training: Training) -> None:
         )
     with reading(path, _ADVICE):
         known = _flat(_read(path)["training"])
+    unknown = sorted(asdict(training).keys() - known)
+    if unknown:
+        raise ConfigurationError(
+            f"--resume: the training in {folder} was started by another version, which had no"
+            f" {', '.join(unknown)}; go on with that version, or start it again in another folder"
+        )
     wanted = _flat(json.loads(json.dumps(asdict(training))))
     # Another system may change others too, such as a default, which come after it.
     for name in sorted(

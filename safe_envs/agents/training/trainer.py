@@ -257,6 +257,8 @@ class TrainingSession:
             seed=seed,
             knowledge=training.knowledge,
             bounds=False,
+            # Policies that cannot be compiled can be trained behind compiled envs.
+            engine="numpy" if training.engine == "numpy" else "auto",
         )
         row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
         best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)

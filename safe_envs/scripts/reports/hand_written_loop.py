@@ -7,7 +7,7 @@ counters and restarts, without info, checks, and what Gymnasium asks for. Its nu
 
 from __future__ import annotations
 
-from math import cos, pi, sin, sqrt
+from math import cos, inf, pi, sin, sqrt
 
 import numpy as np
 
@@ -85,7 +85,8 @@ def step_by_hand(
             episodes[i] += 1
             x, y, theta = start_by_hand(keys[i], episodes[i])
             k = 0
-            for j in range(4):
+            counters[i, 0] = inf
+            for j in range(1, 4):
                 counters[i, j] = 0.0
         else:
             x, y, theta = states[i, 0], states[i, 1], states[i, 2]
@@ -104,7 +105,7 @@ def step_by_hand(
             if a * u + b < 0.0:
                 u = min(max(-b / a, -LARGEST_INPUT), LARGEST_INPUT)
                 counters[i, 2] += u != nominal
-                counters[i, 3] += a * u + b < 0.0
+                counters[i, 3] += abs(a) * LARGEST_INPUT + b < 0.0
             x += SPEED * c * PERIOD + root * first
             y += SPEED * s * PERIOD + root * second
             theta += u * PERIOD

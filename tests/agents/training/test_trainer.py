@@ -209,6 +209,12 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
             folder,
             resume=True,
         )
+    config = json.loads((folder / "config.json").read_text())
+    del config["training"]["engine"]
+    (tmp_path / "older").mkdir()
+    (tmp_path / "older" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ConfigurationError, match="by another version, which had no engine; go on"):
+        train(training(), tmp_path / "older", resume=True)
 
 
 @pytest.mark.parametrize(
@@ -329,6 +335,13 @@ def test_long_trainings_take_the_compiled_engine(tmp_path, monkeypatch):
         assert session._model.get_env().get_attr("engine") == [engine] * 4
     with pytest.raises(ConfigurationError, match="engine = 'fast'"):
         training(engine="fast")
+
+
+def test_no_engine_but_numpy_is_used_where_it_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(engines, "LONG", 0)
+    monkeypatch.setattr(Program, "compiled", lambda _: pytest.fail("a program is compiled"))
+    train(training(steps=256, engine="numpy"), tmp_path / "run")
+    assert len(evaluations(tmp_path / "run")) == 1
 
 
 def test_the_figures_are_those_of_the_infos():
