@@ -12,6 +12,9 @@ from pathlib import Path
 _KEPT = 64
 """Programs that are kept; each takes some hundred kilobytes."""
 
+DIGITS = 32
+"""Hexadecimal digits in the name of a program's folder."""
+
 VARIABLE = "SAFE_ENVS_CACHE"
 """Environment variable with a folder to use in place of the user's cache; empty for none."""
 
@@ -33,9 +36,9 @@ def cache_folder() -> Path | None:
 
 
 def forget_old_programs(folder: Path) -> None:
-    """Remove programs, but for the 64 that were used last."""
+    """Remove programs, but for the 64 that were used last, and nothing else."""
     used = {}
-    for program in folder.iterdir():
+    for program in folder.glob("[0-9a-f]" * DIGITS):
         with suppress(OSError):  # Another process may have removed it.
             used[program] = program.stat().st_mtime
     for program in sorted(used, key=lambda each: -used[each])[_KEPT:]:
