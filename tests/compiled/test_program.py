@@ -13,7 +13,7 @@ import pytest
 
 from safe_envs.compiled import cache, program
 from safe_envs.compiled.cache import VARIABLE, cache_folder, forget_old_programs
-from safe_envs.compiled.engine import compiled_or_none, require_engine
+from safe_envs.compiled.engine import compiled_or_none, periods_of_a_part, require_engine
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError, SystemDefinitionError
@@ -216,3 +216,10 @@ def test_engines_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigurationError, match=r"needs Numba.*safe-envs\[fast\]"):
         small().compiled()
+
+
+def test_parts_of_the_work_are_short_for_large_networks() -> None:
+    # An interrupt waits for the end of a part. A network of 400 and 300 units takes some 30 us.
+    assert periods_of_a_part(1) == periods_of_a_part(100) == 1_000_000
+    assert periods_of_a_part(125_000) == 800
+    assert periods_of_a_part(10**12) == 1
