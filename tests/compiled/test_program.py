@@ -105,6 +105,15 @@ def test_a_folder_that_others_write_to_is_not_used(folder: Path) -> None:
     assert not list(folder.iterdir())
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs rights of files as on Unix")
+def test_a_folder_that_others_can_replace_is_not_used(folder: Path) -> None:
+    assert cache_folder() == folder
+    folder.parent.chmod(0o777)
+    assert cache_folder() is None
+    folder.parent.chmod(0o1777)
+    assert cache_folder() == folder
+
+
 def test_a_folder_that_nothing_can_be_written_to_is_not_needed(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
