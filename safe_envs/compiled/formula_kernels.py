@@ -28,10 +28,20 @@ def formula_sign(value: float) -> float:
 
 
 def formula_max(a: float, b: float) -> float:
-    """Return the larger one of two numbers; NaN where one is."""
+    """Return the larger one of two numbers; NaN where one is.
+
+    Args:
+        a: a number.
+        b: another one.
+    """
     return float(a) if a >= b or a != a else float(b)
 
 
 def formula_min(a: float, b: float) -> float:
-    """Return the smaller one of two numbers; NaN where one is."""
+    """Return the smaller one of two numbers; NaN where one is.
+
+    Args:
+        a: a number.
+        b: another one.
+    """
     return float(a) if a <= b or a != a else float(b)
