@@ -12,6 +12,9 @@ from pathlib import Path
 _KEPT = 64
 """Programs that are kept; each takes some hundred kilobytes."""
 
+DIGITS = 32
+"""Hexadecimal digits in the name of a program's folder."""
+
 VARIABLE = "SAFE_ENVS_CACHE"
 """Environment variable with a folder to use in place of the user's cache; empty for none."""
 
@@ -19,7 +22,8 @@ VARIABLE = "SAFE_ENVS_CACHE"
 def cache_folder() -> Path | None:
     """Return the folder of compiled programs, made if need be; None where none can be trusted.
 
-    What is found there is executed: it must belong to the user, and nobody else may write to it.
+    What is found there is executed: it must belong to the user, and nobody else may write to it
+    or put another one in its place.
     """
     given = os.environ.get(VARIABLE)
     if given == "":
@@ -33,9 +37,9 @@ def cache_folder() -> Path | None:
 
 
 def forget_old_programs(folder: Path) -> None:
-    """Remove programs, but for the 64 that were used last."""
+    """Remove programs, but for the 64 that were used last, and nothing else."""
     used = {}
-    for program in folder.iterdir():
+    for program in folder.glob("[0-9a-f]" * DIGITS):
         with suppress(OSError):  # Another process may have removed it.
             used[program] = program.stat().st_mtime
     for program in sorted(used, key=lambda each: -used[each])[_KEPT:]:
@@ -47,7 +51,18 @@ def _is_private(folder: Path) -> bool:
         return os.access(folder, os.W_OK)
     found = folder.stat()
     others_write = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    return found.st_uid == os.getuid() and not others_write and os.access(folder, os.W_OK)
+    return (
+        found.st_uid == os.getuid()
+        and not others_write
+        and os.access(folder, os.W_OK)
+        and not any(map(_anyone_may_rename_in, folder.resolve().parents))
+    )
+
+
+def _anyone_may_rename_in(folder: Path) -> bool:
+    """Return whether anyone can put a folder of theirs in the place of one in it."""
+    mode = folder.stat().st_mode
+    return bool(mode & stat.S_IWOTH) and not mode & stat.S_ISVTX
 
 
 def _user_folder() -> Path:

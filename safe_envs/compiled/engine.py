@@ -16,6 +16,10 @@ LONG = 5_000_000
 a compilation takes as well. The choice depends on nothing else that changes from run to run, so
 that a command gives the same numbers each time."""
 
+_PART = 1_000_000
+_FEW_NUMBERS = 100
+"""Control periods that take some tenths of a second, if a program has few numbers."""
+
 _Found = TypeVar("_Found")
 
 
@@ -57,3 +61,15 @@ def engine_for(engine: str, periods: float) -> str:
         periods: control periods to simulate, about.
     """
     return "numpy" if engine == "auto" and periods < LONG else engine
+
+
+def periods_of_a_part(numbers: int) -> int:
+    """Return control periods to simulate by one call, which nothing can interrupt.
+
+    They take less than a second, about: a program reads most of its numbers, such as the weights of
+    a network, in each period. It is no measured time, so that the parts are the same each time.
+
+    Args:
+        numbers: of the program.
+    """
+    return max(1, _PART * _FEW_NUMBERS // max(numbers, _FEW_NUMBERS))

@@ -10,6 +10,13 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from safe_envs.compiled.data import Data
+from safe_envs.compiled.formula_kernels import (
+    formula_ceiling,
+    formula_floor,
+    formula_max,
+    formula_min,
+    formula_sign,
+)
 from safe_envs.compiled.trigonometry_kernel import arc_tangent, cosine, sine
 from safe_envs.dynamics.codegen import prepared
 from safe_envs.dynamics.computable import excerpt
@@ -42,29 +49,16 @@ class Source:
 
 
 class _KernelPrinter(FloatPrinter):
-    """Prints numbers as entries of the program's data, and names functions of kernels.
+    """Prints numbers as entries of the program's data.
 
     Attributes:
-        uses: the functions that it has named.
+        uses: kernels that the code calls.
     """
 
     def __init__(self, data: Data) -> None:
         super().__init__()
         self._data = data
         self.uses: list[Callable[..., Any]] = []
-
-    def _call(self, function: Callable[..., Any], expr: Any) -> str:
-        self.uses.append(function)
-        return f"{function.__name__}({', '.join(map(self._print, expr.args))})"
-
-    def _print_sin(self, expr: Any) -> str:
-        return self._call(sine, expr)
-
-    def _print_cos(self, expr: Any) -> str:
-        return self._call(cosine, expr)
-
-    def _print_atan2(self, expr: Any) -> str:
-        return self._call(arc_tangent, expr)
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
         # By way of its digits, as plain floats get it: that may round differently.
@@ -74,6 +68,41 @@ class _KernelPrinter(FloatPrinter):
         # Compiled code has whole numbers of 64 bits.
         small = abs(expr) < _LARGE
         return super()._print_Integer(expr) if small else self._print_Float(sp.Float(expr, 17))
+
+    def _call(self, kernel: Callable[..., Any], *arguments: str) -> str:
+        if kernel not in self.uses:
+            self.uses.append(kernel)
+        return f"{kernel.__name__}({', '.join(arguments)})"
+
+    def _nested(self, kernel: Callable[..., Any], expr: Any) -> str:
+        first, *others = (self._print(argument) for argument in expr.args)
+        for argument in others:
+            first = self._call(kernel, first, argument)
+        return first
+
+    def _print_Max(self, expr: Any) -> str:  # noqa: N802
+        return self._nested(formula_max, expr)
+
+    def _print_Min(self, expr: Any) -> str:  # noqa: N802
+        return self._nested(formula_min, expr)
+
+    def _print_sin(self, expr: Any) -> str:
+        return self._call(sine, self._print(expr.args[0]))
+
+    def _print_cos(self, expr: Any) -> str:
+        return self._call(cosine, self._print(expr.args[0]))
+
+    def _print_atan2(self, expr: Any) -> str:
+        return self._call(arc_tangent, *map(self._print, expr.args))
+
+    def _print_sign(self, e: Any) -> str:
+        return self._call(formula_sign, self._print(e.args[0]))
+
+    def _print_floor(self, expr: Any) -> str:
+        return self._call(formula_floor, self._print(expr.args[0]))
+
+    def _print_ceiling(self, expr: Any) -> str:
+        return self._call(formula_ceiling, self._print(expr.args[0]))
 
 
 def formulas(
@@ -122,4 +151,4 @@ def formulas(
             f"{excerpt(exprs)} has no numerical form: {str(error).splitlines()[0]}"
         ) from error
     lines.append(f"    return ({' '.join(entries)})")
-    return Source("\n".join(lines) + "\n", tuple(dict.fromkeys(printer.uses)))
+    return Source("\n".join(lines) + "\n", tuple(printer.uses))

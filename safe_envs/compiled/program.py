@@ -12,14 +12,15 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.compiled import plain_natives
-from safe_envs.compiled.cache import cache_folder, forget_old_programs
+from safe_envs.compiled.cache import DIGITS, cache_folder, forget_old_programs
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.linker import linked
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, NotCompilableError, shortened
 
 ADVICE = "install it with pip install 'safe-envs[fast]', or use the engine 'numpy'"
 
@@ -68,6 +69,7 @@ class Program:
 
         Raises:
             ConfigurationError: Numba is not installed.
+            NotCompilableError: It cannot be used.
         """
         if not is_available():
             raise ConfigurationError(f"the compiled engine needs Numba, which is missing; {ADVICE}")
@@ -80,23 +82,40 @@ def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @lru_cache(maxsize=64)
 def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
-    from safe_envs.compiled import numba_natives
-
-    stamp = f"{inspect.getsource(numba_natives)}\n{text}"
-    digest = hashlib.sha256(stamp.encode()).hexdigest()[:32]
+    natives = _natives()
+    stamp = f"{inspect.getsource(natives)}\n{text}"
+    digest = hashlib.sha256(stamp.encode()).hexdigest()[:DIGITS]
     folder = cache_folder()
-    if folder is None:
-        _LOG.warning("compiling %s; there is no folder of yours to keep it in", title)
-        natives = {**vars(numba_natives), "entry": numba_natives.passing_entry}
-        return _functions(natives, text, names)
-    program = _KeptProgram(folder / digest, text, title)
-    forget_old_programs(folder)
-    return {name: program.entry(name) for name in names}
+    try:
+        if folder is not None:
+            program = _KeptProgram(folder / digest, text, title)
+            forget_old_programs(folder)
+            return {name: program.entry(name) for name in names}
+    except (OSError, ConfigurationError):  # The disk may be full.
+        pass
+    _LOG.warning("compiling %s; there is no folder of yours to keep it in", title)
+    found = _not_kept(text)
+    return {name: found[name] for name in names}
 
 
-def _functions(names: dict[str, Any], text: str, wanted: Sequence[str]) -> Functions:
+def _natives() -> ModuleType:
+    """Import what needs Numba, which may not suit the other packages."""
+    try:
+        from numba.core import config
+
+        from safe_envs.compiled import numba_natives
+    except Exception as error:
+        raise NotCompilableError(f"Numba cannot be imported: {shortened(error)}") from error
+    if getattr(config, "DISABLE_JIT", 0):
+        raise NotCompilableError("Numba compiles nothing, as NUMBA_DISABLE_JIT says")
+    return numba_natives
+
+
+def _not_kept(text: str) -> dict[str, Any]:
+    natives = _natives()
+    names = {**vars(natives), "entry": natives.passing_entry}
     exec(text, names)
-    return {name: names[name] for name in wanted}
+    return names
 
 
 class _KeptProgram:
@@ -104,7 +123,7 @@ class _KeptProgram:
 
     def __init__(self, folder: Path, text: str, title: str) -> None:
         self._folder, self._title, self._told = folder, title, False
-        self._text = f"from safe_envs.compiled.numba_natives import *\n{text}"
+        self._text = text
         self._functions = self._load()
 
     def entry(self, name: str) -> Callable[..., Any]:
@@ -116,25 +135,33 @@ class _KeptProgram:
             nonlocal function, is_new
             if not is_new:
                 return function(*arguments)
-            if not (self._told or any(self._folder.glob(f"__pycache__/*.{name}-*.nbi"))):
+            # Elsewhere where the user has set NUMBA_CACHE_DIR.
+            place = Path(function.stats.cache_path)
+            is_kept = any(place.glob(f"*.{name}-*.nbi"))
+            if not (is_kept or self._told):
                 _LOG.warning("compiling %s, which takes some seconds once", self._title)
                 self._told = True
             is_new = False
             try:
                 return function(*arguments)
+            except OSError:  # The disk may be full.
+                function = _not_kept(self._text)[name]
             except Exception:
+                if not is_kept:
+                    raise
                 # Kernels raise nothing: what is kept cannot be read.
-                shutil.rmtree(self._folder, ignore_errors=True)
+                shutil.rmtree(place, ignore_errors=True)
                 function = self._load()[name]
-                return function(*arguments)
+            return function(*arguments)
 
         return call
 
     def _load(self) -> dict[str, Any]:
         file = self._folder / _FILE
+        text = f"from safe_envs.compiled.numba_natives import *\n{self._text}".encode()
         self._folder.mkdir(mode=0o700, exist_ok=True)
-        if not file.is_file() or file.read_text() != self._text:
-            write_atomically(file, lambda path: path.write_text(self._text))
+        if not file.is_file() or file.read_bytes() != text:
+            write_atomically(file, lambda path: path.write_bytes(text))
         os.utime(self._folder)
         name = f"safe_envs_program_{self._folder.name}"
         spec: Any = importlib.util.spec_from_file_location(name, file)

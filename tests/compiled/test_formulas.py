@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import sympy as sp
 
 from safe_envs.compiled.data import Data
+from safe_envs.compiled.formula_kernels import formula_max, formula_min
 from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.compiled.program import Program
 from safe_envs.dynamics.codegen import compile_function
@@ -92,3 +94,34 @@ def test_a_function_returns_floats_and_reads_what_it_needs() -> None:
     names: dict = dict(vars(math))
     exec(source.text, names)
     assert names["f"]((math.nan, 3.0), math.nan, np.array([1.0])) == (1.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [sp.Max(t, x - y), sp.Min(t, x - y), sp.sign(x - y)],
+    ids=str,
+)
+def test_nan_remains_nan(expression: sp.Expr) -> None:
+    data = Data()
+    functions = program([expression], data).plain()
+    with np.errstate(invalid="ignore"):
+        assert math.isnan(read(functions, data, (math.inf, math.inf, 1.0)))
+    assert read(functions, data, (1.0, 2.0, 1.0)) == float(expression.subs({x: 1, y: 2, t: 1}))
+
+
+@pytest.mark.parametrize(("kernel", "plain"), [(formula_max, max), (formula_min, min)])
+def test_nan_remains_nan_in_either_place(kernel: Callable, plain: Callable) -> None:
+    assert math.isnan(kernel(math.nan, 1.0))
+    assert math.isnan(kernel(1.0, math.nan))
+    assert kernel(2.0, 1.0) == kernel(1.0, 2.0) == plain(1.0, 2.0)
+
+
+@pytest.mark.parametrize("value", [1e30, -1e19, 2.5, -2.5, 0.0, -7.0, math.inf])
+def test_whole_numbers_have_no_largest_one(value: float) -> None:
+    data = Data()
+    functions = program([sp.floor(x)], data).plain()
+    text = program([sp.floor(x) + sp.ceiling(y)], Data()).text
+    assert read(functions, data, (value, 0.0, 0.0)) == np.floor(value)
+    # Compiled code would make a whole number of 64 bits of it.
+    assert "formula_floor(" in text
+    assert "formula_ceiling(" in text

@@ -4,14 +4,16 @@ import logging
 import multiprocessing
 import os
 import stat
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from safe_envs.compiled import cache, program
 from safe_envs.compiled.cache import VARIABLE, cache_folder, forget_old_programs
-from safe_envs.compiled.engine import compiled_or_none, require_engine
+from safe_envs.compiled.engine import compiled_or_none, periods_of_a_part, require_engine
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError, SystemDefinitionError
@@ -103,6 +105,58 @@ def test_a_folder_that_others_write_to_is_not_used(folder: Path) -> None:
     assert not list(folder.iterdir())
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs rights of files as on Unix")
+def test_a_folder_that_others_can_replace_is_not_used(folder: Path) -> None:
+    assert cache_folder() == folder
+    folder.parent.chmod(0o777)
+    assert cache_folder() is None
+    folder.parent.chmod(0o1777)
+    assert cache_folder() == folder
+
+
+def test_a_folder_that_nothing_can_be_written_to_is_not_needed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise ConfigurationError("no space left on device")
+
+    monkeypatch.setattr(program, "write_atomically", full)
+    monkeypatch.setattr(program, "_not_kept", lambda text: {"total_reward": np.sum})
+    assert small().compiled()["total_reward"](VALUES) == 7.0
+    assert [each.message for each in caplog.records] == [
+        "compiling a sum; there is no folder of yours to keep it in"
+    ]
+
+
+def test_a_disk_that_gets_full_while_compiling(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(_: object) -> dict:
+        def full(_: np.ndarray) -> float:
+            raise OSError("no space left on device")
+
+        full.stats = SimpleNamespace(cache_path=str(folder))  # pyright: ignore[reportFunctionMemberAccess]
+        return {"total_reward": full}
+
+    monkeypatch.setattr(program._KeptProgram, "_load", load)
+    monkeypatch.setattr(program, "_not_kept", lambda text: {"total_reward": np.sum})
+    assert small().compiled()["total_reward"](VALUES) == 7.0
+
+
+def test_a_numba_that_does_not_work_leaves_the_work_to_numpy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    program._loaded.cache_clear()
+    monkeypatch.setattr("numba.core.config.DISABLE_JIT", 1)
+    assert compiled_or_none("auto", 1e9, small().compiled) is None
+    with pytest.raises(NotCompilableError, match="NUMBA_DISABLE_JIT"):
+        compiled_or_none("compiled", 1.0, small().compiled)
+    monkeypatch.setitem(sys.modules, "numba.core", None)
+    monkeypatch.setattr(program, "is_available", lambda: True)
+    with pytest.raises(NotCompilableError, match="cannot be imported"):
+        small().compiled()
+
+
 def test_places_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "")
     assert cache_folder() is None
@@ -116,11 +170,12 @@ def test_places_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_programs_used_last_remain(tmp_path: Path) -> None:
-    for i in range(70):
-        (tmp_path / str(i)).mkdir()
-        os.utime(tmp_path / str(i), (i, i))
+    names = [f"{i:032x}" for i in range(70)]
+    for i, name in enumerate(["mine", *names]):
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (i, i))
     forget_old_programs(tmp_path)
-    assert {each.name for each in tmp_path.iterdir()} == {str(i) for i in range(6, 70)}
+    assert {each.name for each in tmp_path.iterdir()} == {"mine", *names[6:]}
 
 
 def test_compiled_natives_give_what_plain_ones_give(folder: Path) -> None:
@@ -170,3 +225,10 @@ def test_engines_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigurationError, match=r"needs Numba.*safe-envs\[fast\]"):
         small().compiled()
+
+
+def test_parts_of_the_work_are_short_for_large_networks() -> None:
+    # An interrupt waits for the end of a part. A network of 400 and 300 units takes some 30 us.
+    assert periods_of_a_part(1) == periods_of_a_part(100) == 1_000_000
+    assert periods_of_a_part(125_000) == 800
+    assert periods_of_a_part(10**12) == 1

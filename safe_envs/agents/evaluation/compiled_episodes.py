@@ -19,6 +19,7 @@ from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.agents.policies.policy_source import policy_source
 from safe_envs.compiled.data import Data
+from safe_envs.compiled.engine import periods_of_a_part
 from safe_envs.compiled.program import Functions, Program
 from safe_envs.dynamics.philox import key_of
 from safe_envs.envs.world_source import noise_channels, world_source
@@ -26,9 +27,6 @@ from safe_envs.errors import NotCompilableError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
-
-_PERIODS = 1_000_000
-"""Control periods of a part of the work at most, some tenths of a second."""
 
 _PARTS = 8
 """Parts for each thread at least, so that all threads end at about the same time."""
@@ -107,11 +105,12 @@ class CompiledEpisodes:
         Returns:
             The batches in the order of the episodes.
         """
-        size = max(1, min(_PERIODS // self._problem.steps, len(episodes) // (_PARTS * threads)))
-        parts = [
+        size = periods_of_a_part(len(self._data)) // self._problem.steps
+        size = max(1, min(size, len(episodes) // (_PARTS * threads)))
+        parts = (
             range(first, min(first + size, episodes.stop))
             for first in range(episodes.start, episodes.stop, size)
-        ]
+        )
         for part, batch in self._in_order(functions, parts, seed, threads):
             done = len(batch.starts)
             if done:
@@ -120,7 +119,7 @@ class CompiledEpisodes:
                 yield from again(part[done:])
 
     def _in_order(
-        self, functions: Functions, parts: list[range], seed: int, threads: int
+        self, functions: Functions, parts: Iterable[range], seed: int, threads: int
     ) -> Iterator[tuple[range, PlayedBatch]]:
         """Simulate parts of the work side by side, a few of them ahead of what is asked for."""
         key = _key(seed)

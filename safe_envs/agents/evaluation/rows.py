@@ -91,7 +91,7 @@ class EpisodeSummary:
         safety_rate: their share.
         ci_low: lower end of its interval.
         ci_high: upper end.
-        min_h_median: median over episodes of the minimum h.
+        min_h_median: median of the minimum h over the first 65,536 episodes.
         min_h_p05: 5 % quantile of it.
         violations: number of episodes that are not safe.
         touching: how many of these come no lower than h = 0 to rounding.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from safe_envs.agents.rare_events.path_kernel import FAILED, FULL, draw_path_sta
 from safe_envs.agents.rare_events.path_source import path_source
 from safe_envs.agents.rare_events.records import Records
 from safe_envs.compiled.data import Data
+from safe_envs.compiled.engine import periods_of_a_part
 from safe_envs.compiled.program import Functions, Program
 from safe_envs.envs.world_source import noise_channels, world_source
 from safe_envs.errors import NotCompilableError, shortened
@@ -43,6 +45,7 @@ class PathProgram:
     Attributes:
         problem: as given.
         program: with the entry points `draw_path_starts` and `play_paths`.
+        most_paths: to play by one call.
 
     Raises:
         NotCompilableError: The policy or the filter is none that can be compiled.
@@ -62,6 +65,7 @@ class PathProgram:
         self.problem = problem
         self.program = Program(f"paths of {problem.name}", (draw_path_starts, play_paths), source)
         self._data, self._work = data.array(), max(source.work, 1)
+        self.most_paths = max(1, periods_of_a_part(len(self._data)) // problem.steps)
         ahead = min(_AHEAD, 4 * math.ceil(problem.steps / 4))
         self._sizes = ahead, noise_channels(problem), len(problem.barriers) if bridged else 0
         self._root = math.sqrt(problem.dt / problem.substeps)
@@ -201,14 +205,17 @@ class CompiledPaths:
     def _play(self, left: np.ndarray, *arguments: Any) -> None:
         """Divide the work among the threads."""
         count = min(_PARTS * self._threads, math.ceil(len(left) / _FEWEST_PATHS))
+        count = max(count, math.ceil(len(left) / self._program.most_paths))
         parts = np.array_split(left, count)
         if self._threads == 1 or count == 1:
             for part in parts:
                 self._program.play(self._functions, part, *arguments)
             return
-        with ThreadPoolExecutor(self._threads, "safe_envs_paths") as pool:
+        with ExitStack() as stack:
+            pool = ThreadPoolExecutor(self._threads, "safe_envs_paths")
+            stack.callback(pool.shutdown, cancel_futures=True)
             under_way = [
                 pool.submit(self._program.play, self._functions, part, *arguments) for part in parts
             ]
-        for each in under_way:
-            each.result()
+            for each in under_way:
+                each.result()

@@ -158,7 +158,7 @@ def test_neither_threads_nor_parts_of_the_work_change_a_bit(monkeypatch):
     part = columns(range(100, 900), 2)
     for name in ("returns", "min_h", "effort", "starts", "length"):
         assert part[name].tobytes() == whole[name][100:900].tobytes(), name
-    monkeypatch.setattr(compiled_episodes, "_PERIODS", 7 * problem.steps)
+    monkeypatch.setattr(compiled_episodes, "periods_of_a_part", lambda numbers: 7 * problem.steps)
     for threads in (1, 3):
         again = columns(range(1000), threads)
         for name, column in whole.items():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import Future
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -179,3 +182,28 @@ def test_estimates_of_both_engines_are_equal_but_for_rounding(env_id):
             wanted.plain,
         )
         assert found.estimates == pytest.approx(wanted.estimates, rel=1e-9)
+
+
+def test_an_interrupt_waits_for_parts_under_way_alone(monkeypatch):
+    """Those that nobody has begun are left."""
+    begun, player = [], SimpleNamespace(most_paths=1)
+    reader, writer = threading.Event(), threading.Event()
+
+    def play(functions, part, *arguments):
+        begun.append(part)
+        if len(begun) == 2:
+            reader.set()
+        writer.wait(5.0)
+
+    def interrupted(future):
+        assert reader.wait(5.0)
+        threading.Timer(0.05, writer.set).start()
+        raise KeyboardInterrupt
+
+    player.play = play
+    monkeypatch.setattr(Future, "result", interrupted)
+    paths: Any = CompiledPaths.__new__(CompiledPaths)
+    paths._program, paths._functions, paths._threads = player, {}, 2
+    with pytest.raises(KeyboardInterrupt):
+        paths._play(np.arange(50))
+    assert len(begun) == 2
