@@ -165,7 +165,7 @@ class BatchStepper:
         )
 
     def _at_rest(self) -> _Told:
-        """Return what is told of envs whose filter has decided nothing yet."""
+        """Return the report of envs whose filter has decided nothing yet."""
         inputs, choices, flags = told = self._new_told()
         inputs[:] = [0.0] * self._batch.shape[1] + self._rest.tolist()
         choices[:] = [0, 0, -1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 
@@ -99,16 +100,14 @@ class CompiledPlayer:
     """Runs a compiled program; the arguments are those of `NumpyPlayer`.
 
     Attributes:
-        engine: "compiled".
-        jobs: threads.
+        engine: "compiled"; "compiled, numpy" once NumPy had to simulate a part of the work again.
+        jobs: threads, at most as many as processors.
 
     Raises:
         NotCompilableError: Only NumPy can do this.
         ConfigurationError: Numba is missing.
         SafeEnvsError: The filter cannot be made.
     """
-
-    engine = "compiled"
 
     def __init__(
         self, resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
@@ -133,7 +132,8 @@ class CompiledPlayer:
             problem, resolved.policy, safety_filter and safety_filter.qp, continuous
         )
         self._functions = self._episodes.compiled()
-        self.jobs = settings.jobs or available_threads()
+        self.engine = "compiled"
+        self.jobs = min(settings.jobs or available_threads(), os.cpu_count() or 1)
         self._reference = partial(NumpyPlayer, resolved, conditions, settings)
 
     @cached_property
@@ -150,12 +150,16 @@ class CompiledPlayer:
             range(self._spec.episodes),
             self._spec.seed,
             self.jobs,
-            lambda part: self._numpy.part(part),
+            self._again,
         ):
             yield batch
             done += len(batch.starts)
             if progress:
                 progress(done)
+
+    def _again(self, episodes: range) -> Iterator[PlayedBatch]:
+        self.engine = "compiled, numpy"
+        return self._numpy.part(episodes)
 
     def close(self) -> None:
         """Do nothing: there is nothing to close."""
