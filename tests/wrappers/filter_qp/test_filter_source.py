@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import sympy as sp
@@ -25,7 +26,14 @@ from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.compiled.program import Program
 from safe_envs.dynamics.codegen import filled
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import CBF, RCBF, SRCBF, SafetyFilter, parse_conditions
+from safe_envs.wrappers import (
+    CBF,
+    RCBF,
+    SRCBF,
+    SafetyFilter,
+    SafetyFilterVectorWrapper,
+    parse_conditions,
+)
 from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedHOCBF
@@ -144,6 +152,23 @@ def test_a_filter_of_every_id(env_id: str) -> None:
     found = check(safety_filter, *situations(problem, 500))
     assert "met" in found
     assert len(found) > 1
+
+
+def test_decisions_on_the_way_of_a_filtered_quadrotor() -> None:
+    env_id = "safe_envs/QuadrotorLimits-v0"
+    problem = problem_of(env_id)
+    safety_filter = SafetyFilter.for_problem(problem, parse_conditions("hocbf", problem))
+    env: Any = SafetyFilterVectorWrapper(gym.make_vec(env_id, num_envs=10, noise=0.1), "hocbf")
+    env.reset(seed=0)
+    rng, states, inputs = np.random.default_rng(0), [], []
+    low, high = np.array(problem.box).T
+    for _ in range(40):
+        actions = np.clip(rng.normal(0.1, 0.7, env.action_space.shape), -1.0, 1.0)
+        states.append(np.array(env.unwrapped.state))
+        inputs.append(low + (high - low) * (actions + 1.0) / 2.0)
+        env.step(actions.astype(np.float32))
+    found = check(safety_filter, np.concatenate(states), np.concatenate(inputs), most=25)
+    assert found >= {"idle", "met"}
 
 
 @pytest.mark.oracle
