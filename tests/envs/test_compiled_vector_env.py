@@ -17,6 +17,7 @@ from safe_envs.compiled.program import Program
 from safe_envs.envs.compiled_batch import CompiledBatch
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilterVectorWrapper
+from safe_envs.wrappers.env_wrappers import safety_filter_vector
 from tests.envs.test_vector_env import assert_same
 
 SCALAR, DUBINS = "safe_envs/Scalar-v0", "safe_envs/StochasticDubins-v0"
@@ -70,7 +71,13 @@ def test_every_env(env_id, plain):
 
 
 @pytest.mark.parametrize(
-    ("name", "condition"), [("ACC", "hocbf"), ("CubicSDEDisk", "rcbf"), ("Quadrotor", "hocbf")]
+    ("name", "condition"),
+    [
+        ("ACC", "hocbf"),
+        ("CubicSDEDisk", "rcbf"),
+        ("Quadrotor", "hocbf"),
+        ("QuadrotorLimits", "hocbf"),
+    ],
 )
 def test_filters(name, condition, plain):
     assert_same_steps(pair(f"safe_envs/{name}-v0", condition, "SameStep", 2, noise=0.05), 4)
@@ -277,13 +284,17 @@ def test_wrappers_of_gymnasium(plain):
     assert shown[1][3][1][0]["episode"]["l"] == 4
 
 
-def test_filters_that_need_a_solver(plain):
+def test_filters_that_cannot_be_compiled(plain, monkeypatch):
+    def refuse(*_):
+        raise NotCompilableError("no method for learned terms")
+
+    monkeypatch.setattr(safety_filter_vector, "filter_source", refuse)
     env_id = "safe_envs/QuadrotorLimits-v0"
     theirs, ours = (gym.make_vec(env_id, num_envs=2, engine=e) for e in ("numpy", "auto"))
     assert isinstance(ours.unwrapped._batch, CompiledBatch)
     envs = [SafetyFilterVectorWrapper(e, "hocbf") for e in (theirs, ours)]
     assert_same_steps(envs, 2)
-    with pytest.raises(NotCompilableError, match="need a solver"):
+    with pytest.raises(NotCompilableError, match="no method for learned terms"):
         pair(env_id, "hocbf")
 
 

@@ -59,7 +59,8 @@ def make_sb3_env(
 
     Raises:
         ConfigurationError: an id, a filter or an argument is unknown or out of range.
-        NotCompilableError: the compiled engine was asked for, and the filter needs a solver.
+        NotCompilableError: the compiled engine was asked for, and the filter has learned terms
+            without a compiled form.
         RelativeDegreeError: the filter does not suit the env's barrier.
     """
     require_whole("num_envs", num_envs, 1)

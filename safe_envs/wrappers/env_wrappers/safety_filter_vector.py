@@ -33,10 +33,11 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     reports what it reports at reset, and counts nothing.
 
     Over envs with the engine "compiled" or "auto", made without a render mode, the filter is part
-    of their compiled function, if it has a closed form; "auto" leaves other filters to NumPy.
+    of their compiled function; "auto" leaves those that have no compiled form to NumPy.
 
     Raises:
-        NotCompilableError: the engine of the env is "compiled", and the filter needs a solver.
+        NotCompilableError: the engine of the env is "compiled", and the filter has learned terms
+            without a compiled form.
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.

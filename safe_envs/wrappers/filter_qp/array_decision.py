@@ -8,12 +8,12 @@ from typing import Any
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
-from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp.kernels.interval import project_interval, work_of_interval
 from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
+from safe_envs.wrappers.qp.kernels.many import project_many, work_of_many
 from safe_envs.wrappers.qp.kernels.one_constraint import (
     project_one_constraint,
     row_margin,
@@ -36,7 +36,7 @@ class ArrayDecision:
         data: receives its numbers.
 
     Raises:
-        NotCompilableError: No method for one state at a time solves such a QP.
+        NotCompilableError: Learned terms have no compiled form.
     """
 
     def __init__(self, qp: FilterQP, data: Data) -> None:
@@ -100,18 +100,19 @@ class ArrayDecision:
             if self._reciprocal:
                 body.vector("aim", [f"u[{j}]" for j in range(m)])
             return
-        low, high, unit = map(
-            body.number, (self._qp.low[0], self._qp.high[0], self._values.solver.goal_unit)
-        )
-        growth, along = f"values[{goal}]", f"values[{goal + 1}]"
-        self._finite.append(f"{growth} + {along}")
-        body.add(f"most = {growth} + max({along} * {low}, {along} * {high})")
-        body.vector("high", [high, f"2.0 * most / {unit} if most > 0.0 else 1.0"])
-        body.table("goal_row", [[f"-{along}", unit]])
+        low, high = [list(map(body.number, bounds)) for bounds in (self._qp.low, self._qp.high)]
+        unit = body.number(self._values.solver.goal_unit)
+        growth, along = f"values[{goal}]", [f"values[{goal + 1 + j}]" for j in range(m)]
+        self._finite.append(" + ".join([growth, *along]))
+        ends = zip(along, low, high, strict=True)
+        most = " + ".join(f"max({rate} * {lo}, {rate} * {hi})" for rate, lo, hi in ends)
+        body.add(f"most = {growth} + ({most})")
+        body.vector("high", [*high, f"2.0 * most / {unit} if most > 0.0 else 1.0"])
+        body.table("goal_row", [[*(f"-{rate}" for rate in along), unit]])
         body.vector("goal_offset", [f"-{growth}"])
-        body.vector("aim", ["0.0 * u[0]"] * 2)
-        body.room("proposed", 2)
-        body.room("goal_scratch", work_of_one_constraint(1, 2))
+        body.vector("aim", [*(f"0.0 * u[{j}]" for j in range(m)), "0.0 * u[0]"])
+        body.room("proposed", m + 1)
+        body.room("goal_scratch", work_of_one_constraint(1, m + 1))
         body.call(
             project_one_constraint,
             "goal_row, goal_offset, aim, low, high, w, priority, proposed, margin, active,"
@@ -158,7 +159,8 @@ class ArrayDecision:
             ]
             body.table("form", entries)
         if self._goal:
-            held = [*([*row, "0.0"] for row in held), ["goal_row[0, 0]", "goal_row[0, 1]"]]
+            goal_row = [f"goal_row[0, {j}]" for j in range(self._m + 1)]
+            held = [*([*row, "0.0"] for row in held), goal_row]
             self._offsets.append("goal_offset[0]")
         self._in_place = held == self._a
         if not self._in_place:
@@ -277,7 +279,7 @@ def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int
         return project_interval, work_of_interval(k, m)
     if m == 2:
         return project_plane, work_of_plane(k, m)
-    raise NotCompilableError(f"{k} constraints on {m} inputs need a solver")
+    return project_many, work_of_many(k, m)
 
 
 def _pairs(m: int) -> list[tuple[int, int]]:

@@ -30,7 +30,7 @@ def filter_source(qp: FilterQP, data: Data) -> Source:
         data: receives its numbers.
 
     Raises:
-        NotCompilableError: No method for one state at a time solves such a QP.
+        NotCompilableError: Learned terms have no compiled form.
     """
     only = qp.constraints[0] if len(qp.constraints) == 1 else None
     if only and qp.model.m == 1 and qp.plain and only.uncertainty is None:
