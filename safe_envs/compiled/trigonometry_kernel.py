@@ -31,7 +31,7 @@ PER_QUARTER = 0.6366197723675814
 WHOLE = 1.5 * 2.0**52
 """A number that leaves the nearest whole number where it is added and subtracted."""
 
-BEYOND = 2.0**1007
+FAR_BEYOND = 2.0**1007
 """Its product with an angle overflows from 2**17 on."""
 
 # Parts of pi / 2: the first two have 36 bits, so that their products with up to 2**17 are exact.
@@ -83,7 +83,7 @@ SPLITTER = 2.0**27 + 1.0
 def sine(x: float) -> float:
     """Return the sine of an angle in rad."""
     quarters, s, c = turned_back(x)
-    beyond = x * BEYOND
+    beyond = x * FAR_BEYOND
     # One factor is 0 and the other one 1 or -1; the first is no number for large angles.
     own = (1.0 - abs(quarters)) + (beyond - beyond)
     found = s * own + c * (quarters * (abs(quarters) - 2.0))
@@ -96,7 +96,7 @@ def sine(x: float) -> float:
 def cosine(x: float) -> float:
     """Return the cosine of an angle in rad."""
     quarters, s, c = turned_back(x)
-    beyond = x * BEYOND
+    beyond = x * FAR_BEYOND
     own = (1.0 - abs(quarters)) + (beyond - beyond)
     found = c * own - s * (quarters * (abs(quarters) - 2.0))
     if found != found:

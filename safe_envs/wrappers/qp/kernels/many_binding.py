@@ -160,7 +160,7 @@ def furthest_outside(
     rows: np.ndarray,
     u: np.ndarray,
 ) -> int:
-    """Return the constraint, or k plus the input whose bound, is missed by most; -1 if none is.
+    """Return the constraint, or k plus the input whose bound, is violated most; -1 if none is.
 
     Args:
         a: constraints, shape (k, m).

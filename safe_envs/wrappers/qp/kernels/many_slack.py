@@ -13,7 +13,7 @@ SLACK_STEPS = 20
 """Steps for each constraint and input: many times more than were ever seen."""
 NO_PUSH = 1e-12
 """Part of the forces on an input that is rounding."""
-BEYOND = 2.0
+BEYOND_STEP = 2.0
 """Length of a step that meets nothing; it ends at 1."""
 
 
@@ -184,7 +184,7 @@ def advance_to_stop(  # noqa: PLR0913
         change = 0.0
         for j in range(m):
             change += scaled[i, j] * step[j]
-        to_rows[i] = BEYOND
+        to_rows[i] = BEYOND_STEP
         if missed[i] == 0.0 and change < 0.0:
             to_rows[i] = max(margins[i], 0.0) / -change
         length = min(length, to_rows[i])
