@@ -319,8 +319,8 @@ def test_each_picture_has_its_own_claim(outcomes):
 
 
 def test_the_input_bounds_are_too_narrow_in_the_stated_setting():
-    # One start in some hundred is too fast for the input.
-    outcome = compute("figure-5.3b", Workload(episodes=1000))
+    # One start in some hundred is too fast for the input; here one of fifty.
+    outcome = compute("figure-5.3b", Workload(quick=True, seed=2))
     assert not outcome.claims[0].holds
     assert outcome.numbers[0].ours < 100.0
     judged = judge(ARTEFACTS["figure-5.3b"], outcome, FULL)
