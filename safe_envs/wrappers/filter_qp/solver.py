@@ -15,6 +15,7 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
 from safe_envs.wrappers.qp import one_constraint
+from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 from safe_envs.wrappers.qp.majorant import majorant
 
 _FAR = 1e4
@@ -32,9 +33,13 @@ class FilterQPSolver(CompiledQP):
         *a, b = values
         p = self._qp
         if self._flavour == "floats":
-            action, margin, active, feasible = one_constraint.project_floats(
-                a, b, u, p.low, p.high, p.weights
-            )
+            if self._m == 1:
+                v, margin, active, feasible = project_scalar(a[0], b, u[0], p.low[0], p.high[0])
+                action = [v]
+            else:
+                action, margin, active, feasible = one_constraint.project_floats(
+                    a, b, u, p.low, p.high, p.weights
+                )
             self._require_finite((margin,))
             return FilterDecision(
                 action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0, u
