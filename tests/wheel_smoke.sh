@@ -131,6 +131,7 @@ refused() {
 }
 refused 'safe-envs[tensorboard]' safe-envs train Scalar-v0 --algo ppo --n-timesteps 512 --out other --tensorboard logs
 refused 'safe-envs[render]' safe-envs render Scalar-v0 --out film.mp4
+refused 'safe-envs[fast]' safe-envs evaluate Scalar-v0 --episodes 20 --engine compiled
 refused "did you mean 'scbf'" safe-envs evaluate Scalar-v0 --filter scfb
 
 step "passed"
