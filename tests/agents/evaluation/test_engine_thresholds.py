@@ -155,8 +155,11 @@ def test_engines_differ_at_thresholds_alone(env_id, text, capsys):
         steps = steps_of(problem, text)
     except (RelativeDegreeError, NotCompilableError) as error:
         pytest.skip(str(error))
-    differing = compare(steps, 1_000_000 // ROWS, steps.program.compiled()["take_steps"])
+    # Where NumPy needs a solver it takes a millisecond a step.
+    by_solver = len(problem.inputs) > 2 and len(problem.barriers) > 1
+    count = 20_000 if by_solver else 1_000_000
+    differing = compare(steps, count // ROWS, steps.program.compiled()["take_steps"])
     with capsys.disabled():
-        print(f"{problem.name}, {text}: {len(differing)} flags of 1,000,000 steps differ")
+        print(f"{problem.name}, {text}: {len(differing)} flags of {count:,} steps differ")
         for flag, x in differing[:10]:
             print(f"  {flag} at {x.tolist()}")
