@@ -9,7 +9,8 @@ from safe_envs.compiled.slots import State, no_state, start_margin, start_state
 from safe_envs.dynamics.normal_kernel import standard_normal
 from safe_envs.dynamics.philox import EPISODE, START
 
-MOST_TRIES = 10000
+MOST_TRIES = 10_000
+"""Starts that are drawn until one meets the condition of its distribution."""
 
 
 def fill_uniforms(
@@ -64,6 +65,19 @@ def episode_key(episode: int, k0: int, k1: int) -> int:
     return philox_block(episode + 1, 0, EPISODE, 0, k0, k1)[0]
 
 
+def uniform_at(place: int, episode: int, purpose: int, k0: int, k1: int) -> float:
+    """Return the uniform of one word of a stream.
+
+    Args:
+        place: of the word, from 0.
+        episode: number of the episode since the env was seeded.
+        purpose: of the stream.
+        k0: first word of the key.
+        k1: second word.
+    """
+    return uniform_of(philox_block(place // 4 + 1, episode, purpose, 0, k0, k1)[place % 4])
+
+
 def draw_start(k0: int, k1: int, episode: int, uniforms: np.ndarray, data: np.ndarray) -> State:
     """Return the start state of an episode; NaN where none was allowed in 10,000 tries.
 
@@ -76,9 +90,7 @@ def draw_start(k0: int, k1: int, episode: int, uniforms: np.ndarray, data: np.nd
     """
     for t in range(MOST_TRIES):
         for j in range(len(uniforms)):
-            place = t * len(uniforms) + j
-            block = philox_block(place // 4 + 1, episode, START, 0, k0, k1)
-            uniforms[j] = uniform_of(block[place % 4])
+            uniforms[j] = uniform_at(t * len(uniforms) + j, episode, START, k0, k1)
         x = start_state(uniforms, data)
         if start_margin(x, data) > 0.0:
             return x

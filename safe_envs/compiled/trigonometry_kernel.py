@@ -1,13 +1,14 @@
-"""Sine, cosine and arc tangent of two numbers, as kernels: the same on every machine.
+"""Sine, cosine and arc tangent of two numbers, as kernels.
 
-They are sums and products without branches, so that compiled code has no calls, computes what the
-sine and the cosine of an angle have in common once, and goes on while it waits for other results.
+Within their reach they give the same bits on every machine. They are sums and products without
+branches, so that compiled code has no calls, computes what the sine and the cosine of an angle have
+in common once, and goes on while it waits for other results.
 Errors are below 1 unit in the last place for sine and cosine, and about 1 for the arc tangent.
 
-What they do not reach is left to the C library: angles beyond 2**17, sines of 0, vectors with tiny
-components, infinities. Of an angle that is found out at the end, by a result that is no number:
-a question about the argument would let the compiler move the sums and products into one of its
-branches, where they could not be shared.
+The C library computes the rest: angles beyond 2**17, sines of 0, vectors with tiny components, and
+infinities. An angle out of reach is detected at the end, by a result that is NaN: a test of the
+argument would let the compiler move the sums and products into one of its branches, where they
+could not be shared.
 
 The coefficients are those of minimax polynomials of z = r * r for the relative error, by Lawson's
 algorithm: sin(r) = r + r z S(z) to 2**-57.8 and cos(r) = 1 - z / 2 + z z C(z) to 2**-63.8, both up

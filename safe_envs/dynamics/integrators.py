@@ -71,14 +71,30 @@ def _compiled(
     system: ControlAffineSDE, h: float, flavour: Flavour
 ) -> tuple[int, Callable[..., Components]]:
     """Compile a step of h in s, or the rate where there is no noise, with the noise channels."""
-    diffusion = system.numeric(system.diffusion)
+    arguments = (*system.states, *system.inputs)
+    if not system.noise_channels:
+        return 0, compile_function(arguments, tuple(rate(system)), flavour)
+    draws, moved = euler_maruyama_step(system, h)
+    return len(draws), compile_function((*arguments, *draws), tuple(moved), flavour)
+
+
+def rate(system: ControlAffineSDE) -> Any:
+    """Return f + g u with the values of the parameters, a matrix (n, 1)."""
+    return system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
+
+
+def euler_maruyama_step(system: ControlAffineSDE, h: float) -> tuple[tuple[sp.Symbol, ...], Any]:
+    """Derive a step of Euler and Maruyama.
+
+    Args:
+        system: with noise.
+        h: length of the step in s.
+
+    Returns:
+        Symbols of the standard normals that it takes, and the state after it, a matrix (n, 1).
+    """
     live = list(system.noise_channels)
-    rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
-    if not live:
-        return 0, compile_function((*system.states, *system.inputs), tuple(rate), flavour)
     draws = sp.symbols(f"_w:{len(live)}", real=True)
-    noise = diffusion[:, live] * sp.Matrix(draws) * sp.Float(math.sqrt(h), 17)
-    moved = sp.Matrix(system.states) + rate * sp.Float(h, 17) + noise
-    return len(live), compile_function(
-        (*system.states, *system.inputs, *draws), tuple(moved), flavour
-    )
+    diffusion = system.numeric(system.diffusion)[:, live]
+    noise = diffusion * sp.Matrix(draws) * sp.Float(math.sqrt(h), 17)
+    return draws, sp.Matrix(system.states) + rate(system) * sp.Float(h, 17) + noise

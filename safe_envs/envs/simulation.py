@@ -24,13 +24,7 @@ class Simulation:
         self.integrator = Integrator(problem.plant, problem.dt, problem.substeps, flavour)
         self._features = len(problem.features)
         self._barriers = self._features + len(problem.barriers)
-        read = (
-            *(f.expression for f in problem.features),
-            *(b.expression for b in problem.barriers),
-            problem.reward,
-            problem.outside,
-            -1 if problem.goal is None else problem.goal,
-        )
+        read = readings(problem)
         self.timed = TIME in set().union(*(sp.sympify(e).free_symbols for e in read))
         self._measure = compile_function(
             (*problem.plant.states, *problem.plant.inputs, TIME), read, flavour
@@ -60,6 +54,21 @@ def start_sampler(problem: SafetyProblem) -> StartSampler:
     """Return what draws the start states of a problem."""
     title = f"{problem.name!r} ({problem.start})"
     return StartSampler(problem.starts[problem.start], problem.model, title)
+
+
+def readings(problem: SafetyProblem) -> tuple[Any, ...]:
+    """Return what is read off a state, as expressions of states, inputs and `TIME`.
+
+    These are the features, the barriers, the reward, the distance by which the workspace was left,
+    and the goal, which is negative where there is none.
+    """
+    return (
+        *(f.expression for f in problem.features),
+        *(b.expression for b in problem.barriers),
+        problem.reward,
+        problem.outside,
+        -1 if problem.goal is None else problem.goal,
+    )
 
 
 def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
-import sympy as sp
-
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
+from safe_envs.dynamics.integrators import euler_maruyama_step, rate
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.simulation import readings
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
@@ -61,16 +59,12 @@ def _starts(problem: SafetyProblem, data: Data) -> Source:
 
 
 def _physics(plant: ControlAffineSDE, h: float, substeps: int, data: Data) -> Source:
-    channels = plant.noise_channels
-    rate = plant.numeric(plant.drift + plant.input_matrix * sp.Matrix(plant.inputs))
     arguments = {"x": plant.states, "u": plant.inputs}
-    if not channels:
-        return formulas("rate", arguments, tuple(rate), data) + _runge_kutta(
+    if not plant.noise_channels:
+        return formulas("rate", arguments, tuple(rate(plant)), data) + _runge_kutta(
             plant.n, h, substeps, data
         )
-    draws = sp.symbols(f"_w:{len(channels)}", real=True)
-    noise = plant.numeric(plant.diffusion)[:, list(channels)] * sp.Matrix(draws)
-    moved = sp.Matrix(plant.states) + rate * sp.Float(h, 17) + noise * sp.Float(math.sqrt(h), 17)
+    draws, moved = euler_maruyama_step(plant, h)
     step = formulas("euler_step", {**arguments, "w": draws}, tuple(moved), data)
     lines = ["def advance(x, u, noise, first, data):"]
     for k in range(substeps):
@@ -102,15 +96,10 @@ def _runge_kutta(n: int, h: float, substeps: int, data: Data) -> Source:
 
 def _measure(problem: SafetyProblem, data: Data) -> Source:
     features, barriers = len(problem.features), len(problem.barriers)
-    read = (
-        *(f.expression for f in problem.features),
-        *(b.expression for b in problem.barriers),
-        problem.reward,
-        problem.outside,
-        -1 if problem.goal is None else problem.goal,
-    )
     plant, last = problem.plant, features + barriers
-    measure = formulas("measure", {"x": plant.states, "u": plant.inputs, "time": TIME}, read, data)
+    measure = formulas(
+        "measure", {"x": plant.states, "u": plant.inputs, "time": TIME}, readings(problem), data
+    )
     seen = [f"single(values[{i}])" for i in range(features)]
     heights = [f"values[{features + i}]" for i in range(barriers)]
     observed = {f.expression for f in problem.features}

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
+from safe_envs.compiled.draws import MOST_TRIES
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.philox import START, Key, StreamReader
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 
 _TRIES_AT_ONCE = 4
-_MOST_TRIES = 10_000
 
 
 @dataclass(frozen=True)
@@ -83,13 +83,13 @@ class StartSampler:
         """
         if self._uniforms:
             reader.seek(key, episode, START)
-        for _ in range(_MOST_TRIES // self._tries):
+        for _ in range(MOST_TRIES // self._tries):
             for uniforms in reader.uniforms((self._tries, self._uniforms)).tolist():
                 x = self._state(*uniforms)
                 if self._accept is None or self._accept(*x)[0] > 0:
                     return x
         raise ConfigurationError(
-            f"no start of {self._title} met the condition of the distribution in {_MOST_TRIES}"
+            f"no start of {self._title} met the condition of the distribution in {MOST_TRIES}"
             " tries; give a fixed start or another distribution"
         )
 

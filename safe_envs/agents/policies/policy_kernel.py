@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from safe_envs.compiled.plain_natives import philox_block, uniform_of
+from safe_envs.compiled.draws import uniform_at
 from safe_envs.dynamics.philox import POLICY
 
 
@@ -43,8 +43,7 @@ def random_action(place: int, k0: int, k1: int) -> float:
         k0: first word of the key of the episode.
         k1: second word.
     """
-    block = philox_block(place // 4 + 1, 0, POLICY, 0, k0, k1)
-    return 2.0 * uniform_of(block[place % 4]) - 1.0
+    return 2.0 * uniform_at(place, 0, POLICY, k0, k1) - 1.0
 
 
 def clip_to_bound(value: float, bound: float) -> float:
