@@ -1,7 +1,7 @@
 """Expected values under noise of constant size along one coordinate, bounded from below.
 
 For values that are constant on cells, the expected value at a mean m is
-outside + sum_e d_e Phi((m - e)/s), where d_e is the step of the values at the edge e and s the
+sum_e d_e Phi((m - e)/s), where d_e is the step of the values at the edge e and s the
 standard deviation. Each term is monotone in m: over an interval of means a rising step counts from
 its lower end, a falling one from its upper end, and the sum is a lower bound.
 """
@@ -15,8 +15,11 @@ import numpy as np
 
 from safe_envs.wrappers.value.grid import Axis, Grid
 
-_REACH = 6.0
+_REACH = 5.2
 """Standard deviations that noise is taken to reach."""
+
+_PARTS = 3
+"""Of a cell along an axis with noise."""
 
 
 class _Blur(NamedTuple):
@@ -38,49 +41,77 @@ class _Blur(NamedTuple):
 class Smoothing:
     """Bounds expected values on the cells of a grid of means.
 
+    Along axes with noise the cells of the values are cut into parts, of which those that are not
+    wholly in the safe set count as outside: so the edge of the set is resolved better than the
+    values. The grid of means is as fine.
+
     Args:
         grid: of the values.
         blur: standard deviation of the noise along each axis; 0 for none.
-        parts: into which the cells are cut along axes with noise, for the grid of means.
 
     Attributes:
+        fine: the grid of the parts.
         means: the grid of means, which reaches beyond the other by the noise.
+        parts: of a cell along each axis.
         beyond: chance of noise beyond what is considered, at most.
     """
 
-    def __init__(self, grid: Grid, blur: Sequence[float], parts: int) -> None:
+    def __init__(self, grid: Grid, blur: Sequence[float]) -> None:
         from scipy.special import ndtr
 
         self._shape = grid.shape
         self._blurs: list[_Blur] = []
-        axes = list(grid.axes)
+        self.parts = tuple(_PARTS if size else 1 for size in blur)
+        fine = [axis.refined(cut) for axis, cut in zip(grid.axes, self.parts, strict=True)]
+        self.fine, axes = Grid(tuple(fine)), list(fine)
         for i, size in enumerate(blur):
             if size:
-                axes[i] = grid.axes[i].refined(parts).widened(_REACH * size)
-                self._blurs.append(_blur(i, axes[i], _unrolled(grid.axes[i], size), size))
+                axes[i] = fine[i].widened(_REACH * size)
+                self._blurs.append(_blur(i, axes[i], _unrolled(fine[i], size), size))
         self.means = Grid(tuple(axes))
         self.beyond = 2.0 * len(self._blurs) * float(ndtr(-_REACH))
 
-    def smoothed(self, values: np.ndarray, outside: float) -> np.ndarray:
+    def smoothed(self, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """Return lower bounds of the expected values on the grid of means, float32.
 
         Args:
-            values: on the cells of the grid, shape (cells,), float32.
-            outside: value outside the grid.
+            values: on the cells of the grid, shape (cells,), float32; 0 is outside.
+            counts: which parts of cells count, shape (cells of `fine`,).
         """
+        found = values.reshape(self._shape)
+        for i, cut in enumerate(self.parts):
+            if cut > 1:
+                found = np.repeat(found, cut, axis=i)
+        found = np.where(counts.reshape(found.shape), found, np.float32(0.0))
         if not self._blurs:
-            return values
-        found = values.reshape(self._shape).astype(np.float64)
+            return found.reshape(-1)
         for blur in self._blurs:
             found = np.moveaxis(found, blur.axis, 0)
             others = found.shape[1:]
-            steps = _steps(found.reshape(len(found), -1), outside, blur.at_low.shape[1])
+            steps = _steps(found.reshape(len(found), -1), blur.at_low.shape[1])
             passed = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
-            bound = outside + passed[blur.below]
+            bound = passed[blur.below]
             bound += blur.at_low @ np.maximum(steps, 0.0)
             bound += blur.at_high @ np.minimum(steps, 0.0)
             found = np.moveaxis(bound.reshape(-1, *others), 0, blur.axis)
         return rounded_down(np.ascontiguousarray(found).reshape(-1))
+
+    def least_around(self, means: np.ndarray) -> np.ndarray:
+        """Return for each mean the least value of the block of `parts` cells that begins there.
+
+        Args:
+            means: on the grid of means, shape (cells of `means`,).
+        """
+        if not self._blurs:
+            return means
+        from scipy.ndimage import minimum_filter1d
+
+        found = means.reshape(self.means.shape)
+        for i, cut in enumerate(self.parts):
+            if cut > 1:
+                mode = "wrap" if self.means.axes[i].period else "nearest"
+                found = minimum_filter1d(found, cut, i, mode=mode, origin=-(cut // 2))
+        return np.ascontiguousarray(found).reshape(-1)
 
 
 def rounded_down(values: np.ndarray) -> np.ndarray:
@@ -115,10 +146,10 @@ def _unrolled(axis: Axis, size: float) -> np.ndarray:
     return np.append((axis.edges[:-1] + turns[:, None]).ravel(), axis.edges[-1] + turns[-1])
 
 
-def _steps(values: np.ndarray, outside: float, edges: int) -> np.ndarray:
+def _steps(values: np.ndarray, edges: int) -> np.ndarray:
     """Return how values rise at each edge, with copies of them for more edges than cells."""
     copies = (edges - 1) // len(values)
     if copies > 1:
         values = np.tile(values, (copies, 1))
-    ends = np.full((1, values.shape[1]), outside)
+    ends = np.zeros((1, values.shape[1]))
     return np.diff(values, axis=0, prepend=ends, append=ends)
