@@ -165,10 +165,7 @@ class Derivation:
         outside: Any = problem.outside if verdict.workspace_matters else sp.Integer(-1)
         return Chain(
             (*own, *rest),
-            (
-                *(c.expression.xreplace(following) for c in own),
-                *(following[c.symbol] for c in rest),
-            ),
+            (*stepped, *(following[c.symbol] for c in rest)),
             tuple(tidied(b.expression.xreplace(section)) for b in problem.barriers),
             None if problem.goal is None else tidied(problem.goal.xreplace(section)),
             outside.xreplace(section),
