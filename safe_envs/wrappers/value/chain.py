@@ -14,6 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import excess
 from safe_envs.wrappers.value.frame_check import World, check_frame
 from safe_envs.wrappers.value.one_step import Intervals, tidied
 
@@ -162,7 +163,7 @@ class Derivation:
             for c, period, value in zip(frame.coordinates, frame.periods, frame.values, strict=True)
         )
         stepped: Any = [c.expression.xreplace(following) for c in own]
-        outside: Any = problem.outside if verdict.workspace_matters else sp.Integer(-1)
+        outside: Any = excess(verdict.bounds)
         return Chain(
             (*own, *rest),
             (*stepped, *(following[c.symbol] for c in rest)),

@@ -20,7 +20,8 @@ from safe_envs.dynamics.codegen import Components, compile_function, filled
 from safe_envs.errors import SystemDefinitionError
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.signals import Variable
+from safe_envs.problem.signals import Variable, excess
+from safe_envs.wrappers.value.normal_rules import normal_rules
 
 TOLERANCE = 1e-9
 """By which expectations at a state and at its partner may differ."""
@@ -30,7 +31,6 @@ _DEGREES = {4: 5, 3: 8, 2: math.inf}
 """Most test functions of which products of so many are compared."""
 _FEWEST = 8
 _PROPOSALS = 1 << 13
-_NODES, _MOST_NODES = 28, 1 << 14
 _REACH = 10.0
 _FAR = (1e-6, 1e-3, 0.03, 0.3, 1.0, 10.0)
 """How far outside the workspace states are tried, in widths of it."""
@@ -65,12 +65,12 @@ class FrameVerdict:
 
     Attributes:
         reason: why the frame cannot be used; "" if it can.
-        workspace_matters: whether a state outside the workspace may be safe, which the coordinates
-            then tell from those inside.
+        bounds: the states outside whose workspace a state may be safe; the coordinates tell whether
+            it is outside.
     """
 
     reason: str = ""
-    workspace_matters: bool = False
+    bounds: tuple[Variable, ...] = ()
 
 
 def check_frame(frame: Frame, problem: SafetyProblem, world: World) -> FrameVerdict:
@@ -91,20 +91,19 @@ def check_frame(frame: Frame, problem: SafetyProblem, world: World) -> FrameVerd
         The verdict; states are drawn by a fixed seed.
     """
     pairs = _Pairs(frame, problem, world)
-    x = pairs.safe_states()
+    everywhere, x = pairs.states()
     if x.shape[1] < _FEWEST:
         return FrameVerdict("too few safe states were found to check it")
-    partners = pairs.partners(x)
-    outside = pairs.outside_states()
-    matters = bool((pairs.values(world.barriers, outside).min(axis=0) >= 0.0).any())
+    beyond = pairs.outside_states()
+    crossed = {v: s for v, s in beyond.items() if (pairs.barriers(s) >= 0.0).any()}
     reason = (
-        pairs.flaw_of_section(x, partners)
+        pairs.flaw_of_section(x)
         or pairs.flaw_of_ranges(x)
-        or pairs.flaw_of_readings(x, partners)
-        or (pairs.flaw_of_workspace(np.hstack((x, outside))) if matters else "")
-        or pairs.flaw_of_law(x, partners)
+        or pairs.flaw_of_readings(everywhere)
+        or pairs.flaw_of_bounds(tuple(crossed), np.hstack((x, *crossed.values())))
+        or pairs.flaw_of_law(x)
     )
-    return FrameVerdict(reason, matters)
+    return FrameVerdict(reason, tuple(crossed))
 
 
 class _Pairs:
@@ -157,34 +156,38 @@ class _Pairs:
         """Return the states that the section gives for the coordinates of others."""
         return self.values(self._section, x)
 
-    def safe_states(self) -> np.ndarray:
-        """Return random safe states, shape (n, count)."""
+    def barriers(self, x: np.ndarray) -> np.ndarray:
+        """Return the smallest barrier at states."""
+        return self.values(self._world.barriers, x).min(axis=0)
+
+    def states(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return random states, and safe ones, shapes (n, count)."""
         domain = self._region()
         x = np.array([self._random.uniform(low, high, _PROPOSALS) for low, high in domain])
         starts = self._problem.starts[self._problem.start].proposals(_PROPOSALS // 8).T
         more = x[:, : starts.shape[1]].copy()
         more[: len(starts)] = starts
         x = np.hstack((more, x))
-        safe = x[:, self.values(self._world.barriers, x).min(axis=0) > 0.0]
-        return safe[:, self._random.permutation(safe.shape[1])[:_STATES]]
+        safe = x[:, self.barriers(x) > 0.0]
+        return x, safe[:, self._random.permutation(safe.shape[1])[:_STATES]]
 
-    def outside_states(self) -> np.ndarray:
-        """Return states outside the workspace, near and far, shape (n, count)."""
-        found = []
-        for i, (low, high) in enumerate(self._world.ranges[: self._problem.plant.n]):
-            for end, sign in ((low, -1.0), (high, 1.0)):
+    def outside_states(self) -> dict[Variable, np.ndarray]:
+        """Return states outside the workspace of a state, near and far, shapes (n, count)."""
+        found = {}
+        for i, v in enumerate(self._problem.states):
+            for end, sign in ((v.low, -1.0), (v.high, 1.0)):
                 if not math.isfinite(end):
                     continue
-                width = high - low if math.isfinite(high - low) else _REACH
+                width = v.high - v.low if math.isfinite(v.high - v.low) else _REACH
                 for far in _FAR:
                     x = np.array([self._random.uniform(a, b, 256) for a, b in self._region(far)])
                     x[i] = end + sign * far * width
-                    found.append(x)
-        return np.hstack(found) if found else np.empty((len(self._world.symbols), 0))
+                    found[v] = np.hstack((found[v], x)) if v in found else x
+        return found
 
-    def flaw_of_section(self, x: np.ndarray, partners: np.ndarray) -> str:
+    def flaw_of_section(self, x: np.ndarray) -> str:
         """Say where the coordinates of a state are not those of its partner."""
-        return self._difference("the section has another", self._tested, x, partners)
+        return self._difference("the section has another", self._tested, x)
 
     def flaw_of_ranges(self, x: np.ndarray) -> str:
         """Say where a coordinate of a safe state is outside its range."""
@@ -194,25 +197,25 @@ class _Pairs:
                 return f"safe states have a {c.symbol} outside [{c.low:g}, {c.high:g}]"
         return ""
 
-    def flaw_of_readings(self, x: np.ndarray, partners: np.ndarray) -> str:
+    def flaw_of_readings(self, x: np.ndarray) -> str:
         """Say where barriers or goal are no functions of the coordinates."""
         goal = [] if self._world.goal is None else [self._world.goal]
         timed = [e.xreplace({s: sp.Float(1.7) for s in self._times(e)}) for e in goal]
         return self._difference(
-            "barrier or goal differ at equal", [*self._world.barriers, *timed], x, partners
+            "barrier or goal differ at equal", [*self._world.barriers, *timed], x
         )
 
-    def flaw_of_workspace(self, x: np.ndarray) -> str:
-        """Say where the workspace is no function of the coordinates, though that matters."""
-        left = [self._problem.outside]
+    def flaw_of_bounds(self, bounds: tuple[Variable, ...], x: np.ndarray) -> str:
+        """Say where bounds of the workspace are no functions of the coordinates."""
         what = "safe states may be outside the workspace, which differs at equal"
-        return self._difference(what, left, x, self.partners(x))
+        return self._difference(what, [excess(bounds)], x)
 
-    def flaw_of_law(self, x: np.ndarray, partners: np.ndarray) -> str:
+    def flaw_of_law(self, x: np.ndarray) -> str:
         """Say where the law of the coordinates after a step differs between partners."""
+        partners = self.partners(x)
         settled = np.zeros(len(self._products), dtype=int)
         for u in self._inputs():
-            rules = _rules(len(self._world.noise))
+            rules = normal_rules(len(self._world.noise))
             found = np.array(
                 [[self._expected(side, u, *rule) for side in (x, partners)] for rule in rules]
             )
@@ -240,10 +243,8 @@ class _Pairs:
             return ""
         return "the law of a step could not be computed exactly enough to compare it"
 
-    def _difference(
-        self, what: str, expressions: Sequence[Any], x: np.ndarray, partners: np.ndarray
-    ) -> str:
-        a, b = self.values(expressions, x), self.values(expressions, partners)
+    def _difference(self, what: str, expressions: Sequence[Any], x: np.ndarray) -> str:
+        a, b = self.values(expressions, x), self.values(expressions, self.partners(x))
         same = abs(a - b) <= TOLERANCE * np.maximum(1.0, abs(a))
         names = ", ".join(s.name for s in self._frame.symbols)
         return "" if same.all() else f"{what} {names}"
@@ -284,23 +285,6 @@ class _Pairs:
 
     def _times(self, expression: Any) -> set[Any]:
         return expression.free_symbols - set(self._world.symbols)
-
-
-def _rules(channels: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return quadratures over standard normals, of more and more nodes."""
-    if not channels:
-        return (_tensor(1, 0),)
-    most = min(_NODES, int(_MOST_NODES ** (1 / channels)))
-    return tuple(_tensor(max(most * part // 8, 1), channels) for part in (4, 5, 6, 8))
-
-
-def _tensor(count: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    nodes, weights = np.polynomial.hermite_e.hermegauss(count)
-    weights = weights / weights.sum()
-    shape = (count**channels, channels)
-    grid = np.array(list(itertools.product(nodes, repeat=channels))).reshape(shape)
-    shares = np.array(list(itertools.product(weights, repeat=channels))).reshape(shape)
-    return grid.T, shares.prod(axis=1)
 
 
 def _evaluated(symbols: Sequence[sp.Symbol], expressions: Sequence[Any], x: Any) -> np.ndarray:

@@ -30,7 +30,7 @@ MOST_COORDINATES = 4
 _NONE: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReducedProblem:
     """The Markov chain of a simulation, and its sets, in few coordinates.
 
