@@ -88,16 +88,15 @@ class Chain:
 
     def _with_period(self, i: int) -> Coordinate:
         c = self.coordinates[i]
-        ends = math.isfinite(c.low), math.isfinite(c.high)
-        if all(ends):
+        if math.isfinite(c.low) and math.isfinite(c.high):
             return c
         shift = {c.symbol: c.symbol + 2 * sp.pi}
-        if any(ends) or not all(
+        if not all(
             is_zero(e.xreplace(shift) - e - (2 * sp.pi if j == i else 0))
             for j, e in enumerate(self.expressions)
         ):
             raise ConfigurationError(
-                f"{c.symbol} has no bounds and does not repeat after 2 pi, so that no grid can"
+                f"{c.symbol} lacks finite bounds and does not repeat after 2 pi, so that no grid can"
                 " cover it; give the state a workspace"
             )
         return replace(c, low=-math.pi, high=math.pi, period=2 * math.pi)
