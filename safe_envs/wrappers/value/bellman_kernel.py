@@ -101,8 +101,8 @@ def sweep_lower(  # noqa: PLR0913
 ) -> None:
     """Maximise the bound of the expected value over some of the inputs.
 
-    Any input gives a lower envelope. Those near the best one of the last sweep, and another one each
-    time, find nearly the maximum of all.
+    Any input gives a lower envelope. The best one of the last sweep and, in turn, one next to it or
+    any other find nearly the maximum of all.
 
     Args:
         first: state to begin with.
@@ -130,16 +130,16 @@ def sweep_lower(  # noqa: PLR0913
         if best[a] < 0:
             continue
         largest, chosen = -inf, best[a]
-        number = tried if turn == 0 else neighbours.shape[1] + 2
+        number = tried if turn == 0 else 2
         for j in range(number):
             if turn == 0:
                 u = j
             elif j == 0:
                 u = best[a]
-            elif j == 1:
-                u = (a * 7 + turn) % tried
+            elif turn % 4 == 0:
+                u = (7 * a + turn // 4) % tried
             else:
-                u = neighbours[best[a], j - 2]
+                u = neighbours[best[a], (a + turn) % neighbours.shape[1]]
             if u >= 0:
                 value = expected_value(
                     a,

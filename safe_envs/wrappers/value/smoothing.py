@@ -9,7 +9,7 @@ its lower end, a falling one from its upper end, and the sum is a lower bound.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,24 +18,29 @@ from safe_envs.wrappers.value.grid import Axis, Grid
 _REACH = 5.2
 """Standard deviations that noise is taken to reach."""
 
-_PARTS = 3
+_PARTS = 2
 """Of a cell along an axis with noise."""
 
+_AT_ONCE = 96
+"""Intervals of means of a block: so many share most of the edges that noise may pass."""
 
-class _Blur(NamedTuple):
-    """Noise along an axis.
+
+class _Block(NamedTuple):
+    """Consecutive intervals of means, and the edges that noise may or may not pass from them.
 
     Attributes:
-        axis: its place.
-        at_low: for each interval of means, chance to pass each edge from its lower end, sparse.
+        means: the intervals.
+        edges: the edges.
+        at_low: for each interval, chance to pass each edge from its lower end.
         at_high: the same from its upper end.
-        below: edges that are passed from anywhere in the interval.
+        below: number of edges that are passed in any case.
     """
 
-    axis: int
-    at_low: Any
-    at_high: Any
-    below: np.ndarray
+    means: slice
+    edges: slice
+    at_low: np.ndarray
+    at_high: np.ndarray
+    below: int
 
 
 class Smoothing:
@@ -60,14 +65,14 @@ class Smoothing:
         from scipy.special import ndtr
 
         self._shape = grid.shape
-        self._blurs: list[_Blur] = []
+        self._blurs: list[tuple[int, list[_Block]]] = []
         self.parts = tuple(_PARTS if size else 1 for size in blur)
         fine = [axis.refined(cut) for axis, cut in zip(grid.axes, self.parts, strict=True)]
         self.fine, axes = Grid(tuple(fine)), list(fine)
         for i, size in enumerate(blur):
             if size:
                 axes[i] = fine[i].widened(_REACH * size)
-                self._blurs.append(_blur(i, axes[i], _unrolled(fine[i], size), size))
+                self._blurs.append((i, _blocks(axes[i], _unrolled(fine[i], size), size)))
         self.means = Grid(tuple(axes))
         self.beyond = 2.0 * len(self._blurs) * float(ndtr(-_REACH))
 
@@ -85,15 +90,11 @@ class Smoothing:
         found = np.where(counts.reshape(found.shape), found, np.float32(0.0))
         if not self._blurs:
             return found.reshape(-1)
-        for blur in self._blurs:
-            found = np.moveaxis(found, blur.axis, 0)
+        for i, blocks in self._blurs:
+            found = np.moveaxis(found, i, 0)
             others = found.shape[1:]
-            steps = _steps(found.reshape(len(found), -1), blur.at_low.shape[1])
-            passed = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
-            bound = passed[blur.below]
-            bound += blur.at_low @ np.maximum(steps, 0.0)
-            bound += blur.at_high @ np.minimum(steps, 0.0)
-            found = np.moveaxis(bound.reshape(-1, *others), 0, blur.axis)
+            bound = _passed(blocks, found.reshape(len(found), -1))
+            found = np.moveaxis(bound.reshape(-1, *others), 0, i)
         return rounded_down(np.ascontiguousarray(found).reshape(-1))
 
     def least_around(self, means: np.ndarray) -> np.ndarray:
@@ -120,21 +121,40 @@ def rounded_down(values: np.ndarray) -> np.ndarray:
     return np.where(found > values, np.nextafter(found, np.float32(-np.inf)), found)
 
 
-def _blur(i: int, means: Axis, edges: np.ndarray, size: float) -> _Blur:
-    from scipy.sparse import csr_matrix
+def _blocks(means: Axis, edges: np.ndarray, size: float) -> list[_Block]:
     from scipy.special import ndtr
 
-    low, high = means.edges[:-1], means.edges[1:]
-    below = np.searchsorted(edges, low - _REACH * size)
-    above = np.searchsorted(edges, high + _REACH * size)
-    rows = np.repeat(np.arange(len(low)), above - below)
-    columns = np.concatenate([np.arange(a, b) for a, b in zip(below, above, strict=True)])
-    shape = (len(low), len(edges))
-    at_low, at_high = (
-        csr_matrix((ndtr((ends[rows] - edges[columns]) / size), (rows, columns)), shape)
-        for ends in (low, high)
-    )
-    return _Blur(i, at_low, at_high, below)
+    found = []
+    for first in range(0, means.count, _AT_ONCE):
+        part = slice(first, min(first + _AT_ONCE, means.count))
+        low, high = means.edges[part], means.edges[part.start + 1 : part.stop + 1]
+        begin = int(np.searchsorted(edges, low[0] - _REACH * size))
+        end = int(np.searchsorted(edges, high[-1] + _REACH * size))
+        at_low, at_high = (
+            ndtr((ends[:, None] - edges[None, begin:end]) / size) for ends in (low, high)
+        )
+        found.append(_Block(part, slice(begin, end), at_low, at_high, begin))
+    return found
+
+
+def _passed(blocks: list[_Block], values: np.ndarray) -> np.ndarray:
+    """Return lower bounds of the expected values of the columns of values."""
+    edges = max(block.edges.stop for block in blocks)
+    copies = max(1, -(-(edges - 1) // len(values)))
+    if copies > 1:
+        values = np.tile(values, (copies, 1))
+    nothing = np.zeros((1, values.shape[1]))
+    steps = np.diff(values.astype(np.float64), axis=0, prepend=nothing, append=nothing)
+    rising, falling = np.maximum(steps, 0.0), np.minimum(steps, 0.0)
+    found = np.empty((blocks[-1].means.stop, values.shape[1]))
+    for block in blocks:
+        part = block.at_low @ rising[block.edges]
+        part += block.at_high @ falling[block.edges]
+        # The steps that are passed in any case add up to the value behind the last of them.
+        if 0 < block.below <= len(values):
+            part += values[block.below - 1]
+        found[block.means] = part
+    return found
 
 
 def _unrolled(axis: Axis, size: float) -> np.ndarray:
@@ -144,12 +164,3 @@ def _unrolled(axis: Axis, size: float) -> np.ndarray:
     copies = int(np.ceil(_REACH * size / axis.period))
     turns = axis.period * np.arange(-copies, copies + 1)
     return np.append((axis.edges[:-1] + turns[:, None]).ravel(), axis.edges[-1] + turns[-1])
-
-
-def _steps(values: np.ndarray, edges: int) -> np.ndarray:
-    """Return how values rise at each edge, with copies of them for more edges than cells."""
-    copies = (edges - 1) // len(values)
-    if copies > 1:
-        values = np.tile(values, (copies, 1))
-    ends = np.zeros((1, values.shape[1]))
-    return np.diff(values, axis=0, prepend=ends, append=ends)
