@@ -21,9 +21,7 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from safe_envs.errors import ConfigurationError, nearest, shown
-
-OPERATORS = ("always", "eventually", "until", "then", "and", "or", "not")
-"""Words of the grammar, which no set can have as its name."""
+from safe_envs.problem.regions import OPERATORS
 
 _SIGNS = {"&": "and", "|": "or", "!": "not"}
 _TOKEN = re.compile(r"\s*(?:([A-Za-z_][A-Za-z0-9_]*)|([0-9]+)|([&|!()\[\],]))")
