@@ -135,11 +135,11 @@ class Specification:
         found = self._evaluated(self.formula, 0, values[:, None], self._rest())
         return np.broadcast_to(found, (self.size, values.shape[1])).copy()
 
-    def advance(self, k: int, registers: np.ndarray, values: np.ndarray) -> np.ndarray:
+    def advance(self, k: Any, registers: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the registers after one more state.
 
         Args:
-            k: control instant of that state, at least 1.
+            k: control instant of that state, at least 1; an int, or an array (B,).
             registers: after instant k - 1, shape (size, B) or (size, 1).
             values: of the sets at x_k, shape (number of atoms, B).
 
@@ -189,7 +189,7 @@ class Specification:
         return {f: self._vertices[i][:, None] for i, f in enumerate(self._pending)}
 
     def _evaluated(
-        self, f: Formula, k: int, values: np.ndarray, rest: Mapping[Formula, np.ndarray]
+        self, f: Formula, k: Any, values: np.ndarray, rest: Mapping[Formula, np.ndarray]
     ) -> Any:
         """Return the robustness of a formula at instant k, given that of `rest` at the next."""
         if f.kind == "set":
@@ -203,8 +203,11 @@ class Specification:
         if f.kind in ("and", "or"):
             return grow.reduce(np.broadcast_arrays(*parts))
         closed = np.float64(np.inf if f.kind == "release" else -np.inf)
-        is_open = f.first <= k <= (k if f.last is None else f.last) if f.clocked else f.first == 0
-        now = parts[0] if is_open else closed
+        now = parts[0]
+        if f.clocked and f.last is not None:
+            now = np.where((f.first <= k) & (k <= f.last), now, closed)
+        elif f.first > 0:
+            now = closed
         later = closed if f.following is None else rest[f.following]
         return grow(now, later if len(parts) == 1 else shrink(parts[1], later))
 
