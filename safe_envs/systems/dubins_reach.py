@@ -29,7 +29,7 @@ def dubins_reach(*, radius: float = 0.4) -> SafetyProblem:
         radius: r_O of the obstacle, in m.
     """
     r = positive("radius", radius)
-    car = vehicle_among(1.0, {x_o: sp.Integer(0), y_o: v_o}, {v_o: 0.7}, noise=0.1)
+    car = vehicle_among(1.0, {x_o: sp.Integer(0), y_o: v_o}, {v_o: 0.7}, noise=0.2)
     return SafetyProblem(
         name="DubinsReach",
         plant=car,
@@ -55,9 +55,9 @@ def dubins_reach(*, radius: float = 0.4) -> SafetyProblem:
             "spread": uniform_box((*_START, *_OBSTACLE_START), (0.2, 0.2, 0.5, 0.0, 0.0)),
             "fixed": Start.at((*_START, *_OBSTACLE_START)),
         },
-        dt=0.1,
+        dt=0.2,
         horizon=6.0,
-        gains=(2.0, 2.0),
+        gains=(1.0, 2.0),
         filter="hocbf",
         **SHOWN,
         sampling=SamplingDomain(
@@ -75,7 +75,8 @@ class DubinsReach(SystemEnv):
     As `DubinsObstacle`, with noise in the position and in a small workspace: what counts is to
     reach the goal before the obstacle hits, "always safe & eventually goal". The obstacle's path is
     known from the start, so that three coordinates and the time say everything. Nothing waits: the
-    vehicle cannot slow down, and the workspace ends 2 m from the centre.
+    vehicle cannot slow down, and the workspace ends 2 m from the centre. A step is .2 m long, five
+    cells of a table with 100 cells along x and y, whose bounds are close then.
 
     ## Equations
     dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
@@ -98,7 +99,7 @@ class DubinsReach(SystemEnv):
     and y_o - y.
 
     ## Barrier
-    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .4 m, of relative degree 2. Gains 2 and 2.
+    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .4 m, of relative degree 2. Gains 1 and 2.
     Default filter: `hocbf`, which ignores the noise.
 
     ## Regions
@@ -106,7 +107,7 @@ class DubinsReach(SystemEnv):
     (gate then goal)" leads around the obstacle's path.
 
     ## Noise
-    `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both .1.
+    `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both .2.
 
     ## Mismatch
     None: plant and model have v = 1 m/s and v_o = .7 m/s; `plant={"v": 1.2}` or `model={"v_o":
@@ -124,7 +125,7 @@ class DubinsReach(SystemEnv):
     `fixed`: exactly there.
 
     ## Episode end
-    Terminated within .3 m of the goal (1.4, 1) or outside the workspace, truncated after 6 s = 60
+    Terminated within .3 m of the goal (1.4, 1) or outside the workspace, truncated after 6 s = 30
     steps.
 
     ## Arguments

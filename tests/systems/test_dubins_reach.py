@@ -17,9 +17,9 @@ def test_obstacle_is_known_in_advance_and_the_noises_are_equal() -> None:
     env.reset(seed=1)
     env.step(np.zeros((MANY, 1)))
     found = env.state
-    np.testing.assert_allclose(found[:, 2:], np.tile([0.4, 0.0, -1.13], (MANY, 1)), atol=1e-15)
-    moved = found[:, :2] - [-1.5 + 0.1 * np.cos(0.4), -1.0 + 0.1 * np.sin(0.4)]
-    scale = 0.1 * np.sqrt(0.1)
+    np.testing.assert_allclose(found[:, 2:], np.tile([0.4, 0.0, -1.06], (MANY, 1)), atol=1e-15)
+    moved = found[:, :2] - [-1.5 + 0.2 * np.cos(0.4), -1.0 + 0.2 * np.sin(0.4)]
+    scale = 0.2 * np.sqrt(0.2)
     np.testing.assert_allclose(moved.mean(axis=0) / scale, 0.0, atol=4 / np.sqrt(MANY))
     np.testing.assert_allclose(np.cov(moved.T) / scale**2, np.eye(2), atol=6 / np.sqrt(MANY))
 
@@ -39,7 +39,7 @@ def test_nominal_controller_arrives_and_is_hit_on_its_way() -> None:
         if ended.all():
             break
     assert arrived.mean() > 0.97
-    assert hit.mean() > 0.8
+    assert hit.mean() > 0.7
 
 
 def test_passing_behind_the_obstacle_is_possible_in_time() -> None:

@@ -31,9 +31,9 @@ KEYS = {"robustness": float, "satisfied": bool, "verdict": int, "automaton_state
 MODES = ["NextStep", "SameStep", "Disabled"]
 
 
-def near(**options):
+def near():
     """The problem a few steps before the goal, so that short episodes end in several ways."""
-    return problem_of(ENV_ID, start=[0.8, 0.6, 0.4, 1.2, 0.0], horizon=0.8, **options)
+    return problem_of(ENV_ID, start=[0.8, 0.6, 0.4, 1.2, 0.0], dt=0.1, noise=0.1, horizon=0.8)
 
 
 def values_by_hand(states: np.ndarray) -> np.ndarray:

@@ -123,3 +123,38 @@ def test_the_longest_window_is_short_work() -> None:
     _, automaton = built("always[10,100000] (safe | eventually[0,2] goal)")
     assert automaton.begins.tolist() == [0, 10, 100_000, 100_001]
     assert automaton.size == 4
+
+
+def test_labels_of_a_cell_are_those_of_its_points() -> None:
+    _, automaton = built("always safe & eventually goal")
+    surely = np.array([[True, False, False, False], [False, False, False, True]])
+    perhaps = np.array([[True, True, True, False], [False, True, False, True]])
+    found = automaton.possible_labels(surely, perhaps)
+    labels = [np.flatnonzero(column).tolist() for column in found.T]
+    assert labels == [[1], [0, 1, 2, 3], [0, 1], [2]]  # bit 0 is safe, bit 1 the goal
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "always safe & eventually goal",
+        "safe until goal",
+        "eventually (safe then goal)",
+        "eventually[1,3] goal",
+        "always[0,2] safe | eventually[2,4] goal",
+        "safe & always (goal | safe)",
+    ],
+)
+def test_verdicts_fall_as_soon_as_they_are_known(text: str) -> None:
+    specification, automaton = built(text)
+    formula, atoms = parsed(text, NAMES), specification.atoms
+    outcomes: dict[tuple[int, ...], set[int]] = {}
+    for length in range(1, LONGEST + 1):
+        for word in words(atoms, length):
+            held = satisfied(formula, [read(atoms, label) for label in word])
+            for begun in range(1, length + 1):
+                outcomes.setdefault(word[:begun], set()).add(1 if held else -1)
+    for word, ends in outcomes.items():
+        if len(word) < LONGEST:
+            settled = int(automaton.verdict(len(word) - 1, automaton.run(list(word))))
+            assert settled == (ends.pop() if len(ends) == 1 else 0), word
