@@ -26,7 +26,12 @@ and with a filter
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
 
-At reset, before anything is executed, both are the point within the input bounds nearest to 0.
+and with the filter of `safe_envs.wrappers.value`
+
+| `promise` | float | p_k at the state reached: the probability that is still kept, p_0 at reset |
+
+At reset, before anything is executed, both actions are the point within the input bounds nearest to
+0.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Values of a problem: how safe it can be made, and the filter that keeps a given probability."""
