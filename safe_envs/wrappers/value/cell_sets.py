@@ -68,9 +68,7 @@ class Sets:
             parts.append(self._classified(*grid.corners(cells), k, _HALVINGS))
         return CellSets(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
-    def of_states(
-        self, k: np.ndarray, q: Sequence[np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def of_states(self, k: np.ndarray, q: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return whether states are in the safe set, and whether the episode ends in them.
 
         Args:
@@ -112,9 +110,7 @@ class Sets:
             )
         return found
 
-    def _evaluated(
-        self, low: Sequence[np.ndarray], high: Sequence[np.ndarray], k: int
-    ) -> CellSets:
+    def _evaluated(self, low: Sequence[np.ndarray], high: Sequence[np.ndarray], k: int) -> CellSets:
         boxes = [Interval(a, b) for a, b in zip(low, high, strict=True)]
         known = [float(values[k * self._substeps]) for values in self._known]
         values = self._function([*boxes, *known])

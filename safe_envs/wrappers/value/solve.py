@@ -212,4 +212,3 @@ class _Operator:
                 bounds,
             ),
         )
-

@@ -19,9 +19,7 @@ _BYTES = 8
 """Of both tables for a cell and an instant."""
 
 
-def suitable_grid(
-    small: ReducedProblem, settings: ValueSettings, sets: Sets, step: Step
-) -> Grid:
+def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, step: Step) -> Grid:
     """Return a grid over the safe part of the workspace.
 
     Coordinates that a step changes little get narrow cells, since a cell's width acts like a
