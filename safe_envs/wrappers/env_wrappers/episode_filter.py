@@ -15,14 +15,17 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import spec_of
 from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_memory import PromiseMemory
+from safe_envs.wrappers.value.promise_tables import promise_filter_for
+from safe_envs.wrappers.value.promise_text import PromiseSettings
 
-FilterChoice = Conditions | PromiseFilter
-"""Conditions or their text, or a promise filter."""
+FilterChoice = Conditions | PromiseSettings | PromiseFilter
+"""Conditions or their text; or a promise filter, its settings or their text."""
 
 
 class EpisodeFilter(Protocol):
@@ -150,12 +153,17 @@ def episode_filter(
         ConfigurationError: What is given is unknown or does not fit the problem.
         RelativeDegreeError: A condition does not suit a barrier.
     """
-    if isinstance(given, PromiseFilter):
+    if isinstance(given, str) and names_promise(given):
+        given = PromiseSettings.of_text(given)
+    if isinstance(given, PromiseSettings | PromiseFilter):
         if priorities is not None:
             raise ConfigurationError(
                 "priorities are of conditions; the promise filter keeps all barriers together:"
                 " leave them out"
             )
+        if isinstance(given, PromiseSettings):
+            given.require_fit(problem, objective)
+            given = promise_filter_for(problem, given, knowledge)
         given.settings.require_fit(problem, objective)
         given.require_problem(problem)
         return PromiseMemory(given, num_envs)
