@@ -132,9 +132,7 @@ class Step:
         rest, effect = self._functions
         n, m = effects.shape[2:4]
         known = [float(values[instant]) for values in self._reduced.known.values()]
-        wide = [
-            Interval(c.low[:, None, None, None], c.high[:, None, None, None]) for c in coordinates
-        ]
+        wide = [Interval(c.low[:, None, None, None], c.high[:, None, None, None]) for c in coordinates]
         worlds = [
             Interval(
                 np.array([s[i][0] for s in self._scenarios])[:, None],
@@ -182,7 +180,9 @@ def _parts_of(reduced: ReducedProblem) -> _Parts:
         rest = [e.subs(dict.fromkeys(inputs, 0)) for e in rest]
     else:
         effect = [[sp.Integer(0)] * len(inputs) for _ in rest]
-    return _Parts(tuple(rest), tuple(map(tuple, effect)), tuple(blur), tuple(boxed), is_affine)
+    return _Parts(
+        tuple(rest), tuple(map(tuple, effect)), tuple(blur), tuple(boxed), is_affine
+    )
 
 
 def _scenarios(
@@ -196,3 +196,5 @@ def _scenarios(
         ends = [low + (high - low) * i / number for i in range(number)] + [high]
         cut.append(list(itertools.pairwise(ends)))
     return list(itertools.product(*cut))
+
+
