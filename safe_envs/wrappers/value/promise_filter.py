@@ -43,6 +43,12 @@ _SHARES = np.arange(1, 8) / 8.0
 _SEARCHES = 2
 """How often; together they divide the distance of two scanned inputs by 64."""
 
+_COARSE = 8
+"""Distances of the inputs that are looked at first, of each input."""
+
+_TINY = 1e-300
+"""A distance that can divide."""
+
 _OF_CHAIN = ("plant", "model", "barriers", "states", "box", "goal", "dt", "substeps", "steps")
 
 
@@ -115,8 +121,10 @@ class PromiseFilter:
     """Chooses the input nearest to a proposed one that keeps a probability of being safe.
 
     "Nearest" is in the Euclidean distance of physical units, as for `SafetyFilter`. The proposed
-    input is taken as it is where its own q_k is large enough. Elsewhere it is the nearest scanned
-    input, from which a search goes towards the proposed one, to inputs whose own q_k was computed.
+    input is taken as it is where its own q_k is large enough. Elsewhere a few scanned inputs are
+    looked at, and all of them where none of these is allowed; from the nearest one a search goes
+    towards the proposed input, to inputs whose own q_k was computed. Whether an input is the
+    nearest one is decided with the resolution of this search, whether it is allowed exactly.
 
     The filter itself remembers nothing: `PromiseMemory` has the p_k of episodes.
 
@@ -153,6 +161,7 @@ class PromiseFilter:
             [problem.plant.numeric(barrier.expression) for barrier in problem.barriers],
             "arrays",
         )
+        self._coarse = _coarse(look_ahead.inputs)
         self._spacing = _spacing(look_ahead.inputs)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> PromiseFilter:
@@ -212,20 +221,30 @@ class PromiseFilter:
         self, k: np.ndarray, level: np.ndarray, x: Components, given: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the inputs (B, m) in place of proposed ones, their q_k and the levels p_k."""
-        scanned, inputs = self.look_ahead.scanned(k, x), self.look_ahead.inputs
-        level = np.minimum(level, np.maximum(scanned.max(axis=1), 0.0))
-        distance = sum((inputs[:, j] - given[:, j, None]) ** 2 for j in range(inputs.shape[1]))
-        where = np.where(scanned >= level[:, None], distance, np.inf).argmin(axis=1)
-        action, found = inputs[where], scanned[np.arange(len(where)), where]
+        level, ahead = level.copy(), self.look_ahead
+        action, found = np.empty(given.shape), np.empty(len(given))
+        spacing = np.full(len(given), _spacing(self._coarse))
         held = np.flatnonzero(level > 0.0)
-        if held.size:
-            at = k[held], tuple([c[held] for c in x])
-            action[held], found[held] = self._nearer(
-                at, level[held], given[held], action[held], found[held]
-            )
+        values = ahead.expected(
+            k[held],
+            _part(x, held),
+            np.broadcast_to(self._coarse, (len(held), *self._coarse.shape)),
+        )
+        action[held], found[held] = _closest(self._coarse, values, level[held], given[held])
+        # What is between these inputs decides where none of them is allowed.
+        open_ = held[found[held] < level[held]]
+        if open_.size:
+            values, spacing[open_] = ahead.scanned(k[open_], _part(x, open_)), self._spacing
+            level[open_] = np.minimum(level[open_], np.maximum(values.max(axis=1), 0.0))
+            action[open_], found[open_] = _closest(ahead.inputs, values, level[open_], given[open_])
+        held = np.flatnonzero(level > 0.0)
+        at = k[held], _part(x, held)
+        action[held], found[held] = self._nearer(
+            at, level[held], given[held], (action[held], found[held]), spacing[held]
+        )
         lost = np.flatnonzero(level <= 0.0)
         if lost.size:
-            best, found[lost] = self.look_ahead.best_input(k[lost], tuple([c[lost] for c in x]))
+            best, found[lost] = ahead.best_input(k[lost], _part(x, lost))
             action[lost] = np.clip(best, self._low, self._high)
         return action, found, level
 
@@ -234,31 +253,58 @@ class PromiseFilter:
         at: tuple[np.ndarray, Components],
         level: np.ndarray,
         given: np.ndarray,
-        action: np.ndarray,
-        found: np.ndarray,
+        begun: tuple[np.ndarray, np.ndarray],
+        spacing: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Go from allowed inputs towards the proposed ones, as far as q_k is seen to allow it.
 
         q_k need not be monotone on the way: only inputs whose own q_k is large enough are taken.
-        The way beyond the next scanned inputs, which are not allowed, is left out.
+        The way beyond the next of the inputs that were looked at, not allowed, is left out.
         """
+        action, found = begun
         way = given - action
         length = np.sqrt((way**2).sum(axis=1))
-        width = np.minimum(1.0, self._spacing / np.maximum(length, self._spacing + 1e-300))
-        begun, rows, origin = np.zeros(len(way)), np.arange(len(way)), action
+        width = spacing / np.maximum(np.maximum(length, spacing), _TINY)
+        gone, rows, origin = np.zeros(len(way)), np.arange(len(way)), action
         for _ in range(_SEARCHES):
-            share = begun[:, None] + width[:, None] * _SHARES
+            share = gone[:, None] + width[:, None] * _SHARES
             points = origin[:, None, :] + share[:, :, None] * way[:, None, :]
             points = np.clip(points, self._low, self._high)
             values = self.look_ahead.expected(*at, points)
             allowed = values >= level[:, None]
             last = len(_SHARES) - 1 - allowed[:, ::-1].argmax(axis=1)
             moves = allowed[rows, last]
-            begun = np.where(moves, share[rows, last], begun)
+            gone = np.where(moves, share[rows, last], gone)
             action = np.where(moves[:, None], points[rows, last], action)
             found = np.where(moves, values[rows, last], found)
             width = width / (len(_SHARES) + 1)
         return action, found
+
+
+def _closest(
+    inputs: np.ndarray, values: np.ndarray, level: np.ndarray, given: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest allowed inputs, of V (V, m) whose q_k are (B, V), and their q_k.
+
+    Where none is allowed it is another one, with a q_k below the level.
+    """
+    distance = sum((inputs[:, j] - given[:, j, None]) ** 2 for j in range(inputs.shape[1]))
+    where = np.where(values >= level[:, None], distance, np.inf).argmin(axis=1)
+    return inputs[where], np.take_along_axis(values, where[:, None], axis=1)[:, 0]
+
+
+def _part(x: Components, rows: np.ndarray) -> Components:
+    return tuple([c[rows] for c in x])
+
+
+def _coarse(inputs: np.ndarray) -> np.ndarray:
+    """Return about nine values of each input among scanned ones, in all combinations."""
+    chosen = np.ones(len(inputs), dtype=bool)
+    for column in inputs.T:
+        values = np.unique(column)
+        stride = max(1, (len(values) - 1) // _COARSE)
+        chosen &= np.isin(column, [*values[::stride], values[-1]])
+    return inputs[chosen] if chosen.any() else inputs
 
 
 def _spacing(inputs: np.ndarray) -> float:

@@ -43,6 +43,9 @@ def promise_filter_for(
         knowledge=knowledge, leaving=settings.leaving, intervals=settings.intervals
     )
     fingerprint = reduced(problem, knowledge, settings.intervals).fingerprint
+    if problem.model == problem.plant:
+        # Then a table of the plant is one of the model, and may be there already.
+        wanted = replace(wanted, knowledge="plant")
     key = json.dumps([fingerprint, wanted.as_dict(), settings.table])
     look_ahead = _IN_USE.get(key)
     if look_ahead is None:

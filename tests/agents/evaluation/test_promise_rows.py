@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import json
+import weakref
 
 import numpy as np
 import pytest
@@ -92,11 +94,29 @@ def test_filters_of_one_table_share_it():
     second = promise_filter_for(problem, PromiseSettings(0.5), progress=told.append)
     assert first.look_ahead is second.look_ahead
     assert told == [1.0]
-    other = promise_filter_for(problem, PromiseSettings(0.9), knowledge="plant")
-    assert other.look_ahead is not first.look_ahead
-    before = len(_IN_USE)
-    del first, second
-    assert len(_IN_USE) < before
+    # The model is the plant here.
+    of_plant = promise_filter_for(problem, PromiseSettings(0.9), knowledge="plant")
+    assert of_plant.look_ahead is first.look_ahead
+    assert first.look_ahead in _IN_USE.values()
+    place = weakref.ref(first.look_ahead)
+    del first, second, of_plant
+    gc.collect()
+    assert place() is None
+
+
+def test_a_named_file_is_written_once_and_read_again(tmp_path):
+    problem = problem_of(SCALAR, horizon=0.05)
+    path = tmp_path / "scalar.npz"
+    settings = PromiseSettings.of_text(f"promise:p=0.9:table={path}")
+    first = promise_filter_for(problem, settings)
+    x = (np.linspace(-0.5, 1.2, 9),)
+    wanted = first.start(x)
+    assert path.exists()
+    del first
+    gc.collect()
+    np.testing.assert_array_equal(promise_filter_for(problem, settings).start(x), wanted)
+    with pytest.raises(ConfigurationError, match="Scalar"):
+        promise_filter_for(problem_of(SCALAR, horizon=0.05, noise=0.1), settings)
 
 
 def test_what_cannot_be_had_is_refused():

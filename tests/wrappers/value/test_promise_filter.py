@@ -234,3 +234,28 @@ def test_two_inputs_move_in_the_euclidean_distance():
     assert (distance >= least - 1e-9).all()
     assert (distance - least).max() < 0.25
     assert (np.abs(found.action[0]) <= 1.0).all()
+
+
+class Peak(Plane):
+    """One input, of which only a few values near 0.3125 are any good."""
+
+    inputs = np.linspace(-1.0, 1.0, 33)[:, None]
+
+    def expected(self, k, x, u):
+        return np.clip(0.9 - 5.0 * np.abs(u[..., 0] - 0.3125), 0.0, 1.0)
+
+
+def test_all_scanned_inputs_are_looked_at_before_anything_is_lost():
+    # Of every fourth input none is allowed.
+    chosen = PromiseFilter(Peak(), PromiseSettings(0.85), chain_problem(1))
+    assert not (chosen.look_ahead.expected(0, 0, np.linspace(-1, 1, 9)[:, None]) >= 0.85).any()
+    u, levels = np.array([-1.0, 0.5, 0.3130]), np.full(3, 0.85)
+    x = (np.full(3, 15.0),)
+    found = chosen.choose(np.zeros(3, dtype=int), levels, x, (u,))
+    np.testing.assert_array_equal(found.level, levels)
+    np.testing.assert_allclose(found.action[0], [0.3025, 0.3225, 0.3130], atol=1e-3)
+    assert (found.expected >= 0.85).all()
+    # More than the best one has is lowered to that.
+    found = chosen.choose(np.zeros(3, dtype=int), np.full(3, 0.95), x, (u,))
+    np.testing.assert_allclose(found.level, 0.9)
+    np.testing.assert_allclose(found.action[0], 0.3125)
