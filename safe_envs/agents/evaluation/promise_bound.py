@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from safe_envs.agents.evaluation.contradiction import COMPUTED
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager
 from safe_envs.agents.evaluation.resolved import FilterParts
 from safe_envs.agents.evaluation.rows import BoundSummary
@@ -16,9 +17,6 @@ from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.promise_tables import promise_filter_for, why_not_of_plant
 from safe_envs.wrappers.value.promise_text import PromiseSettings
-
-COMPUTED = "computed: the table is of floating-point numbers"
-"""Remark on the bound of a promise filter."""
 
 
 class Averager(Protocol):

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.evaluation.contradiction import COMPUTED, judged
 from safe_envs.agents.evaluation.evaluate import evaluate, run_evaluation
-from safe_envs.agents.evaluation.promise_bound import COMPUTED
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.errors import NotCompilableError
@@ -162,6 +163,16 @@ def test_the_guarantee_is_of_the_plant_where_the_table_covers_it():
             problem, missing, knowledge
         )
     assert why_not_of_plant(problem_of(SCALAR), plain, "model") == ""
+
+
+def test_a_bound_that_the_rate_contradicts_is_withheld():
+    row = BoundSummary(estimated_bound=0.9, bound_note=COMPUTED)
+    assert judged(row, 0.9) == row
+    found = judged(row, 0.85)
+    assert found.estimated_bound is None
+    assert "ends at 85.0 %, below 90.0 %" in (found.withheld or "")
+    assert "continuous time" not in (found.withheld or "")
+    assert "another table" in (found.withheld or "")
 
 
 def test_notes_say_that_the_bound_is_computed():
