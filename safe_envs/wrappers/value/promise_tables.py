@@ -51,7 +51,7 @@ def promise_filter_for(
     if look_ahead is None:
         table = table_for(problem, wanted, progress, settings.table)
         look_ahead = _IN_USE[key] = LookAhead(table, problem)
-    elif progress is not None:
+    if progress is not None:
         progress(1.0)
     return PromiseFilter(look_ahead, settings, problem)
 
