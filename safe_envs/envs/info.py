@@ -26,12 +26,25 @@ and with a filter
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
 
-and with the filter of `safe_envs.wrappers.value`
+and with the promise filter
 
+| key | type | meaning |
+|---|---|---|
 | `promise` | float | p_k at the state reached: the probability that is still kept, p_0 at reset |
 
-At reset, before anything is executed, both actions are the point within the input bounds nearest to
-0.
+and with a specification, of the trace of the episode so far
+
+| key | type | meaning |
+|---|---|---|
+| `robustness` | float | how far it is from changing whether it satisfies, positive where it does |
+| `satisfied` | bool | it satisfies the specification, if the episode ends here |
+| `verdict` | int | 1 where it will, whatever follows, -1 where it will not, 0 where that is open |
+| `automaton_state` | int | state of the specification's automaton |
+
+A robustness is -inf or inf where the trace is too short for anything to count.
+
+At reset, before anything is executed, both actions are the point within the input bounds nearest
+to 0.
 """
 
 from __future__ import annotations
@@ -86,6 +99,23 @@ class FilterInfo(TypedDict):
 def filter_info(**values: Unpack[FilterInfo]) -> Info:
     """Return what a filter adds, all of `FilterInfo`."""
     return {**values}
+
+
+def specification_info(robustness: Any, satisfied: Any, verdict: Any, automaton_state: Any) -> Info:
+    """Return what a specification adds; see the table above.
+
+    Args:
+        robustness: of the trace so far.
+        satisfied: whether it satisfies the specification.
+        verdict: whether that is settled.
+        automaton_state: after the trace.
+    """
+    return {
+        "robustness": robustness,
+        "satisfied": satisfied,
+        "verdict": verdict,
+        "automaton_state": automaton_state,
+    }
 
 
 def with_masks(info: Info, present: np.ndarray) -> Info:

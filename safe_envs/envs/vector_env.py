@@ -38,7 +38,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Attributes:
         engine: that was asked for.
-        reached: components of the states of the last step, before same-step autoreset.
         viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
@@ -84,7 +83,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._actions = BatchActions(problem, num_envs)
         self._streams = EpisodeStreams(num_envs)
         self.episodes = Episodes(num_envs)
-        self.reached: Components = ()
         limit = steps_until(problem, max_episode_steps)
         require_engine(engine)
         self.engine = engine
@@ -262,15 +260,17 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         return due
 
-    def _told(self, stepper: _Stepper, found: VectorStep) -> VectorStep:
+    def _told(
+        self, stepper: ArrayBatch | CompiledBatch | BatchStepper, found: VectorStep
+    ) -> VectorStep:
         """Return what a step tells, with autoreset."""
         observation, reward, terminated, truncated, info = found
-        episodes = self.episodes
-        ended = terminated | truncated
-        self.reached, last = self._batch.components, Info()
+        episodes, ended = self.episodes, terminated | truncated
+        last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = last_of_episode(ended, observation, info)
+                episodes.last_states = self.state
                 observation, _, _, _, info = stepper.begin(ended)
             episodes.begun = ended
         else:

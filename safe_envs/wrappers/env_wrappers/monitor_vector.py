@@ -31,7 +31,6 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
     Attributes:
         problem: the model as a problem.
         executed: the components of the model's inputs of the last step.
-        reached: see `SafeVectorEnv`.
         viewer: what the pictures are drawn from; None unless the render mode is "rgb_array".
 
     Raises:
@@ -53,7 +52,6 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
             ) from error
         self.executed: Components = ()
         self._x: Components = ()
-        self.reached: Components = ()
         self.episodes = Episodes(self.num_envs)
 
     @property
@@ -113,7 +111,6 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
                 episodes.restart(due)
             episodes.ended = ended
             shown = self._seen(observation, episodes.everywhere)
-            self.reached = self._x
         if self.viewer is not None:
             self.viewer.advance(
                 np.stack(self._x, axis=-1),
@@ -151,14 +148,16 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
 
         Their last step goes to `final_info`.
         """
+        if not ended.any():
+            return self._seen(observation, self.episodes.everywhere)
         last = np.array(observation)
         for i in np.flatnonzero(ended).tolist():
             last[i] = info["final_obs"][i]
-        seen = self._seen(last, self.episodes.everywhere)
-        self.reached = self._x
-        if not ended.any():
-            return seen
-        info["final_info"] = {**info.get("final_info", {}), **with_masks(seen, ended)}
+        info["final_info"] = {
+            **info.get("final_info", {}),
+            **with_masks(self._seen(last, self.episodes.everywhere), ended),
+        }
+        self.episodes.last_states = np.stack(self._x, axis=-1)
         self.episodes.restart(ended)
         return self._seen(observation, ended)
 

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -118,7 +119,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         observation, reward, terminated, truncated, info = self.execute(
             self.env, decision.action, self.env is self._inner
         )
-        self._filter.advance(self._inner.reached, terminated | truncated)
+        self._filter.advance(self._reached(), terminated | truncated)
         added = self._decided(decision, active) | self._filter.report()
         begun = self._inner.episodes.begun
         if np.count_nonzero(begun):
@@ -131,6 +132,14 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             added |= self._filter.report()
         info.update(with_masks(added, info["_cost"]))
         return self.observed(observation), reward, terminated, truncated, info
+
+    def _reached(self) -> Components:
+        """Return the components of the states that a step led to, of ended episodes too."""
+        x, episodes = self._inner.components, self._inner.episodes
+        if self._mode != AutoresetMode.SAME_STEP or not np.count_nonzero(episodes.begun):
+            return x
+        last = episodes.last_states.T
+        return tuple([np.where(episodes.begun, old, c) for old, c in zip(last, x, strict=True)])
 
     def _observe_last(self, info: Info, ended: np.ndarray) -> None:
         """Append p_k to the last observations of episodes, which their envs have not seen."""

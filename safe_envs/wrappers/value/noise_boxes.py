@@ -52,5 +52,8 @@ def noise_boxes(channels: int) -> NoiseBoxes:
     # The weights of all boxes never exceed 1, whatever the rounding.
     total = np.array(weights) * (1.0 - 1e-15)
     return NoiseBoxes(
-        np.reshape(low, shape).T, np.reshape(high, shape).T, total, max(0.0, 1.0 - float(total.sum()))
+        np.reshape(low, shape).T,
+        np.reshape(high, shape).T,
+        total,
+        max(0.0, 1.0 - float(total.sum())),
     )

@@ -28,7 +28,7 @@ the filter says that it is infeasible, and it executes the input of the largest 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.value.step_values import StepValues
 
 _SHARES = np.arange(1, 8) / 8.0
 """Where an interval is searched at once for an input nearer to the proposed one."""
@@ -50,55 +51,6 @@ _TINY = 1e-300
 """A distance that can divide."""
 
 _OF_CHAIN = ("plant", "model", "barriers", "states", "box", "goal", "dt", "substeps", "steps")
-
-
-class StepValues(Protocol):
-    """What the filter asks of a table and its problem, for B states at control instants k (B,).
-
-    Attributes:
-        steps: K.
-        inputs: those that are scanned, shape (U, m).
-    """
-
-    steps: int
-    inputs: np.ndarray
-
-    def values(self, k: np.ndarray, x: Components) -> np.ndarray:
-        """Return L_k(x), shape (B,), 0 outside the safe set.
-
-        Args:
-            k: control instants, int (B,).
-            x: n components of the states, arrays (B,).
-        """
-        ...
-
-    def expected(self, k: np.ndarray, x: Components, u: np.ndarray) -> np.ndarray:
-        """Return q_k(x, u), shape (B, V).
-
-        Args:
-            k: control instants, int (B,).
-            x: n components of the states, arrays (B,).
-            u: inputs in physical units, shape (B, V, m).
-        """
-        ...
-
-    def scanned(self, k: np.ndarray, x: Components) -> np.ndarray:
-        """Return q_k(x, u) at all scanned inputs, shape (B, U).
-
-        Args:
-            k: control instants, int (B,).
-            x: n components of the states, arrays (B,).
-        """
-        ...
-
-    def best_input(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
-        """Return the inputs of the largest q_k, shape (B, m), and these q_k, shape (B,).
-
-        Args:
-            k: control instants, int (B,).
-            x: n components of the states, arrays (B,).
-        """
-        ...
 
 
 class PromiseChoice(NamedTuple):

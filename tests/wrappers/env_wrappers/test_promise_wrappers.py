@@ -95,12 +95,12 @@ def test_the_last_info_of_an_episode_has_p_of_its_last_state():
         *_, truncated, infos = envs.step(actions(k))
     assert truncated.all()
     memory = envs._filter
-    last, x = infos["final_info"]["promise"], envs.unwrapped.reached
+    last, x = infos["final_info"]["promise"], tuple(envs.unwrapped.episodes.last_states.T)
     # Below 1 it is p times the table's value there, and not that of the next start.
     assert (last > 0.0).all()
     assert (last <= memory.safety_filter.look_ahead.values(np.full(4, 6), x)).all()
     assert (infos["promise"] == memory.safety_filter.start(envs.unwrapped.components)).all()
-    assert (envs.unwrapped.reached[0] != envs.unwrapped.components[0]).all()
+    assert (x[0] != envs.unwrapped.components[0]).all()
 
 
 def test_a_snapshot_has_what_the_filter_remembers():
