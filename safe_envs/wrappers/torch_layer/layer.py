@@ -181,8 +181,8 @@ class TorchFilter(torch.nn.Module):
 
 def _not_differentiable(given: str) -> ConfigurationError:
     return ConfigurationError(
-        f"{shown(given)} is no SafetyFilter, and a torch layer takes no other: the promise filter"
-        " looks its inputs up in a table, so that they have no gradient. Take a condition here, such"
+        f"{shown(given)} is no SafetyFilter, and a torch layer takes no other; the promise filter"
+        " looks its inputs up in a table, so they have no gradient. Take a condition here, such"
         " as 'scbf' or 'hocbf'; or train an agent behind it, which needs no gradient of it, by"
         " SafetyFilterVectorWrapper or make_sb3_env(..., filter='promise:p=0.99')"
     )
