@@ -31,6 +31,7 @@ from safe_envs.wrappers import (
     spec_of,
 )
 from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
+from safe_envs.wrappers.value.reduction import reduced
 
 
 class ResolvedEvaluation:
@@ -78,13 +79,23 @@ class ResolvedEvaluation:
                 "a filter over a third-party env takes what was learned from a log: NAME:file=FILE"
             )
         self.filters: dict[str, list[tuple[Condition, ...]]] = {}
+        if spec.best:
+            # What has no table, as for its many states, is known at once.
+            reduced(self.problem, "plant")
+
+    @property
+    def prepares(self) -> bool:
+        """Whether the policy has long work to do before it acts."""
+        return isinstance(self.policy, Policy) and type(self.policy).prepare is not Policy.prepare
 
     def learn(self, part: Callable[[], Progress | None]) -> None:
-        """Learn what is missing, and read the filters.
+        """Prepare the policy, learn what is missing, and read the filters.
 
         Args:
             part: returns the progress of the next part of the work.
         """
+        if self.prepares:
+            self.policy.prepare(part())
         for method, repeat in self.learning.missing():
             self.learning.learn(method, repeat, part())
         for name in self.names:
@@ -206,6 +217,11 @@ def _require_third_party(spec: EvaluationSpec) -> None:
         raise ConfigurationError(
             "monitoring = 'continuous': the path of a third-party env between its steps is"
             " unknown; use 'discrete'"
+        )
+    if spec.best:
+        raise ConfigurationError(
+            "best = True: the best attainable safety needs the step of the env, and of a third-party"
+            " env only a model is known; leave it out"
         )
     if spec.knowledge != "model":
         raise ConfigurationError(

@@ -64,9 +64,11 @@ class EvaluationSpec:
             it; 1 where nothing is.
         monitoring: where h is checked: "discrete" at control instants, "continuous" between them
             too.
+        best: compute how safe any policy can be, too; without it that is shown where its table is
+            in the cache.
 
     Raises:
-        ConfigurationError: A value is out of range.
+        ConfigurationError: A value is out of range, or parts do not go together.
     """
 
     problem: SafetyProblem | str
@@ -84,6 +86,7 @@ class EvaluationSpec:
     bounds: bool = True
     repeats: int = 1
     monitoring: str = "discrete"
+    best: bool = False
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
@@ -92,13 +95,18 @@ class EvaluationSpec:
             value = getattr(self, name)
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
-        for name in ("trust", "bounds"):
+        for name in ("trust", "bounds", "best"):
             if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ConfigurationError(
                     f"{name} = {shown(getattr(self, name))}; give True or False"
                 )
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
+        if self.best and self.monitoring == "continuous":
+            raise ConfigurationError(
+                "best = True with monitoring = 'continuous': the best attainable safety is of"
+                " control instants, and not of the time between them; leave one of the two out"
+            )
         if not isinstance(self.options or {}, Mapping):
             raise ConfigurationError(f"options = {shown(self.options)}; give a dictionary")
         filters = listed(self.filters)
@@ -117,7 +125,7 @@ class EvaluationSpec:
             ("learned", tuple(learned)),
             ("policy", str(self.policy) if isinstance(self.policy, Path) else self.policy),
             *((name, int(getattr(self, name))) for name in ("episodes", "seed", "repeats")),
-            *((name, bool(getattr(self, name))) for name in ("trust", "bounds")),
+            *((name, bool(getattr(self, name))) for name in ("trust", "bounds", "best")),
             ("confidence", float(self.confidence)),
         ):
             object.__setattr__(self, name, value)

@@ -1,0 +1,96 @@
+"""The best attainable safety in the tables of other commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.yardstick import TimesUnavoidable, times_unavoidable
+
+COMPUTED = (
+    "computed in floating point by dynamic programming of the env's own step, with the error of the"
+    " grid in both ends"
+)
+"""What the ends of the best attainable safety are."""
+
+_MOST_DIGITS = 9
+
+
+def best_text(best: AttainableSafety | None) -> str:
+    """Return the ends of the best attainable safety, in per cent; "-" where there are none."""
+    if best is None or best.lower is None or best.upper is None:
+        return "-"
+    low, high = outwards(best.lower, best.upper)
+    return f"{low} %" if low == high else f"{low}..{high} %"
+
+
+def outwards(lower: float, upper: float) -> tuple[str, str]:
+    """Return a lower and an upper bound in per cent, the one rounded down and the other up.
+
+    There is a digit after the point, or as many as tell an upper bound below 1 from it.
+    """
+    low, high = 100.0 * lower, 100.0 * upper
+    digits = next((d for d in range(1, _MOST_DIGITS) if upper == 1.0 or _up(high, d) < 100.0), 9)
+    # What is a decimal number but for its last bits stays as it is.
+    return f"{-_up(-low, digits):.{digits}f}", f"{_up(high, digits):.{digits}f}"
+
+
+def _up(percentage: float, digits: int) -> float:
+    return math.ceil(percentage * 10**digits - 1e-6) / 10**digits
+
+
+def times_text(times: TimesUnavoidable | None) -> str:
+    """Return how many times the unavoidable violations, rounded outwards."""
+    if times is None:
+        return "-"
+    low = _rounded(times.low, math.floor)
+    if times.high is None:
+        return f">= {low}"
+    high = _rounded(times.high, math.ceil)
+    return low if low == high else f"{low}..{high}"
+
+
+def times_column(best: AttainableSafety | None, rows: Sequence[EvaluationRow]) -> list[str]:
+    """Return the cells of a column with `times_text`; none at all where nothing is known."""
+    if best is None or best.lower is None:
+        return []
+    return [times_text(times_unavoidable(best, row.ci_low, row.ci_high)) for row in rows]
+
+
+def best_line(best: AttainableSafety | None) -> str:
+    """Return a line with the best attainable safety and how leaving counts; "" without it."""
+    if best is None:
+        return ""
+    if best.lower is None:
+        return "best attainable safety: withheld"
+    return f"best attainable safety: {best_text(best)}, {COMPUTED}"
+
+
+def best_notes(best: AttainableSafety | None) -> list[str]:
+    """Return what has to be known to read the best attainable safety and the times."""
+    if best is None:
+        return []
+    if best.contradiction:
+        return [f"the best attainable safety is withheld: {best.contradiction}"]
+    counted = (
+        "It counts leaving the workspace as the rates do, as the end of a safe episode, which may be"
+        " all that it takes; `safe-envs best` counts that as a violation."
+        if best.leaving == "safe"
+        else "Nothing outside the workspace is safe, so that leaving it counts as a violation."
+    )
+    return [
+        f"no policy is safer than the upper end of best, and a policy exists that is as safe as the"
+        f" lower end. {counted}",
+        "times unavoidable: violations of a filter for each one that no policy can avoid. From (1 -"
+        " the upper end of the rate)/(1 - the lower end of best), at least 1, to (1 - the lower end"
+        " of the rate)/(1 - the upper end of best); only >= where no violation is shown to be"
+        " unavoidable.",
+    ]
+
+
+def _rounded(value: float, towards: Callable[[float], int]) -> str:
+    """Return a number from 1 on as text: below 10 with a digit after the point, else without."""
+    scale = 10 if value < 10.0 else 1
+    return f"{towards(value * scale) / scale:.10g}"
