@@ -80,7 +80,10 @@ def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
         units: of states and inputs, by symbol. A state in "rad" without bounds is an angle.
         **rest: other attributes of `SafetyProblem`. By default `noise` are the parameters that
             occur in the diffusion alone, `gains` ones for every barrier's relative degree, `filter`
-            "szcbf" with noise and "hocbf" without, and `plane` the states if they are two.
+            "szcbf" with noise and "hocbf" without, and `plane` the states if they are two. A
+            `frame` declares coordinates in which the problem closes (see
+            `safe_envs.problem.frame.Frame`): tables of values then need an axis for each of these
+            in place of the states. It is checked before it is used.
 
     Raises:
         SystemDefinitionError: the parts do not fit together, or hold a mistake: see

@@ -22,6 +22,7 @@ from safe_envs.errors import (
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
+from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
@@ -64,6 +65,7 @@ class SafetyProblem:
         clf: the task as a soft goal, if it is one.
         sampling: where and how the system is excited to learn from it, as far as the defaults do
             not suit; see `sampling_domain`.
+        frame: coordinates in which the problem closes, if it has a symmetry; see `Frame`.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -91,6 +93,7 @@ class SafetyProblem:
     scene: str = ""
     clf: CLF | None = None
     sampling: SamplingDomain = field(default_factory=SamplingDomain)
+    frame: Frame | None = None
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -136,6 +139,8 @@ class SafetyProblem:
             plant.require_known("the nominal controller", law.free_symbols, known)
         if self.clf is not None:
             self.clf.require_known(model)
+        if self.frame is not None:
+            self.frame.require_known(plant)
         for i in self.inputs:
             if not -_WIDEST <= i.low < i.high <= _WIDEST:
                 raise ConfigurationError(

@@ -12,6 +12,7 @@ from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
@@ -20,6 +21,7 @@ from safe_envs.systems._common import in_disk, positive, uniforms
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
 v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
+distance, phi = sp.symbols("distance phi", real=True)
 cos_theta, sin_theta = sp.symbols("cos_theta sin_theta", real=True)
 
 _HEADING_GAIN = 2
@@ -91,6 +93,26 @@ def _patrol(r: float) -> tuple[sp.Expr, sp.Expr]:
     return on_circle * (1 + along) / 2, v / radius + turn_rate_towards(*course)
 
 
+def disk_frame(r: float) -> Frame:
+    """Return distance from the centre and heading against the radius.
+
+    A turn around the centre leaves both as they are, and the law of a step as well where the noise
+    is the same in every direction.
+
+    Args:
+        r: radius of the disk, in m.
+    """
+    return Frame(
+        coordinates=(
+            Variable(distance, 0.0, 2 * r, "m"),
+            Variable(phi, -math.pi, math.pi, "rad"),
+        ),
+        values=(sp.sqrt(x**2 + y**2), theta - sp.atan2(y, x)),
+        section=(distance, sp.Integer(0), phi),
+        periods=(0.0, 2 * math.pi),
+    )
+
+
 def disk_problem(
     name: str,
     *,
@@ -129,6 +151,7 @@ def disk_problem(
         starts={**starts, "uniform": Start(anywhere(r), UNIFORMS)},
         **SHOWN,
         sampling=SamplingDomain(region=((-r, r), (-r, r), (-math.pi, math.pi))),
+        frame=disk_frame(r),
         **rest,
     )
 

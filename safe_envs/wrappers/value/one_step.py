@@ -1,0 +1,159 @@
+"""One sub-step of the simulation as expressions, with uncertain parameters left as symbols."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.dynamics.declarations import fitting
+from safe_envs.dynamics.integrators import euler_maruyama_step, rate
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.number_text import finite_number
+
+_LARGEST_EXPANDED = 150
+"""Operations of an expression that is worth expanding to see whether it gets shorter."""
+
+Intervals = Mapping[sp.Symbol, tuple[float, float]]
+
+
+def with_intervals(
+    system: ControlAffineSDE, intervals: Mapping[str, tuple[float, float]]
+) -> tuple[ControlAffineSDE, Intervals]:
+    """Return a system whose uncertain parameters are states that do not move.
+
+    All that is derived from the system leaves their symbols as they are then.
+
+    Args:
+        system: the dynamics.
+        intervals: (low, high) of parameters, by name.
+
+    Returns:
+        The system, with the parameters as further states, and the intervals by their symbols.
+
+    Raises:
+        ConfigurationError: a parameter does not exist, an interval is none, or the system has no
+            finite value in it.
+    """
+    by_name = {p.name: p for p in system.parameters}
+    found: dict[sp.Symbol, tuple[float, float]] = {}
+    for name, given in intervals.items():
+        if name not in by_name:
+            raise ConfigurationError(
+                f"an interval names the parameter {shown(name)}, which the system lacks;"
+                f" {nearest(name, by_name)}"
+            )
+        found[sp.Symbol(name, real=True)] = _ends(system, by_name[name], given)
+    if not found:
+        return system, {}
+    symbols = {by_name[p.name]: p for p in found}
+    still = [0] * len(found)
+    uncertain = ControlAffineSDE(
+        states=(*system.states, *found),
+        inputs=system.inputs,
+        drift=[*system.drift.xreplace(symbols), *still],
+        input_matrix=system.input_matrix.xreplace(symbols).col_join(sp.zeros(len(found), system.m)),
+        diffusion=system.diffusion.xreplace(symbols).col_join(
+            sp.zeros(len(found), system.diffusion.cols)
+        ),
+        parameters={p: v for p, v in system.parameters.items() if p not in symbols},
+    )
+    vanishing = {p: 0 for p, (low, high) in found.items() if low <= 0.0 <= high}
+    if (
+        uncertain.noisy
+        and not replace(uncertain, diffusion=uncertain.diffusion.xreplace(vanishing)).noisy
+    ):
+        names = ", ".join(p.name for p in vanishing)
+        raise ConfigurationError(
+            f"the intervals of {names} hold 0, where the noise vanishes and the simulation takes"
+            " steps of Runge and Kutta in place of Euler's; begin them above 0"
+        )
+    return uncertain, found
+
+
+def _ends(system: ControlAffineSDE, parameter: sp.Symbol, given: Any) -> tuple[float, float]:
+    name = parameter.name
+    try:
+        low, high = given
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"interval of {name} = {shown(given)}; give (low, high)"
+        ) from error
+    low, high = finite_number(f"low end of {name}", low), finite_number(f"high end of {name}", high)
+    if low > high:
+        raise ConfigurationError(f"interval of {name} = ({low:g}, {high:g}); its low end is higher")
+    for value in {low, high, 0.0 if low < 0.0 < high else low}:
+        fitting(parameter, value)
+        rate(system.with_parameters(**{name: value}))  # Raises where there is a division by 0.
+    return low, high
+
+
+def sub_step(
+    system: ControlAffineSDE, h: float
+) -> tuple[tuple[sp.Symbol, ...], tuple[sp.Expr, ...]]:
+    """Derive the state after one sub-step, as `Integrator` computes it.
+
+    Args:
+        system: the dynamics.
+        h: length of the sub-step, in s.
+
+    Returns:
+        Symbols of the standard normals that it takes, one for each channel that is not zero, and
+        the state after it as expressions of states, inputs and normals.
+    """
+    if system.noisy:
+        draws, moved = euler_maruyama_step(system, h)
+        return draws, tuple(map(tidied, moved))
+    x, f = list(system.states), list(rate(system))
+    half, whole, sixth = (sp.Float(value, 17) for value in (0.5 * h, h, h / 6.0))
+
+    def rate_at(length: sp.Float, slope: Iterable[Any]) -> list[Any]:
+        at = {s: s + length * k for s, k in zip(x, slope, strict=True)}
+        return [e.xreplace(at) for e in f]
+
+    k1 = f
+    k2 = rate_at(half, k1)
+    k3 = rate_at(half, k2)
+    k4 = rate_at(whole, k3)
+    return (), tuple(
+        tidied(s + sixth * (b1 + 2 * (b2 + b3) + b4))
+        for s, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True)
+    )
+
+
+def tidied(expression: Any) -> Any:
+    """Return an expression with fewer occurrences of its symbols, if that is easily done.
+
+    The fewer times a symbol occurs, the narrower is what interval arithmetic makes of it.
+    """
+    best: Any = expression
+    if sp.count_ops(expression) <= _LARGEST_EXPANDED:
+        expanded = sp.expand(expression, trig=False, power_base=False, power_exp=False, log=False)
+        # Ones that rounding alone keeps apart from zero do not come up: terms are of one sign.
+        best = min(expression, expanded, key=occurrences)
+    for symbol in sorted(best.free_symbols, key=sp.default_sort_key):
+        best = min(best, _collected(best, symbol), key=occurrences)
+    return best
+
+
+def occurrences(expression: Any) -> int:
+    """Return how many times symbols occur in an expression."""
+    if not expression.args:
+        return int(expression.is_Symbol)
+    if isinstance(expression, sp.Pow) and expression.exp.is_number:
+        return occurrences(expression.base)
+    return sum(occurrences(part) for part in expression.args)
+
+
+def _collected(expression: Any, symbol: sp.Symbol) -> Any:
+    """Take a symbol out of the terms of a sum that are linear in it."""
+    terms: Sequence[Any] = sp.Add.make_args(expression)
+    linear: dict[Any, Any] = {t: t.coeff(symbol, 1) for t in terms}
+    factors = [c for t, c in linear.items() if c != 0 and not c.has(symbol) and t == c * symbol]
+    if len(factors) < 2:
+        return expression
+    rest = [t for t, c in linear.items() if not (c != 0 and not c.has(symbol) and t == c * symbol)]
+    return sp.Add(*rest, sp.Mul(symbol, sp.Add(*factors)))

@@ -1,0 +1,169 @@
+"""A problem in as few coordinates as decide what happens, and a sub-step of the simulation in them.
+
+Three things make states superfluous. A state that moves by itself, without input and noise, from a
+known start is a function of time. A symmetry of the problem, declared as its frame, leaves fewer
+coordinates; it is checked on the step. An angle that occurs only through its sine and cosine is
+periodic, so that one turn of it is enough.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import Components, compile_function
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.chain import Coordinate, Derivation
+from safe_envs.wrappers.value.known_states import known_states
+from safe_envs.wrappers.value.one_step import Intervals, sub_step, with_intervals
+
+MOST_COORDINATES = 4
+"""Axes of a grid that fits into memory."""
+
+_NONE: Mapping[str, tuple[float, float]] = MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class ReducedProblem:
+    """The Markov chain of a simulation, and its sets, in few coordinates.
+
+    Attributes:
+        problem: that it was derived from.
+        coordinates: at most four.
+        inputs: symbols.
+        noise: symbols of the standard normals of one sub-step.
+        intervals: (low, high) of the uncertain parameters, by the symbols that they have here.
+        known: value of each known state (and of `TIME`, where the goal depends on it) at each
+            instant of a sub-step, shape (steps substeps + 1,).
+        step: each coordinate one sub-step later, of coordinates, inputs, noise, known symbols and
+            uncertain parameters. A periodic coordinate may leave its range by it.
+        barriers: of coordinates and known symbols.
+        goal: likewise, reached where it is >= 0; None without one.
+        outside: likewise, positive where the workspace is left.
+        steps: control periods of an episode.
+        substeps: of a control period.
+        box: (low, high) of each input.
+        note: why a declared frame is not used, if so.
+    """
+
+    problem: SafetyProblem
+    coordinates: tuple[Coordinate, ...]
+    inputs: tuple[sp.Symbol, ...]
+    noise: tuple[sp.Symbol, ...]
+    intervals: Intervals
+    known: Mapping[sp.Symbol, np.ndarray]
+    step: tuple[sp.Expr, ...]
+    barriers: tuple[sp.Expr, ...]
+    goal: sp.Expr | None
+    outside: sp.Expr
+    steps: int
+    substeps: int
+    box: tuple[tuple[float, float], ...]
+    note: str = ""
+
+    @property
+    def symbols(self) -> tuple[sp.Symbol, ...]:
+        """The symbols of the coordinates."""
+        return tuple(c.symbol for c in self.coordinates)
+
+    def of_states(self, x: Components) -> Components:
+        """Return the coordinates of states.
+
+        Args:
+            x: a float or an array for each state of the plant.
+
+        Returns:
+            A float or an array for each coordinate; periodic ones may be outside their range.
+        """
+        flavour = "arrays" if any(isinstance(v, np.ndarray) for v in x) else "floats"
+        expressions = tuple(c.expression for c in self.coordinates)
+        return compile_function(self.problem.plant.states, expressions, flavour)(*x)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256, in hexadecimal digits, of all that determines the chain and its sets."""
+        known = {
+            sp.srepr(s): hashlib.sha256(v.astype("<f8").tobytes()).hexdigest()
+            for s, v in self.known.items()
+        }
+        described = (
+            [(sp.srepr(c.symbol), c.low, c.high, c.period) for c in self.coordinates],
+            [sp.srepr(c.expression) for c in self.coordinates],
+            [sp.srepr(s) for s in (*self.problem.plant.states, *self.inputs, *self.noise)],
+            sorted((sp.srepr(s), *ends) for s, ends in self.intervals.items()),
+            sorted(known.items()),
+            [[sp.srepr(e) for e in part] for part in (self.step, self.barriers)],
+            [sp.srepr(e) for e in (sp.sympify(self.goal), self.outside)],
+            (self.steps, self.substeps, self.box),
+        )
+        return hashlib.sha256(repr(described).encode()).hexdigest()
+
+
+def reduced(
+    problem: SafetyProblem,
+    knowledge: str = "plant",
+    intervals: Mapping[str, tuple[float, float]] = _NONE,
+) -> ReducedProblem:
+    """Reduce a problem to the coordinates that decide what happens.
+
+    Args:
+        problem: with the start, noise and bounds in use.
+        knowledge: whose step is taken, that of the "plant" or of the "model".
+        intervals: (low, high) of parameters that are uncertain, by name. They stay symbols.
+
+    Returns:
+        The chain of a simulation in these coordinates.
+
+    Raises:
+        ConfigurationError: there are too many coordinates for a grid, or one that has neither
+            bounds nor a period; or an argument is not allowed.
+    """
+    worlds = {"plant": problem.plant, "model": problem.model}
+    if knowledge not in worlds:
+        raise ConfigurationError(f"knowledge = {shown(knowledge)}; {nearest(knowledge, worlds)}")
+    system, uncertain = with_intervals(worlds[knowledge], intervals)
+    noise, moved = sub_step(system, problem.dt / problem.substeps)
+    known, constant = known_states(problem, system, moved)
+    foreknown = frozenset((*known, *constant))
+    derivation, note = Derivation(problem, system, uncertain, noise, moved, foreknown), ""
+    chain = derivation.in_states()
+    if problem.frame is not None:
+        framed, note = derivation.in_frame(problem.frame)
+        chain = framed or chain
+    _require_few(problem, chain.coordinates, note)
+    chain = chain.with_numbers(constant).with_periods()
+    used = set().union(*(e.free_symbols for e in chain.expressions))
+    return ReducedProblem(
+        problem=problem,
+        coordinates=chain.coordinates,
+        inputs=system.inputs,
+        noise=noise,
+        intervals=uncertain,
+        known={s: v for s, v in known.items() if s in used},
+        step=chain.step,
+        barriers=chain.barriers,
+        goal=chain.goal,
+        outside=chain.outside,
+        steps=problem.steps,
+        substeps=problem.substeps,
+        box=problem.box,
+        note=note,
+    )
+
+
+def _require_few(problem: SafetyProblem, coordinates: Sequence[Coordinate], note: str) -> None:
+    if len(coordinates) > MOST_COORDINATES:
+        names = ", ".join(c.symbol.name for c in coordinates)
+        raise ConfigurationError(
+            f"{problem.name} has {len(coordinates)} coordinates ({names}); a grid takes at most"
+            f" {MOST_COORDINATES}. Fewer are left if states that neither input nor noise reaches"
+            " start at known values (give such a start), or in the coordinates of a symmetry"
+            f" (declare a frame){f'; {note}' if note else ''}"
+        )
