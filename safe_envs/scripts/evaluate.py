@@ -30,7 +30,7 @@ def evaluate(
     confidence: of.Confidence = 0.95,
     refine: of.Refine = False,
     monitoring: of.Monitoring = "discrete",
-    best: of.Best = False,
+    best: of.Best = None,
     rare: of.Rare = False,
     particles: of.Particles = None,
     repetitions: of.Repetitions = None,

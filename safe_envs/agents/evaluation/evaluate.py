@@ -47,7 +47,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     monitoring: str = "discrete",
-    best: bool = False,
+    best: bool | None = None,
     jobs: int | None = None,
     progress: Progress | None = None,
     record: bool = False,
@@ -93,7 +93,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned.
         monitoring: where h is checked, "discrete" or "continuous".
-        best: compute how safe any policy can be, too: see `safe_envs.agents.evaluation.yardstick`.
+        best: whether to compute how safe any policy can be, see
+            `safe_envs.agents.evaluation.yardstick`; None to tell it if its table is in the cache.
         jobs: number of processes, or of threads of the compiled engine; the result is the same.
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
@@ -145,7 +146,7 @@ class _Runner:
     def __init__(self, resolved: ResolvedEvaluation, settings: RunSettings) -> None:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
         parts = len(resolved.learning.missing()) + sum(map(resolved.repeats, resolved.names))
-        parts += resolved.prepares + resolved.spec.best
+        parts += resolved.prepares + bool(resolved.spec.best)
         self._work = WorkParts(settings.progress, parts)
         identifications = sum(map(resolved.repeats, resolved.names))
         self._keeps = settings.keeps(self._spec.episodes * identifications)
@@ -203,7 +204,8 @@ class _Runner:
         resolved = self._resolved
         if self._spec.best:
             return best_for(resolved.problem, self._work.part())
-        if resolved.target.filter_spec is not None or self._spec.monitoring == "continuous":
+        third_party = resolved.target.filter_spec is not None
+        if self._spec.best is False or third_party or self._spec.monitoring == "continuous":
             return None
         return best_at_hand(resolved.problem)
 

@@ -220,8 +220,8 @@ def _require_third_party(spec: EvaluationSpec) -> None:
         )
     if spec.best:
         raise ConfigurationError(
-            "best = True: the best attainable safety needs the step of the env, and of a third-party"
-            " env only a model is known; leave it out"
+            "best = True: the best attainable safety needs the step of the env, and of a"
+            " third-party env only a model is known; leave it out"
         )
     if spec.knowledge != "model":
         raise ConfigurationError(

@@ -64,8 +64,8 @@ class EvaluationSpec:
             it; 1 where nothing is.
         monitoring: where h is checked: "discrete" at control instants, "continuous" between them
             too.
-        best: compute how safe any policy can be, too; without it that is shown where its table is
-            in the cache.
+        best: whether to compute how safe any policy can be; None to tell that only where the table
+            for it is in the cache.
 
     Raises:
         ConfigurationError: A value is out of range, or parts do not go together.
@@ -86,7 +86,7 @@ class EvaluationSpec:
     bounds: bool = True
     repeats: int = 1
     monitoring: str = "discrete"
-    best: bool = False
+    best: bool | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
@@ -95,13 +95,15 @@ class EvaluationSpec:
             value = getattr(self, name)
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
-        for name in ("trust", "bounds", "best"):
+        for name in ("trust", "bounds"):
             if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ConfigurationError(
                     f"{name} = {shown(getattr(self, name))}; give True or False"
                 )
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
+        if not isinstance(self.best, bool | None):
+            raise ConfigurationError(f"best = {shown(self.best)}; give True, False or None")
         if self.best and self.monitoring == "continuous":
             raise ConfigurationError(
                 "best = True with monitoring = 'continuous': the best attainable safety is of"
@@ -125,7 +127,7 @@ class EvaluationSpec:
             ("learned", tuple(learned)),
             ("policy", str(self.policy) if isinstance(self.policy, Path) else self.policy),
             *((name, int(getattr(self, name))) for name in ("episodes", "seed", "repeats")),
-            *((name, bool(getattr(self, name))) for name in ("trust", "bounds", "best")),
+            *((name, bool(getattr(self, name))) for name in ("trust", "bounds")),
             ("confidence", float(self.confidence)),
         ):
             object.__setattr__(self, name, value)

@@ -64,10 +64,27 @@ def times_unavoidable(
     Returns:
         The interval; None where it would mean nothing.
     """
-    if best is None or best.lower is None or best.upper is None or best.lower >= 1.0:
+    return None if best is None else times_between(best.lower, best.upper, ci_low, ci_high)
+
+
+def times_between(
+    lower: float | None, upper: float | None, ci_low: float, ci_high: float
+) -> TimesUnavoidable | None:
+    """Return how many times the unavoidable violations a filter has; see the module.
+
+    Args:
+        lower: lower end of the best attainable safety, if it is known.
+        upper: its upper end.
+        ci_low: lower end of the interval of the filter's safety rate.
+        ci_high: upper end.
+
+    Returns:
+        The interval; None where it would mean nothing.
+    """
+    if lower is None or upper is None or lower >= 1.0:
         return None
-    low = max(1.0, (1.0 - ci_high) / (1.0 - best.lower))
-    high = (1.0 - ci_low) / (1.0 - best.upper) if best.upper < 1.0 else None
+    low = max(1.0, (1.0 - ci_high) / (1.0 - lower))
+    high = (1.0 - ci_low) / (1.0 - upper) if upper < 1.0 else None
     return TimesUnavoidable(low, None if high is None else max(low, high))
 
 
@@ -110,7 +127,9 @@ def best_for(problem: SafetyProblem, progress: Progress | None = None) -> Attain
     Raises:
         ConfigurationError: There is no table of the problem.
     """
-    return attainable_safety(problem, evaluation_settings(problem), episodes=0, progress=progress)[0]
+    return attainable_safety(problem, evaluation_settings(problem), episodes=0, progress=progress)[
+        0
+    ]
 
 
 def best_at_hand(problem: SafetyProblem) -> AttainableSafety | None:

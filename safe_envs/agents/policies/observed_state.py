@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -29,9 +30,9 @@ class ObservedState:
         ConfigurationError: The observation does not hold one of the states that are needed.
     """
 
-    def __init__(self, problem: SafetyProblem, needed: Collection[sp.Symbol]) -> None:
+    def __init__(self, problem: SafetyProblem, needed: Collection[sp.Basic]) -> None:
         columns = tuple(sp.Dummy(feature.name, real=True) for feature in problem.features)
-        given = [
+        given: list[tuple[Any, Any]] = [
             (problem.plant.numeric(feature.expression), column)
             for feature, column in zip(problem.features, columns, strict=True)
             if not feature.expression.has(TIME)
@@ -53,16 +54,14 @@ class ObservedState:
         return tuple(np.broadcast_to(value, len(observations)) for value in values)
 
 
-def _solved(
-    problem: SafetyProblem, given: list[tuple[sp.Expr, sp.Symbol]]
-) -> dict[sp.Symbol, sp.Expr]:
+def _solved(problem: SafetyProblem, given: list[tuple[Any, Any]]) -> dict[Any, Any]:
     """Return the states that features determine, as expressions of the features' values.
 
     Args:
         problem: whose states they are.
         given: expressions of the states, with the symbols of their values.
     """
-    found: dict[sp.Symbol, sp.Expr] = {s: value for s, value in given if s.is_Symbol}
+    found: dict[Any, Any] = {s: value for s, value in given if s.is_Symbol}
     of = dict(given)
     for s in problem.plant.states:
         if s not in found and {sp.cos(s), sp.sin(s)} <= of.keys() and _turns(problem, s):

@@ -96,8 +96,8 @@ def _require_third_party(name: str, env_id: str, filter_spec: FilterSpec) -> Non
     """Raise ConfigurationError for the name of a policy that a third-party env cannot have."""
     if name == "best":
         raise ConfigurationError(
-            f"the policy best needs the step of the env, and {env_id} is a third-party env, of which"
-            " only a model is known; give --policy nominal, zero, random or a .zip"
+            f"the policy best needs the step of the env, and {env_id} is a third-party env, of"
+            " which only a model is known; give --policy nominal, zero, random or a .zip"
         )
     if name == "nominal" and filter_spec.nominal is None:
         raise ConfigurationError(

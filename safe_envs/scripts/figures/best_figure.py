@@ -1,4 +1,4 @@
-"""The picture of the best attainable safety: the lower envelope over the coordinates of its grid."""
+"""The picture of the best attainable safety: the lower envelope over its coordinates."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ def draw(answer: BestAnswer, table: ValueTable, path: Path) -> None:
             for name, axis, i in zip(names[2:], axes[2:], middle, strict=True)
         ]
         panel.set_title(
-            "Best attainable safety at the start of an episode" + f"; {', '.join(held)}" * bool(held)
+            "Best attainable safety at the start of an episode"
+            + f"; {', '.join(held)}" * bool(held)
         )
         figure.legend(handles=handles, loc="outside lower center", ncols=3)
         said = f"from the starts {best_text(found)}" if found.lower is not None else "withheld"

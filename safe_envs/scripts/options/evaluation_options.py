@@ -85,13 +85,14 @@ Refine = Annotated[
     ),
 ]
 Best = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--best",
+        "--best/--no-best",
         help=(
             "Compute the best attainable safety, and how many times the unavoidable violations each"
-            " filter has. Without it they are shown if a table is in the cache."
+            " filter has. By default they are shown if a table is in the cache."
         ),
+        show_default=False,
     ),
 ]
 Monitoring = Annotated[

@@ -20,16 +20,33 @@ _MOST_DIGITS = 9
 
 def best_text(best: AttainableSafety | None) -> str:
     """Return the ends of the best attainable safety, in per cent; "-" where there are none."""
-    if best is None or best.lower is None or best.upper is None:
+    return "-" if best is None else ends_text(best.lower, best.upper)
+
+
+def ends_text(lower: float | None, upper: float | None) -> str:
+    """Return two ends in per cent; "-" where there are none.
+
+    Args:
+        lower: the lower one.
+        upper: the upper one.
+    """
+    if lower is None or upper is None:
         return "-"
-    low, high = outwards(best.lower, best.upper)
+    low, high = outwards(lower, upper)
     return f"{low} %" if low == high else f"{low}..{high} %"
 
 
 def outwards(lower: float, upper: float) -> tuple[str, str]:
-    """Return a lower and an upper bound in per cent, the one rounded down and the other up.
+    """Return bounds in per cent, the lower one rounded down and the upper one rounded up.
 
     There is a digit after the point, or as many as tell an upper bound below 1 from it.
+
+    Args:
+        lower: the lower one.
+        upper: the upper one.
+
+    Returns:
+        Two texts.
     """
     low, high = 100.0 * lower, 100.0 * upper
     digits = next((d for d in range(1, _MOST_DIGITS) if upper == 1.0 or _up(high, d) < 100.0), 9)
@@ -53,7 +70,12 @@ def times_text(times: TimesUnavoidable | None) -> str:
 
 
 def times_column(best: AttainableSafety | None, rows: Sequence[EvaluationRow]) -> list[str]:
-    """Return the cells of a column with `times_text`; none at all where nothing is known."""
+    """Return the cells of a column with `times_text`; none at all where nothing is known.
+
+    Args:
+        best: attainable safety, if it is known.
+        rows: of an evaluation.
+    """
     if best is None or best.lower is None:
         return []
     return [times_text(times_unavoidable(best, row.ci_low, row.ci_high)) for row in rows]
@@ -65,7 +87,7 @@ def best_line(best: AttainableSafety | None) -> str:
         return ""
     if best.lower is None:
         return "best attainable safety: withheld"
-    return f"best attainable safety: {best_text(best)}, {COMPUTED}"
+    return f"best attainable safety: {best_text(best)}"
 
 
 def best_notes(best: AttainableSafety | None) -> list[str]:
@@ -75,16 +97,16 @@ def best_notes(best: AttainableSafety | None) -> list[str]:
     if best.contradiction:
         return [f"the best attainable safety is withheld: {best.contradiction}"]
     counted = (
-        "It counts leaving the workspace as the rates do, as the end of a safe episode, which may be"
-        " all that it takes; `safe-envs best` counts that as a violation."
+        "It counts leaving the workspace as the rates do, as the end of a safe episode, which may"
+        " be all that it takes; `safe-envs best` counts that as a violation."
         if best.leaving == "safe"
         else "Nothing outside the workspace is safe, so that leaving it counts as a violation."
     )
     return [
-        f"no policy is safer than the upper end of best, and a policy exists that is as safe as the"
-        f" lower end. {counted}",
+        "no policy is safer than the upper end of the best attainable safety, and some policy is as"
+        f" safe as its lower end: {COMPUTED}, but not proved. {counted}",
         "times unavoidable: violations of a filter for each one that no policy can avoid. From (1 -"
-        " the upper end of the rate)/(1 - the lower end of best), at least 1, to (1 - the lower end"
+        " the upper end of the rate)/(1 - the lower end of the best), at least 1, to (1 - the lower end"
         " of the rate)/(1 - the upper end of best); only >= where no violation is shown to be"
         " unavoidable.",
     ]
