@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
@@ -15,9 +16,12 @@ from safe_envs.errors import ConfigurationError
 _HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
 """What the operating system says of a lock that somebody else holds."""
 
+_PAUSE = 0.2
+"""Seconds between two attempts to get a lock."""
+
 
 @contextmanager
-def locked(path: Path, taken: str) -> Iterator[None]:
+def locked(path: Path, taken: str, wait: Callable[[], object] | None = None) -> Iterator[None]:
     """Hold the lock of a file, which is made for it and removed with it.
 
     The operating system releases it when the process ends, however that ends. On a file system
@@ -26,15 +30,25 @@ def locked(path: Path, taken: str) -> Iterator[None]:
     Args:
         path: of the file.
         taken: what to say if another process holds the lock.
+        wait: given, it is called once if another process holds the lock, which is then waited for.
 
     Returns:
         A context manager that releases the lock.
 
     Raises:
-        ConfigurationError: another process holds the lock, or the file cannot be made.
+        ConfigurationError: another process holds the lock and `wait` is not given, or the file
+            cannot be made.
     """
     with writing(path):
-        file = _opened(path, taken)
+        file = _opened(path)
+    if file is None:
+        if wait is None:
+            raise ConfigurationError(taken)
+        wait()
+    while file is None:
+        time.sleep(_PAUSE)
+        with writing(path):
+            file = _opened(path)
     try:
         yield
     finally:
@@ -44,7 +58,8 @@ def locked(path: Path, taken: str) -> Iterator[None]:
         file.close()
 
 
-def _opened(path: Path, taken: str) -> IO[bytes]:
+def _opened(path: Path) -> IO[bytes] | None:
+    """Return the locked file, or None if another process holds its lock."""
     while True:
         file = path.open("ab")
         try:
@@ -56,7 +71,7 @@ def _opened(path: Path, taken: str) -> IO[bytes]:
             if error.errno not in _HELD:
                 return file
             file.close()
-            raise ConfigurationError(taken) from error
+            return None
         file.close()
 
 

@@ -52,3 +52,20 @@ def test_a_folder_that_takes_no_files_is_named(tmp_path):
         locked(tmp_path / "file" / ".lock", "taken"),
     ):
         pass
+
+
+def test_who_waits_gets_the_lock_in_the_end(tmp_path, monkeypatch):
+    path, events = tmp_path / ".lock", []
+    holder = locked(path, "taken")
+    holder.__enter__()
+
+    def released(_):
+        events.append("slept")
+        holder.__exit__(None, None, None)
+
+    monkeypatch.setattr(file_locks.time, "sleep", released)
+    with locked(path, "taken", lambda: events.append("told")):
+        assert events == ["told", "slept"]
+        with pytest.raises(ConfigurationError, match="taken"), locked(path, "taken"):
+            pass
+    assert not path.exists()

@@ -17,10 +17,11 @@ from typing import Any
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.compiled import plain_natives
-from safe_envs.compiled.cache import DIGITS, cache_folder, forget_old_programs
+from safe_envs.compiled.cache import DIGITS, FOLDER, forget_old_programs
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.linker import linked
 from safe_envs.errors import ConfigurationError, NotCompilableError, shortened
+from safe_envs.user_cache import cache_folder
 
 ADVICE = "install it with pip install 'safe-envs[fast]', or use the engine 'numpy'"
 
@@ -85,7 +86,7 @@ def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     natives = _natives()
     stamp = f"{inspect.getsource(natives)}\n{text}"
     digest = hashlib.sha256(stamp.encode()).hexdigest()[:DIGITS]
-    folder = cache_folder()
+    folder = cache_folder(FOLDER)
     try:
         if folder is not None:
             program = _KeptProgram(folder / digest, text, title)

@@ -11,12 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from safe_envs.compiled import cache, program
-from safe_envs.compiled.cache import VARIABLE, cache_folder, forget_old_programs
+from safe_envs.compiled import program
+from safe_envs.compiled.cache import forget_old_programs
 from safe_envs.compiled.engine import compiled_or_none, periods_of_a_part, require_engine
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError, SystemDefinitionError
+from safe_envs.user_cache import VARIABLE, cache_folder
 from tests.compiled import kernels, other_kernels
 
 HALF = "def reward_of(values):\n    return 0.5 * values[0]\n"
@@ -100,18 +101,18 @@ def test_a_damaged_program_is_compiled_again(folder: Path) -> None:
 def test_a_folder_that_others_write_to_is_not_used(folder: Path) -> None:
     folder.mkdir(parents=True)
     folder.chmod(0o777)
-    assert cache_folder() is None
+    assert cache_folder("compiled") is None
     assert small().compiled()["total_reward"](VALUES) == 7.0
     assert not list(folder.iterdir())
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs rights of files as on Unix")
 def test_a_folder_that_others_can_replace_is_not_used(folder: Path) -> None:
-    assert cache_folder() == folder
+    assert cache_folder("compiled") == folder
     folder.parent.chmod(0o777)
-    assert cache_folder() is None
+    assert cache_folder("compiled") is None
     folder.parent.chmod(0o1777)
-    assert cache_folder() == folder
+    assert cache_folder("compiled") == folder
 
 
 def test_a_folder_that_nothing_can_be_written_to_is_not_needed(
@@ -155,18 +156,6 @@ def test_a_numba_that_does_not_work_leaves_the_work_to_numpy(
     monkeypatch.setattr(program, "is_available", lambda: True)
     with pytest.raises(NotCompilableError, match="cannot be imported"):
         small().compiled()
-
-
-def test_places_of_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(VARIABLE, "")
-    assert cache_folder() is None
-    (tmp_path / "file").touch()
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "file"))
-    assert cache_folder() is None
-    monkeypatch.delenv(VARIABLE)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cache.sys, "platform", "linux")
-    assert cache_folder() == tmp_path / "safe-envs" / "compiled"
 
 
 def test_the_programs_used_last_remain(tmp_path: Path) -> None:

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -15,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.atomic_io import write_atomically
-from safe_envs.bounded_reading import MOST_BYTES, MOST_BYTES_OF_TEXT, open_archive, open_regular
-from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs import array_files
+from safe_envs.array_files import ArrayFile, reading, write_arrays
+from safe_envs.errors import shortened, shown
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.values import LearnedFileError, require_text
 
@@ -25,31 +20,7 @@ DATA = "transitions"
 """Kind of a file that holds data; others hold models or policies."""
 
 _FORMAT = 2
-_HEADER = "header"
 _PACKAGES = ("safe-envs", "numpy", "sympy", "torch")
-
-
-# What zipfile, NumPy, json and Python raise on damaged files, and on JSON of another shape.
-_DAMAGED = (
-    EOFError,
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    RecursionError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
-_MOST_PARTS = 1000
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 
 
 @dataclass(frozen=True)
@@ -82,14 +53,7 @@ def checksum(
         details: JSON-able.
         arrays: numbers by name.
     """
-    digest = hashlib.sha256(
-        json.dumps([kind, asdict(signature), details], sort_keys=True, default=_plain).encode()
-    )
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        digest.update(array.reshape(-1).data)
-    return digest.hexdigest()
+    return array_files.checksum([kind, asdict(signature), details], arrays)
 
 
 def save(
@@ -111,12 +75,6 @@ def save(
     Raises:
         ConfigurationError: it cannot be written there, or would be too large to be read.
     """
-    size = sum(np.asarray(array).nbytes for array in arrays.values())
-    if size > MOST_BYTES:
-        raise ConfigurationError(
-            f"{path} would take {size / 1e6:.3g} MB; at most {MOST_BYTES / 1e6:g} MB are read: save"
-            " less in a file"
-        )
     header = {
         "format": _FORMAT,
         "kind": kind,
@@ -125,23 +83,7 @@ def save(
         "versions": {package: version(package) for package in _PACKAGES},
         "sha256": checksum(kind, signature, details, arrays),
     }
-    encoded = np.frombuffer(
-        json.dumps(header, allow_nan=False, default=_plain).encode(), dtype=np.uint8
-    )
-
-    def write(part: Path) -> None:
-        with part.open("wb") as stream:
-            plain = {name: np.asarray(array) for name, array in arrays.items()}
-            np.savez(stream, allow_pickle=False, header=encoded, **plain)
-
-    write_atomically(path, write)
-
-
-def _plain(value: Any) -> Any:
-    """Return a number of NumPy, which settings and seeds may be, as one of Python."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{value!r} is no JSON")
+    write_arrays(path, header, arrays)
 
 
 def load(path: Path, writer: str = "safe-envs identify") -> Content:
@@ -155,26 +97,8 @@ def load(path: Path, writer: str = "safe-envs identify") -> Content:
         LearnedFileError: it is missing, a folder, no such file, truncated or altered.
     """
     name = shortened(path)
-    try:
-        with open_regular(path) as stream, open_archive(stream) as archive:
-            content = _content(name, archive, writer)
-    except FileNotFoundError as error:
-        raise LearnedFileError(f"{name} does not exist; `{writer}` writes such files") from error
-    except IsADirectoryError as error:
-        raise LearnedFileError(
-            f"{name} is a folder; name a file in it that `{writer}` wrote"
-        ) from error
-    except OSError as error:
-        raise LearnedFileError(
-            f"{name} cannot be read: {error.strerror}; name a file that `{writer}` wrote"
-        ) from error
-    except _DAMAGED as error:
-        if isinstance(error, LearnedFileError):
-            raise
-        raise LearnedFileError(
-            f"{name} is no file of `{writer}`, or it is truncated or altered"
-            f" ({type(error).__name__})"
-        ) from error
+    with reading(path, writer, LearnedFileError) as file:
+        content = _content(name, file, writer)
     if content.sha256 != checksum(content.kind, content.signature, content.details, content.arrays):
         raise LearnedFileError(
             f"{name} was altered: its content does not match its checksum. Run `{writer}` again"
@@ -182,20 +106,9 @@ def load(path: Path, writer: str = "safe-envs identify") -> Content:
     return content
 
 
-def _content(name: str, archive: zipfile.ZipFile, writer: str) -> Content:
-    """Read an archive; of what is no file of this project, nothing but the header."""
-    parts = {part.filename.removesuffix(".npy"): part for part in archive.infolist()}
-    if len(parts) != len(archive.infolist()) or len(parts) > _MOST_PARTS:
-        raise ValueError("too many parts, or two of one name")
-    # Ours are as large in the file as in memory.
-    if any(
-        part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size
-        for part in parts.values()
-    ):
-        raise ValueError("a part is compressed")
-    if parts[_HEADER].file_size > MOST_BYTES_OF_TEXT:
-        raise ValueError("the header is too large")
-    header = json.loads(_array(archive, parts.pop(_HEADER)).tobytes())
+def _content(name: str, file: ArrayFile, writer: str) -> Content:
+    """Read a file; of what is no file of this project, nothing but the header."""
+    header = file.header
     if header["format"] != _FORMAT:
         raise LearnedFileError(
             f"{name} has the format {shown(header['format'])}; this version reads {_FORMAT}. Run"
@@ -206,23 +119,4 @@ def _content(name: str, archive: zipfile.ZipFile, writer: str) -> Content:
         Signature.from_json(header["signature"]),
         dict(header["details"]),
     )
-    return Content(
-        kind,
-        signature,
-        details,
-        {key: _array(archive, part) for key, part in parts.items()},
-        require_text(header["sha256"]),
-    )
-
-
-def _array(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array of numbers, without taking more memory than the part has bytes."""
-    with archive.open(part) as stream:
-        shape, _, kind = _HEADERS[np.lib.format.read_magic(stream)](stream)
-        if (
-            kind.kind not in "biuf"
-            or math.prod(shape) * kind.itemsize != part.file_size - stream.tell()
-        ):
-            raise ValueError("it holds no numbers, or others than its header says")
-        stream.seek(0)
-        return np.lib.format.read_array(stream, allow_pickle=False)
+    return Content(kind, signature, details, file.arrays(), require_text(header["sha256"]))

@@ -1,0 +1,144 @@
+"""The functions of `bellman_kernel` for arrays, without Numba.
+
+The arguments are those of the kernels. They give the same numbers, but for the order of sums.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+
+from safe_envs.wrappers.value.bellman_kernel import AXES
+
+_AT_ONCE = 200_000
+
+
+def expected_values(first: int, last: int, *arguments: Any) -> None:
+    """Bound the expected value of states under inputs from below; see `bellman_kernel`."""
+    *given, rows, tables, ends, counts, places, edges, scales, _, found = arguments
+    images, effects, inputs, weights = given
+    grid = (counts, edges, scales)
+    for part in _parts(first, last, images):
+        own = inputs[part] if len(inputs) > 1 else inputs
+        for u in range(inputs.shape[1]):
+            v = u if images.shape[1] > 1 else 0
+            found[part, u] = _expected(
+                images[part, v], effects[part], own[:, u], weights, rows[part], tables, ends, grid
+            )
+
+
+def sweep_lower(first: int, last: int, turn: int, *arguments: Any) -> None:
+    """Maximise the bound of the expected value over all inputs; see `bellman_kernel`."""
+    images, effects, inputs, weights, tables, ends, _, counts, _, edges, scales, *rest = arguments
+    _, best, found = rest
+    grid = (counts, edges, scales)
+    del turn
+    for part in _parts(first, last, images):
+        rows = part[best[part] >= 0]
+        largest = np.full(len(rows), -np.inf)
+        none = np.zeros(len(rows), dtype=np.int64)
+        for u in range(inputs.shape[1]):
+            v = u if images.shape[1] > 1 else 0
+            value = _expected(
+                images[rows, v], effects[rows], inputs[:, u], weights, none, tables, ends, grid
+            )
+            better = value > largest
+            best[rows[better]], largest[better] = u, value[better]
+        found[rows] = largest
+
+
+def sweep_upper(first: int, last: int, *arguments: Any) -> None:
+    """Maximise an upper bound of the expected value over all inputs; see `bellman_kernel`."""
+    images, effects, inputs, weights, tables, ends, counts, _, edges, scales, *rest = arguments
+    _, known, found = rest
+    grid = (counts, edges, scales)
+    for part in _parts(first, last, images):
+        none = np.zeros(len(part), dtype=np.int64)
+        for u in range(inputs.shape[1]):
+            v = u if images.shape[1] > 1 else 0
+            value = -_expected(
+                images[part, v], effects[part], inputs[:, u], weights, none, tables, ends, grid
+            )
+            known[part, u] = np.minimum(value, known[part, u])
+        found[part] = known[part].max(axis=1)
+
+
+def _parts(first: int, last: int, images: np.ndarray) -> list[np.ndarray]:
+    size = max(1, _AT_ONCE // (images.shape[2] * images.shape[3]))
+    return [np.arange(a, min(a + size, last)) for a in range(first, last, size)]
+
+
+def _expected(
+    images: np.ndarray,
+    effects: np.ndarray,
+    inputs: np.ndarray,
+    weights: np.ndarray,
+    rows: np.ndarray,
+    tables: np.ndarray,
+    ends: tuple[float, float],
+    grid: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Return bounds (B,) for images (B, R, W, n, 2) and inputs (B or 1, m, 2)."""
+    products = effects[..., :, None] * inputs[:, None, None, :, None, :]
+    low = images[..., 0] + products.min(axis=(-1, -2)).sum(axis=-1)[:, :, None]
+    high = images[..., 1] + products.max(axis=(-1, -2)).sum(axis=-1)[:, :, None]
+    outside, rest = ends
+    first, last, misses, leaves = _windows(low, high, grid)
+    value = _least(rows[:, None, None], tables, grid[0], first, last)
+    value = np.where(leaves, np.minimum(value, outside), value)
+    value = np.where(misses, outside, value)
+    return (rest + value @ weights).min(axis=1)
+
+
+def _windows(
+    low: np.ndarray, high: np.ndarray, grid: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray, np.ndarray]:
+    """Return the first and the last cell along each axis, and what misses or leaves the grid."""
+    counts, edges, scales = grid
+    firsts, lasts = [], []
+    misses = np.zeros(low.shape[:-1], dtype=bool)
+    leaves = np.zeros(low.shape[:-1], dtype=bool)
+    for i in range(low.shape[-1]):
+        count, begin = counts[i], counts[AXES + i]
+        own = edges[begin : begin + count + 1]
+        a, b = low[..., i] - scales[i, 3], high[..., i] + scales[i, 3]
+        start, period = scales[i, 0], scales[i, 2]
+        if period > 0.0:
+            turns = period * np.floor((a - start) / period)
+            whole = b - a >= period
+            a, b = a - turns, b - turns
+            beyond = b >= start + period
+            first = np.clip(np.searchsorted(own, a, side="right") - 1, 0, count - 1)
+            last = np.searchsorted(own, np.where(beyond, b - period, b), side="right") - 1
+            last = np.clip(last, 0, count - 1) + np.where(beyond, count, 0)
+            first, last = np.where(whole, 0, first), np.where(whole, count - 1, last)
+        else:
+            first = np.searchsorted(own, a, side="right") - 1
+            last = np.searchsorted(own, b, side="right") - 1
+            misses |= (last < 0) | (first >= count)
+            leaves |= (first < 0) | (last >= count)
+            first, last = np.clip(first, 0, count - 1), np.clip(last, 0, count - 1)
+        firsts.append(first)
+        lasts.append(last)
+    return firsts, lasts, misses, leaves
+
+
+def _least(
+    rows: np.ndarray,
+    tables: np.ndarray,
+    counts: np.ndarray,
+    first: list[np.ndarray],
+    last: list[np.ndarray],
+) -> np.ndarray:
+    """Return the least value of each box of cells."""
+    widths = [int((b - a).max(initial=0)) for a, b in zip(first, last, strict=True)]
+    least = np.full(first[0].shape, np.inf)
+    for moves in itertools.product(*(range(width + 1) for width in widths)):
+        cell = np.zeros(first[0].shape, dtype=np.int64)
+        for i, (a, b, move) in enumerate(zip(first, last, moves, strict=True)):
+            place = np.minimum(a + move, b)
+            cell = cell * counts[i] + np.where(place >= counts[i], place - counts[i], place)
+        np.minimum(least, tables[rows, cell], out=least)
+    return least

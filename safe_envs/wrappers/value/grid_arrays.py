@@ -1,0 +1,49 @@
+"""Grids as arrays that kernels read."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from safe_envs.wrappers.value.bellman_kernel import AXES
+from safe_envs.wrappers.value.grid import Grid
+
+_SLACK = 1e-13
+"""Of the extent of an axis: how far rounding may carry a sum of a few numbers."""
+
+
+class GridArrays(NamedTuple):
+    """A grid as arrays, with axes of one cell in place of those that it does not have.
+
+    Attributes:
+        counts: for each axis the number of cells, the place of its first edge, that of its first
+            entry in `places`, and the number of these entries; int64, shape (4 * AXES,).
+        places: of all axes, see `Axis.places`, int32.
+        edges: of all axes.
+        scales: for each axis the first edge, the entries of `places` for a unit, the period, and
+            how far sums may be rounded; shape (AXES, 4).
+    """
+
+    counts: np.ndarray
+    places: np.ndarray
+    edges: np.ndarray
+    scales: np.ndarray
+
+
+def grid_arrays(grid: Grid) -> GridArrays:
+    """Return a grid as arrays."""
+    counts = np.zeros((4, AXES), dtype=np.int64)
+    counts[0] = 1
+    scales = np.zeros((AXES, 4))
+    edges = np.concatenate([axis.edges for axis in grid.axes])
+    places = np.concatenate([axis.places for axis in grid.axes])
+    first_edge = first_place = 0
+    for i, axis in enumerate(grid.axes):
+        extent = axis.edges[-1] - axis.edges[0]
+        counts[:, i] = axis.count, first_edge, first_place, len(axis.places)
+        size = max(abs(axis.edges[0]), abs(axis.edges[-1]))
+        scales[i] = axis.edges[0], len(axis.places) / extent, axis.period, _SLACK * size
+        first_edge += axis.count + 1
+        first_place += len(axis.places)
+    return GridArrays(counts.ravel(), places, edges, scales)

@@ -1,0 +1,211 @@
+"""What a table allows at a state: values, and bounds of the expected next value under inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.bellman_kernel import AXES
+from safe_envs.wrappers.value.cell_sets import Sets
+from safe_envs.wrappers.value.grid_arrays import grid_arrays
+from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
+from safe_envs.wrappers.value.smoothing import Smoothing
+from safe_envs.wrappers.value.solve import MEAN_PARTS
+from safe_envs.wrappers.value.step_images import Step
+from safe_envs.wrappers.value.sweeps import bellman_functions
+from safe_envs.wrappers.value.table import ValueTable
+
+
+class LookAhead:
+    """Reads a table at states of the plant, in batches.
+
+    Args:
+        table: of the problem.
+        problem: the problem.
+
+    Attributes:
+        steps: control periods of the table, K.
+        inputs: that the table was computed with, in physical units, shape (U, m).
+        box: (low, high) of each input.
+
+    Raises:
+        ConfigurationError: The table is of another problem.
+    """
+
+    def __init__(self, table: ValueTable, problem: SafetyProblem) -> None:
+        settings = table.settings
+        small = reduced(problem, settings.knowledge, settings.intervals)
+        if small.fingerprint != table.fingerprint:
+            raise ConfigurationError(
+                f"the table is of another problem ({table.problem}, or other parameters, bounds or"
+                f" periods) than {problem.name}; compute one for this problem"
+            )
+        self._table, self._reduced = table, small
+        self._step, self._sets = Step(small), Sets(small, settings.leaving)
+        self._smoothing = Smoothing(table.grid, self._step.blur, MEAN_PARTS)
+        self._means = grid_arrays(self._smoothing.means)
+        self._functions = bellman_functions()
+        self._scanned = scanned_inputs(small.box, settings.inputs)
+        self._window = np.zeros(2 * AXES, dtype=np.int64)
+        cells = self._smoothing.means.cells
+        self._ahead = {
+            sign: np.empty((len(table.lower), cells), dtype=np.float32) for sign in (1, -1)
+        }
+        self._filled = {sign: np.zeros(len(table.lower), dtype=bool) for sign in (1, -1)}
+        self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
+
+    def values(self, k: np.ndarray, x: Components) -> np.ndarray:
+        """Return the lower envelope at states, 0 outside the safe set.
+
+        Args:
+            k: control instants, int array (B,).
+            x: n components of the states, (B,).
+        """
+        cells = self._table.grid.cell_of(self._coordinates(x))
+        rows = np.maximum(np.asarray(k) - self._table.first, 0)
+        return np.where(cells < 0, 0.0, self._table.lower[rows, cells]).astype(np.float64)
+
+    def expected(self, k: np.ndarray, x: Components, u: np.ndarray) -> np.ndarray:
+        """Return lower bounds of the expected next value of the lower envelope.
+
+        Args:
+            k: control instants before K, int array (B,).
+            x: n components of the states, (B,).
+            u: inputs in physical units, shape (B, V, m).
+
+        Returns:
+            Shape (B, V).
+        """
+        return self._bounds(k, x, np.stack([u, u], axis=-1), 1)
+
+    def scanned(self, k: np.ndarray, x: Components) -> np.ndarray:
+        """Return `expected` for all scanned inputs, shape (B, U)."""
+        return self._bounds(k, x, self._scanned.ends, 1)
+
+    def largest(self, k: np.ndarray, x: Components) -> np.ndarray:
+        """Return upper bounds of the expected next value under any input, shape (B,)."""
+        return -self._bounds(k, x, self._scanned.boxes, -1).min(axis=1)
+
+    def best_input(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
+        """Return the scanned inputs of the largest bound, and these bounds.
+
+        Where several inputs are alike, the upper envelope decides.
+
+        Args:
+            k: control instants before K, int array (B,).
+            x: n components of the states, (B,).
+
+        Returns:
+            Shapes (B, m) and (B,).
+        """
+        lower = self.scanned(k, x)
+        most = lower.max(axis=1)
+        alike = lower >= most[:, None] - _ALIKE
+        unsettled = np.flatnonzero(alike.sum(axis=1) > 1)
+        rank = np.where(alike, lower, -np.inf)
+        if unsettled.size:
+            part = [np.asarray(c)[unsettled] for c in x]
+            upper = -self._bounds(np.asarray(k)[unsettled], part, self._scanned.ends, -1)
+            rank[unsettled] = np.where(alike[unsettled], upper, -np.inf)
+        chosen = rank.argmax(axis=1)
+        return self.inputs[chosen], np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
+
+    def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
+        """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
+
+        Args:
+            x: n components of the states, (B,).
+
+        Returns:
+            Lower and upper bounds, shape (B,).
+        """
+        k = np.zeros(len(x[0]), dtype=np.int64)
+        inside, ends = self.sets_at(k, x)
+        lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
+        upper = np.where(ends, 1.0, self.largest(k, x))
+        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(inside, upper, 0.0).clip(0, 1)
+
+    def sets_at(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether states are in the safe set, and whether the episode ends in them.
+
+        Args:
+            k: control instants, int array (B,).
+            x: n components of the states, (B,).
+        """
+        return self._sets.of_states(k, self._coordinates(x))
+
+    def _coordinates(self, x: Components) -> list[np.ndarray]:
+        found = self._reduced.of_states(x)
+        size = np.broadcast_shapes(*(np.shape(c) for c in x))
+        return [
+            axis.wrapped(np.broadcast_to(np.asarray(c, dtype=np.float64), size))
+            for axis, c in zip(self._table.grid.axes, found, strict=True)
+        ]
+
+    def _bounds(self, k: np.ndarray, x: Components, inputs: np.ndarray, sign: int) -> np.ndarray:
+        """Return bounds for inputs (1 or B, V, m, 2): of the lower table, or of the negative upper one."""
+        k, q = np.asarray(k), self._coordinates(x)
+        found = np.empty((len(k), inputs.shape[1]))
+        size = max(1, _AT_ONCE // len(self._step.noise.weights))
+        if len(k) > size:
+            for first in range(0, len(k), size):
+                part = slice(first, first + size)
+                own = inputs[part] if len(inputs) > 1 else inputs
+                found[part] = self._bounds(k[part], [np.asarray(c)[part] for c in x], own, sign)
+            return found
+        if self._step.depends_on_time:
+            for instant in np.unique(k):
+                rows = np.flatnonzero(k == instant)
+                own = inputs[rows] if len(inputs) > 1 else inputs
+                part = np.empty((len(rows), inputs.shape[1]))
+                self._fill(k[rows], [c[rows] for c in q], own, sign, int(instant), part)
+                found[rows] = part
+        elif len(k):
+            self._fill(k, q, inputs, sign, 0, found)
+        return found
+
+    def _fill(
+        self,
+        k: np.ndarray,
+        q: Sequence[np.ndarray],
+        inputs: np.ndarray,
+        sign: int,
+        instant: int,
+        found: np.ndarray,
+    ) -> None:
+        rows = np.maximum(k + 1 - self._table.first, 0)
+        for row in np.unique(rows):
+            self._fill_row(int(row), sign)
+        images, effects = self._step.images(q, q, inputs, instant * self._reduced.substeps)
+        rest = 0.0 if sign > 0 else -(self._step.noise.rest + self._smoothing.beyond)
+        self._functions["expected_values"](
+            0,
+            len(k),
+            images,
+            effects,
+            inputs,
+            self._step.noise.weights,
+            rows,
+            self._ahead[sign],
+            (0.0, rest),
+            *self._means,
+            self._window,
+            found,
+        )
+
+    def _fill_row(self, row: int, sign: int) -> None:
+        if not self._filled[sign][row]:
+            table = self._table.lower[row] if sign > 0 else -self._table.upper[row]
+            self._ahead[sign][row] = self._smoothing.smoothed(table, 0.0)
+            self._filled[sign][row] = True
+
+
+_AT_ONCE = 2_000_000
+
+_ALIKE = 1e-9
+"""Bounds that differ by less are alike."""

@@ -1,0 +1,69 @@
+"""What a table of values is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
+
+KNOWLEDGE = ("model", "plant")
+LEAVING = ("violation", "safe")
+
+_MOST_CELLS = 1 << 28
+
+
+@dataclass(frozen=True)
+class ValueSettings:
+    """What a table of values is asked for, next to a problem.
+
+    Attributes:
+        knowledge: whose step is taken, that of the "model" or of the "plant".
+        leaving: how an episode counts that leaves the workspace in the safe set: as a "violation",
+            or as "safe", which is how `evaluate` counts it.
+        intervals: of parameters that are uncertain; values hold for the worst ones, which may
+            change at every step.
+        cells: number along each coordinate; None for numbers that suit the problem.
+        inputs: number of inputs that are scanned along each input; None for one that suits.
+        memory: in bytes, which the tables must not exceed.
+
+    Raises:
+        ConfigurationError: A value is not allowed.
+    """
+
+    knowledge: str = "model"
+    leaving: str = "violation"
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    cells: tuple[int, ...] | None = None
+    inputs: int | None = None
+    memory: float = 4e9
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("knowledge", KNOWLEDGE), ("leaving", LEAVING)):
+            given = getattr(self, name)
+            if given not in allowed:
+                raise ConfigurationError(f"{name} = {shown(given)}; {nearest(str(given), allowed)}")
+        if self.cells is not None:
+            object.__setattr__(self, "cells", tuple(self.cells))
+            for count in self.cells:
+                require_whole("cells", count, 2, _MOST_CELLS)
+        if self.inputs is not None:
+            require_whole("inputs", self.inputs, 2, 1001)
+        if not 0 < self.memory < float("inf"):
+            raise ConfigurationError(f"memory = {shown(self.memory)}; give a number of bytes")
+        intervals = {
+            str(name): (float(low), float(high)) for name, (low, high) in self.intervals.items()
+        }
+        object.__setattr__(self, "intervals", intervals)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as JSON-able data."""
+        return {
+            "knowledge": self.knowledge,
+            "leaving": self.leaving,
+            "intervals": {name: list(pair) for name, pair in self.intervals.items()},
+            "cells": None if self.cells is None else list(self.cells),
+            "inputs": self.inputs,
+            "memory": self.memory,
+        }

@@ -1,0 +1,214 @@
+"""Envelopes of a problem's value, by dynamic programming of the env's own step.
+
+Let S_k = 1{X_0..X_k in C} for an episode, and D the set where episodes end. With L_K <= 1_C,
+L_k <= 1_C on D, and L_k(x) <= E L_{k+1}(X_{k+1} | X_k = x, u_k(x)) on C without D for some inputs
+u_k, E S_{k+1} L_{k+1} >= E S_k L_k, so that these inputs keep the episode safe with probability
+L_0(x_0) at least. With H_K >= 1_C, H_k >= 1_C on D, and H_k(x) >= E H_{k+1} for every input of the
+box, no policy does so with a larger probability than H_0(x_0), not even one that remembers.
+
+A cell counts for L if it lies wholly in C, for H if it touches C. Its value is the least (largest)
+expected value over all its points: the step takes the cell into boxes, and the least (largest)
+value of all cells that a box touches stands for it. The arithmetic is that of floating point, not
+rounded outwards throughout: the envelopes are computed, not proved.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.cell_sets import CellSets, Sets
+from safe_envs.wrappers.value.grid_arrays import grid_arrays
+from safe_envs.wrappers.value.reduction import ReducedProblem, reduced
+from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
+from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.smoothing import Smoothing, rounded_down
+from safe_envs.wrappers.value.step_images import Step, StepImages
+from safe_envs.wrappers.value.suitable_grid import suitable_grid
+from safe_envs.wrappers.value.sweeps import bellman_functions, in_parts, threads
+from safe_envs.wrappers.value.table import ValueTable
+
+Progress = Callable[[float], None]
+
+MEAN_PARTS = 2
+"""Parts of a cell in the grid of means; see `Smoothing`."""
+
+
+def solve(
+    problem: SafetyProblem, settings: ValueSettings | None = None, progress: Progress | None = None
+) -> ValueTable:
+    """Compute envelopes of the largest probability to stay safe.
+
+    Args:
+        problem: whose plant or model is taken.
+        settings: what is asked for.
+        progress: called with the part of the work that is done.
+
+    Raises:
+        ConfigurationError: The problem has too many coordinates, or unbounded ones, or the tables
+            do not fit the memory.
+    """
+    settings = settings or ValueSettings()
+    small = reduced(problem, settings.knowledge, settings.intervals)
+    return _Solver(small, settings).run(progress)
+
+
+class _Solver:
+    def __init__(self, small: ReducedProblem, settings: ValueSettings) -> None:
+        self._reduced, self._settings = small, settings
+        self._sets, self._step = Sets(small, settings.leaving), Step(small)
+        self._scanned = scanned_inputs(small.box, settings.inputs)
+        self._grid = suitable_grid(small, settings, self._sets, self._step)
+
+    def run(self, progress: Progress | None) -> ValueTable:
+        begun = time.perf_counter()
+        small, grid = self._reduced, self._grid
+        smoothing = Smoothing(grid, self._step.blur, MEAN_PARTS)
+        with ThreadPoolExecutor(threads(), "safe_envs_values") as pool:
+            rows = self._rows(_Operator(self, smoothing, pool), progress)
+        lower, upper = (np.stack(each[::-1]) for each in zip(*rows, strict=True))
+        return ValueTable(
+            small.problem.name,
+            small.fingerprint,
+            self._settings,
+            grid,
+            self._scanned.values,
+            small.steps + 1 - len(rows),
+            lower,
+            upper,
+            time.perf_counter() - begun,
+        )
+
+    def _rows(
+        self, operator: _Operator, progress: Progress | None
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return both envelopes at the instants K, K - 1, ..., down to where they stop changing."""
+        steps = self._reduced.steps
+        cells = operator.cells(steps)
+        rows = [(cells.inside.astype(np.float32), cells.touches.astype(np.float32))]
+        for k in range(steps - 1, -1, -1):
+            rows.append(operator.applied(*rows[-1], k))
+            if operator.is_constant and all(map(np.array_equal, rows[-1], rows[-2])):
+                rows.pop()
+                break
+            if progress:
+                progress((steps - k) / steps)
+        return rows
+
+
+class _Operator:
+    """One step backwards in time, for both envelopes."""
+
+    def __init__(self, solver: _Solver, smoothing: Smoothing, pool: ThreadPoolExecutor) -> None:
+        self._reduced, self._grid, self._step = solver._reduced, solver._grid, solver._step
+        self._sets, self._pool, self._smoothing = solver._sets, pool, smoothing
+        self._scanned = solver._scanned
+        self._functions, self._means = bellman_functions(), grid_arrays(smoothing.means)
+        self._moves = self._step.depends_on_time
+        self.is_constant = not (self._moves or self._sets.depend_on_time)
+        self._cells = self._sets.of_cells(self._grid, self._reduced.steps)
+        everywhere = np.arange(self._grid.cells)
+        self._numbers = np.flatnonzero(self._cells.touches) if self.is_constant else everywhere
+        self._images: tuple[StepImages, StepImages] | None = None
+        self._best = np.zeros(len(self._numbers), dtype=np.int64)
+        self._known = np.full((len(self._numbers), len(self._scanned.values)), 2.0)
+        self._turn = 0
+
+    def cells(self, k: int) -> CellSets:
+        """Return what the cells lie in at a control instant."""
+        if self._sets.depend_on_time:
+            self._cells = self._sets.of_cells(self._grid, k)
+        return self._cells
+
+    def applied(
+        self, lower: np.ndarray, upper: np.ndarray, k: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return both envelopes at the instant k.
+
+        Args:
+            lower: lower envelope at the next instant.
+            upper: upper one.
+            k: the instant.
+        """
+        cells = self.cells(k)
+        if self._images is None or self._moves:
+            self._images = self._imaged(k)
+        if not self.is_constant:
+            self._known[:] = 2.0
+        here = CellSets(*(each[self._numbers] for each in cells))
+        found = np.zeros(len(self._numbers))
+        bounds = np.zeros(len(self._numbers))
+        self._sweep_lower(lower, found, here)
+        self._sweep_upper(upper, bounds)
+        self._turn += 1
+        new_lower = (cells.inside & cells.ends).astype(np.float32)
+        new_upper = (cells.touches & cells.may_end).astype(np.float32)
+        going = here.inside & ~here.ends
+        new_lower[self._numbers[going]] = rounded_down(np.clip(found[going], 0.0, 1.0))
+        going = here.touches & ~here.may_end
+        new_upper[self._numbers[going]] = -rounded_down(-np.clip(bounds[going], 0.0, 1.0))
+        return new_lower, new_upper
+
+    def _imaged(self, k: int) -> tuple[StepImages, StepImages]:
+        """Return where the cells go under single inputs, and under boxes of them."""
+        low, high = self._grid.corners(self._numbers)
+        single = self._step.images(low, high, self._scanned.ends, k * self._reduced.substeps)
+        if self._step.is_affine:
+            return single, single
+        boxed = self._step.images(low, high, self._scanned.boxes, k * self._reduced.substeps)
+        return single, boxed
+
+    def _sweep_lower(self, lower: np.ndarray, found: np.ndarray, here: CellSets) -> None:
+        tables = self._smoothing.smoothed(lower, 0.0)[None]
+        images, effects = self._images[0]
+        sweep, step = self._functions["sweep_lower"], self._step
+        self._best[~(here.inside & ~here.ends)] = -1
+        self._best[here.inside & ~here.ends & (self._best < 0)] = 0
+        in_parts(
+            self._pool,
+            len(self._numbers),
+            lambda first, last, window: sweep(
+                first,
+                last,
+                self._turn if self.is_constant else self._turn % 8,
+                images,
+                effects,
+                self._scanned.ends,
+                step.noise.weights,
+                tables,
+                (0.0, 0.0),
+                self._scanned.neighbours,
+                *self._means,
+                window,
+                self._best,
+                found,
+            ),
+        )
+
+    def _sweep_upper(self, upper: np.ndarray, bounds: np.ndarray) -> None:
+        tables = self._smoothing.smoothed(-upper, 0.0)[None]
+        images, effects = self._images[1]
+        sweep, step = self._functions["sweep_upper"], self._step
+        rest = -(step.noise.rest + self._smoothing.beyond)
+        in_parts(
+            self._pool,
+            len(self._numbers),
+            lambda first, last, window: sweep(
+                first,
+                last,
+                images,
+                effects,
+                self._scanned.boxes,
+                step.noise.weights,
+                tables,
+                (0.0, rest),
+                *self._means,
+                window,
+                self._known,
+                bounds,
+            ),
+        )

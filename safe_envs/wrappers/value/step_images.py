@@ -1,0 +1,198 @@
+"""Where a step takes a cell, or a state: boxes of coordinates, and how the inputs move them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.intervals import Interval, interval_function
+from safe_envs.wrappers.value.noise_boxes import NoiseBoxes, noise_boxes
+from safe_envs.wrappers.value.reduction import ReducedProblem
+
+_PARTS = {1: 8, 2: 4}
+_FEW_PARTS = 2
+_AT_ONCE = 2_000_000
+
+
+class StepImages(NamedTuple):
+    """Where a step takes some states; see `bellman_kernel`.
+
+    Attributes:
+        images: shape (B, 1 or U, R, W, n, 2).
+        effects: shape (B, R, n, m, 2).
+    """
+
+    images: np.ndarray
+    effects: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """A step in parts: x' = rest + effect u + blur w.
+
+    Attributes:
+        rest: of each coordinate, with the boxed noise.
+        effect: of each coordinate and input.
+        blur: standard deviation along each coordinate of noise that is integrated exactly.
+        boxed: normals that are divided into boxes.
+        is_affine: whether `rest` does not hold the inputs.
+    """
+
+    rest: tuple[sp.Expr, ...]
+    effect: tuple[tuple[sp.Expr, ...], ...]
+    blur: tuple[float, ...]
+    boxed: tuple[sp.Symbol, ...]
+    is_affine: bool
+
+
+class Step:
+    """One sub-step of a reduced problem over boxes of its coordinates.
+
+    Noise of constant size along one coordinate alone is left to `smoothing`, which is exact; all
+    other noise is divided into boxes.
+
+    Args:
+        reduced: the problem.
+
+    Attributes:
+        blur: standard deviation of the noise along each coordinate that is left out here.
+        noise: boxes of all other noise.
+        is_affine: whether inputs move the images in proportion.
+    """
+
+    def __init__(self, reduced: ReducedProblem) -> None:
+        self._reduced = reduced
+        self._parts = _parts_of(reduced)
+        self.blur, self.is_affine = self._parts.blur, self._parts.is_affine
+        self.noise: NoiseBoxes = noise_boxes(len(self._parts.boxed))
+        self._scenarios = _scenarios(reduced.intervals)
+
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether states that are known in advance occur in the step."""
+        used = set().union(*(e.free_symbols for e in reduced_expressions(self._parts)))
+        return bool(used & set(self._reduced.known))
+
+    @cached_property
+    def _functions(self) -> tuple[Any, Any]:
+        reduced, parts = self._reduced, self._parts
+        symbols = (
+            *(c.symbol for c in reduced.coordinates),
+            *reduced.known,
+            *reduced.intervals,
+        )
+        effects = [entry for row in parts.effect for entry in row]
+        return (
+            interval_function((*symbols, *parts.boxed, *reduced.inputs), parts.rest),
+            interval_function(symbols, effects),
+        )
+
+    def images(
+        self,
+        low: Sequence[np.ndarray],
+        high: Sequence[np.ndarray],
+        inputs: np.ndarray,
+        instant: int = 0,
+    ) -> StepImages:
+        """Return where boxes of states go.
+
+        Args:
+            low: least coordinates, n arrays (B,).
+            high: largest coordinates.
+            inputs: ends of the inputs, shape (1 or B, V, m, 2), for steps that are not affine.
+            instant: number of the sub-step, for states that are known in advance.
+        """
+        count, n, m = len(low[0]), len(low), len(self._reduced.inputs)
+        tried = 1 if self.is_affine else inputs.shape[1]
+        scenarios, boxes = len(self._scenarios), len(self.noise.weights)
+        images = np.empty((count, tried, scenarios, boxes, n, 2))
+        effects = np.empty((count, scenarios, n, m, 2))
+        size = max(1, _AT_ONCE // (tried * scenarios * boxes))
+        for first in range(0, count, size):
+            part = slice(first, first + size)
+            own = inputs[part] if len(inputs) > 1 else inputs
+            ends = [Interval(a[part], b[part]) for a, b in zip(low, high, strict=True)]
+            self._fill(images[part], effects[part], ends, own, instant)
+        return StepImages(images, effects)
+
+    def _fill(
+        self,
+        images: np.ndarray,
+        effects: np.ndarray,
+        coordinates: Sequence[Interval],
+        inputs: np.ndarray,
+        instant: int,
+    ) -> None:
+        rest, effect = self._functions
+        n, m = effects.shape[2:4]
+        known = [float(values[instant]) for values in self._reduced.known.values()]
+        wide = [
+            Interval(c.low[:, None, None, None], c.high[:, None, None, None]) for c in coordinates
+        ]
+        worlds = [
+            Interval(
+                np.array([s[i][0] for s in self._scenarios])[:, None],
+                np.array([s[i][1] for s in self._scenarios])[:, None],
+            )
+            for i in range(len(self._reduced.intervals))
+        ]
+        noise = [Interval(a, b) for a, b in zip(self.noise.low, self.noise.high, strict=True)]
+        given = (
+            [Interval(np.float64(0.0), np.float64(0.0))] * m
+            if self.is_affine
+            else [Interval(*np.moveaxis(inputs[:, :, j, :, None, None], 2, 0)) for j in range(m)]
+        )
+        for i, found in enumerate(rest([*wide, *known, *worlds, *noise, *given])):
+            images[..., i, 0], images[..., i, 1] = found.low, found.high
+        flat = [Interval(c.low[:, None], c.high[:, None]) for c in coordinates]
+        thin = [Interval(w.low[:, 0], w.high[:, 0]) for w in worlds]
+        for i, found in enumerate(effect([*flat, *known, *thin])):
+            effects[:, :, i // m, i % m, 0] = found.low
+            effects[:, :, i // m, i % m, 1] = found.high
+
+
+def reduced_expressions(parts: _Parts) -> list[sp.Expr]:
+    """Return all expressions of a step."""
+    return [*parts.rest, *(entry for row in parts.effect for entry in row)]
+
+
+def _parts_of(reduced: ReducedProblem) -> _Parts:
+    rest = [sp.sympify(e) for e in reduced.step]
+    blur, boxed = [0.0] * len(rest), []
+    for w in reduced.noise:
+        sizes = [sp.diff(e, w) for e in rest]
+        touched = [i for i, size in enumerate(sizes) if size != 0]
+        if len(touched) == 1 and sizes[touched[0]].is_number and not blur[touched[0]]:
+            i = touched[0]
+            blur[i] = abs(float(sizes[i]))
+            rest[i] = rest[i].subs(w, 0)
+        elif touched:
+            boxed.append(w)
+    inputs = reduced.inputs
+    varying = {*inputs, *boxed}
+    effect = [[sp.diff(e, u) for u in inputs] for e in rest]
+    is_affine = not any(entry.free_symbols & varying for row in effect for entry in row)
+    if is_affine:
+        rest = [e.subs(dict.fromkeys(inputs, 0)) for e in rest]
+    else:
+        effect = [[sp.Integer(0)] * len(inputs) for _ in rest]
+    return _Parts(tuple(rest), tuple(map(tuple, effect)), tuple(blur), tuple(boxed), is_affine)
+
+
+def _scenarios(
+    intervals: dict[sp.Symbol, tuple[float, float]] | Any,
+) -> list[tuple[tuple[float, float], ...]]:
+    """Return boxes that cover the uncertain parameters."""
+    parts = _PARTS.get(len(intervals), _FEW_PARTS)
+    cut = []
+    for low, high in intervals.values():
+        number = parts if high > low else 1
+        ends = [low + (high - low) * i / number for i in range(number)] + [high]
+        cut.append(list(itertools.pairwise(ends)))
+    return list(itertools.product(*cut))

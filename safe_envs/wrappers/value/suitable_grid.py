@@ -1,0 +1,74 @@
+"""A grid that suits a problem."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.value.cell_sets import Sets, hull_of, uniform_grid
+from safe_envs.wrappers.value.grid import Grid
+from safe_envs.wrappers.value.reduction import ReducedProblem
+from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.step_images import Step
+
+_CELLS = {1: 4000, 2: 40_000, 3: 300_000, 4: 600_000}
+_SAMPLES = 512
+_BYTES = 8
+"""Of both tables for a cell and an instant."""
+
+
+def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, step: Step) -> Grid:
+    """Return a grid over the safe part of the workspace.
+
+    Coordinates that a step changes little get narrow cells, since a cell's width acts like a
+    disturbance of the step.
+
+    Args:
+        small: the problem.
+        settings: what is asked for.
+        sets: of the problem.
+        step: of the problem.
+
+    Raises:
+        ConfigurationError: The numbers of cells do not fit the problem or the memory.
+    """
+    n = len(small.coordinates)
+    ends = hull_of(small, sets)
+    if settings.cells is not None and len(settings.cells) != n:
+        names = ", ".join(str(c.symbol) for c in small.coordinates)
+        raise ConfigurationError(
+            f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has {n}"
+            f" coordinates ({names}): give a number for each"
+        )
+    most = int(settings.memory / 2 / (_BYTES * (small.steps + 1)))
+    counts = settings.cells or _counts(small, ends, step, min(_CELLS[n], most))
+    if math.prod(counts) > most:
+        raise ConfigurationError(
+            f"{math.prod(counts)} cells at {small.steps + 1} instants do not fit"
+            f" {settings.memory / 1e9:.3g} GB of memory; take at most {most} cells, or more memory"
+        )
+    return uniform_grid(small.coordinates, ends, counts)
+
+
+def _counts(
+    small: ReducedProblem, ends: list[tuple[float, float]], step: Step, cells: int
+) -> tuple[int, ...]:
+    n = len(ends)
+    rng = np.random.default_rng(0)
+    points = tuple(low + (high - low) * rng.random(_SAMPLES) for low, high in ends)
+    box = np.array(small.box)
+    corners = np.stack([box, box[:, ::-1]])[None, :, :, :1].repeat(2, axis=-1)
+    found = step.images(points, points, corners)
+    middle = found.images.mean(axis=-1)
+    weights = step.noise.weights / step.noise.weights.sum()
+    wanted = []
+    for i, (low, high) in enumerate(ends):
+        moved = np.abs(middle[..., i] - points[i][:, None, None, None])
+        moved = float((moved @ weights).mean()) + step.blur[i]
+        reach = np.abs(found.effects[:, :, i]).max(axis=-1) @ np.abs(box).max(axis=1)
+        moved += 0.5 * float(reach.mean())
+        wanted.append(math.sqrt((high - low) / max(moved, 1e-3 * (high - low))))
+    scale = (cells / math.prod(wanted)) ** (1 / n)
+    return tuple(max(8, round(scale * each)) for each in wanted)

@@ -1,0 +1,214 @@
+"""Tables of the value as files: arrays and JSON in an npz, without pickle, under a checksum."""
+
+from __future__ import annotations
+
+import re
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safe_envs.array_files import checksum, reading, write_arrays
+from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT
+from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.grid import Axis, Grid
+from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.table import ValueTable
+
+MOST_BYTES_OF_TABLE = 8_000_000_000
+"""Of a file with a table."""
+
+FORMAT = 1
+WRITER = "safe-envs best"
+
+_KIND = "values"
+_FINGERPRINT = re.compile("[0-9a-f]{64}")
+_LOWER, _UPPER, _INPUTS, _PERIODS = "lower", "upper", "inputs", "periods"
+_ROUNDING = 1e-9
+
+
+class ValueFileError(ConfigurationError):
+    """A file is no table of values, damaged, or of another problem."""
+
+
+def save_table(table: ValueTable, path: Path | str) -> None:
+    """Write a table into a file, whole or not at all.
+
+    Args:
+        table: of values.
+        path: of the file.
+
+    Raises:
+        ConfigurationError: It cannot be written there, is too large to be read, or holds values
+            that are none.
+    """
+    path = Path(path)
+    try:
+        _require_values(table)
+    except ValueError as error:
+        raise ConfigurationError(f"{shortened(path)} is not written: {error}") from error
+    grid = table.grid
+    arrays = {
+        **{_edges_of(i): axis.edges.astype("<f8") for i, axis in enumerate(grid.axes)},
+        _PERIODS: np.array([axis.period for axis in grid.axes], dtype="<f8"),
+        _INPUTS: table.inputs.astype("<f8"),
+        _LOWER: table.lower.astype("<f4", copy=False),
+        _UPPER: table.upper.astype("<f4", copy=False),
+    }
+    header = {
+        "format": FORMAT,
+        "kind": _KIND,
+        "problem": table.problem,
+        "fingerprint": table.fingerprint,
+        "settings": table.settings.as_dict(),
+        "first": int(table.first),
+        "sizes": {"instants": len(table.lower), "cells": list(grid.shape)},
+        "seconds": float(table.seconds),
+        "version": version("safe-envs"),
+    }
+    header["sha256"] = checksum(header, arrays)
+    write_arrays(path, header, arrays, MOST_BYTES_OF_TABLE - MOST_BYTES_OF_TEXT)
+
+
+def load_table(path: Path | str, problem: SafetyProblem | None = None) -> ValueTable:
+    """Read a table from a file.
+
+    Args:
+        path: of the file.
+        problem: whose values it has to hold; None for those of any.
+
+    Raises:
+        ValueFileError: The file is missing, a folder, no such file, truncated, altered, or of
+            another problem.
+    """
+    path = Path(path)
+    table = _read(path)
+    if problem is not None:
+        _require_problem(path, table, problem)
+    return table
+
+
+def require_asked(path: Path, table: ValueTable, settings: ValueSettings) -> None:
+    """Check that a table is what is asked for.
+
+    The numbers of cells and inputs may be any where none are asked for.
+
+    Args:
+        path: of its file.
+        table: that was read.
+        settings: what is asked for.
+
+    Raises:
+        ValueFileError: It has other settings.
+    """
+    asked = settings.as_dict()
+    found = {**table.settings.as_dict(), "cells": list(table.grid.shape)}
+    for name, value in asked.items():
+        free = name == "memory" or (name in ("cells", "inputs") and value is None)
+        if not free and found[name] != value:
+            raise ValueFileError(
+                f"{shortened(path)} holds values with {name} = {shown(found[name])}, and"
+                f" {shown(value)} is asked for; ask for the former, or name another file"
+            )
+
+
+def _require_problem(path: Path, table: ValueTable, problem: SafetyProblem) -> None:
+    settings = table.settings
+    try:
+        expected = reduced(problem, settings.knowledge, settings.intervals).fingerprint
+    except ConfigurationError:  # It has no such parameters, or other coordinates.
+        expected = ""
+    if table.fingerprint != expected:
+        whose = (
+            f"an earlier version of {shown(problem.name)}, with other dynamics, noise, sets or"
+            " horizon"
+            if table.problem == problem.name
+            else f"{shown(table.problem)}, and not of {shown(problem.name)}"
+        )
+        raise ValueFileError(
+            f"{shortened(path)} holds values of {whose}; name another file, or one that is not"
+            f" there yet to let `{WRITER}` compute them"
+        )
+
+
+def _edges_of(axis: int) -> str:
+    return f"edges_{axis}"
+
+
+def _read(path: Path) -> ValueTable:
+    name = shortened(path)
+    with reading(path, WRITER, ValueFileError, MOST_BYTES_OF_TABLE) as file:
+        header = dict(file.header)
+        if header["kind"] != _KIND:
+            raise ValueError("it holds something else")
+        if header["format"] != FORMAT:
+            raise ValueFileError(
+                f"{name} has the format {shown(header['format'])}; this version reads {FORMAT}. Run"
+                f" `{WRITER}` again"
+            )
+        arrays = file.arrays()
+        if header.pop("sha256") != checksum(header, arrays):
+            raise ValueFileError(
+                f"{name} was altered: its content does not match its checksum. Remove it and run"
+                f" `{WRITER}` again"
+            )
+        table = _table(header, arrays)
+        _require_values(table)
+    return table
+
+
+def _table(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> ValueTable:
+    """Return what was read as a table; raise one of the errors of damaged files otherwise."""
+    problem, fingerprint, first = header["problem"], header["fingerprint"], header["first"]
+    if not (isinstance(problem, str) and _FINGERPRINT.fullmatch(fingerprint)):
+        raise ValueError("its name or fingerprint is none")
+    if isinstance(first, bool) or not isinstance(first, int) or first < 0:
+        raise ValueError("its first instant is none")
+    periods = arrays.pop(_PERIODS)
+    edges = [arrays.pop(_edges_of(i)) for i in range(len(periods))]
+    inputs, lower, upper = (arrays.pop(each) for each in (_INPUTS, _LOWER, _UPPER))
+    if arrays:
+        raise ValueError("it holds more than it should")
+    return ValueTable(
+        problem=problem,
+        fingerprint=fingerprint,
+        settings=ValueSettings(**header["settings"]),
+        grid=Grid(
+            tuple(Axis(each, float(p)) for each, p in zip(edges, periods, strict=True)),
+        ),
+        inputs=inputs,
+        first=first,
+        lower=lower,
+        upper=upper,
+        seconds=float(header["seconds"]),
+    )
+
+
+def _require_values(table: ValueTable) -> None:
+    """Raise ValueError unless a table is one: 0 <= lower <= upper <= 1 on cells that increase."""
+    axes = table.grid.axes
+    for axis in axes:
+        edges, period = axis.edges, axis.period
+        if edges.dtype != np.float64 or edges.ndim != 1 or len(edges) < 2:
+            raise ValueError("the edges of an axis are no row of numbers")
+        if not (np.isfinite(edges).all() and (np.diff(edges) > 0).all()):
+            raise ValueError("the edges of an axis do not increase")
+        extent = edges[-1] - edges[0]
+        if not (period == 0 or abs(period - extent) <= _ROUNDING * extent):
+            raise ValueError("the edges of an axis do not cover its period")
+    inputs = table.inputs
+    if inputs.dtype != np.float64 or inputs.ndim != 2 or not np.isfinite(inputs).all():
+        raise ValueError("the inputs are no rows of numbers")
+    if not axes or not inputs.size or not np.isfinite(table.seconds) or table.seconds < 0:
+        raise ValueError("it has no axis, no input, or no time")
+    shape = (len(table.lower), table.grid.cells)
+    for values in (table.lower, table.upper):
+        if values.dtype != np.float32 or values.shape != shape or not values.size:
+            raise ValueError(f"an envelope is no table of {shape} values")
+    # Row by row, for a table may fill half of the memory. A comparison with NaN is false.
+    for lower, upper in zip(table.lower, table.upper, strict=True):
+        if not (lower.min() >= 0 and upper.max() <= 1 and (lower <= upper).all()):
+            raise ValueError("its values are not 0 <= lower <= upper <= 1")
