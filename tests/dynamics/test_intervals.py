@@ -88,7 +88,8 @@ def test_values_of_random_expressions_lie_inside(seed):
 
 @pytest.mark.parametrize(("expression", "box"), CASES)
 def test_exact_values_at_points_lie_inside_and_near(expression, box):
-    points = np.random.default_rng(2).uniform(*np.array(box, float).T, (20, 3))
+    low, high = np.array(box, float).T
+    points = np.random.default_rng(2).uniform(low, high, (20, 3))
     (result,) = interval_function((X, Y, Z), (expression,))(list(points.T))
     with mpmath.workdps(50):
         for point, low, high in zip(points, *map(np.ravel, result), strict=True):
@@ -166,6 +167,33 @@ def test_single_operations_are_off_by_two_units_in_the_last_place(expression, ul
     assert np.all(values < result.high)
     assert np.all(result.high - values <= ulps * unit)
     assert np.all(values - result.low <= ulps * unit)
+
+
+def test_crests_of_far_waves_are_not_missed():
+    turns = np.random.default_rng(5).integers(10**11, 10**12, 300)
+    with mpmath.workdps(50):
+        crests = [float((4 * int(k) + 1) * mpmath.pi / 2) for k in turns]
+    above = np.nextafter(crests, INF)
+    below = np.nextafter(crests, -INF)
+    for a, b in ((above - 1, above), (below, below + 1)):
+        (result,) = interval_function((X,), (sp.sin(X),))([Interval(a, b)])
+        assert np.all(result.high == 1)
+        assert np.all(result.low < 0.6)
+
+
+def test_a_root_of_squares_has_its_domain():
+    (result,) = interval_function((X, Y), (sp.sqrt(2 * X**2 + 3 * Y**2),))(
+        [Interval(0.0, 1.0), Interval(-1.0, 0.0)]
+    )
+    assert result.low == 0
+    assert result.high == pytest.approx(math.sqrt(5))
+
+
+def test_a_point_without_a_value_is_the_whole_line():
+    for rounded in (True, False):
+        (result,) = interval_function((X, Y), (X - Y,), rounded)([INF, np.array([INF, 1.0])])
+        assert list(result.low) == [-INF, INF if not rounded else -INF]
+        assert list(result.high) == [INF, INF]
 
 
 def test_products_that_underflow_are_enclosed():

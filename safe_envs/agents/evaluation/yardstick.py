@@ -17,7 +17,6 @@ state outside the workspace is in the safe set.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -28,14 +27,14 @@ from safe_envs.agents.evaluation.attainable import (
     contradicted,
     of_table,
 )
+from safe_envs.agents.evaluation.countings import leaves_safely
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
-from safe_envs.dynamics.intervals import Interval, interval_function
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.table_files import table_at_hand
+from safe_envs.wrappers.value.table_cache import table_at_hand
 
 
 @dataclass(frozen=True)
@@ -95,26 +94,6 @@ def evaluation_settings(problem: SafetyProblem) -> ValueSettings:
     """
     same = not leaves_safely(problem)
     return ValueSettings(knowledge="plant", leaving="violation" if same else "safe")
-
-
-def leaves_safely(problem: SafetyProblem) -> bool:
-    """Return whether a state outside the workspace may be in the safe set.
-
-    False is certain: interval arithmetic has a barrier that is not positive beyond each bound.
-    """
-    states = problem.states
-    barriers = [problem.plant.numeric(b.expression) for b in problem.barriers]
-    values = interval_function([s.symbol for s in states], barriers)
-    everywhere = Interval(-math.inf, math.inf)
-    for i, state in enumerate(states):
-        beyond = [Interval(state.high, math.inf)] * math.isfinite(state.high)
-        beyond += [Interval(-math.inf, state.low)] * math.isfinite(state.low)
-        for part in beyond:
-            found = values([part if j == i else everywhere for j in range(len(states))])
-            # What is not a number is not known.
-            if not any(h.high <= 0.0 for h in found):
-                return True
-    return False
 
 
 def best_for(problem: SafetyProblem, progress: Progress | None = None) -> AttainableSafety:

@@ -16,7 +16,7 @@ from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.table import ValueTable
-from safe_envs.wrappers.value.table_files import table_for
+from safe_envs.wrappers.value.table_cache import table_for
 
 
 class BestPolicy(Policy):

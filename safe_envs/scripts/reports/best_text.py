@@ -105,10 +105,9 @@ def best_notes(best: AttainableSafety | None) -> list[str]:
     return [
         "no policy is safer than the upper end of the best attainable safety, and some policy is as"
         f" safe as its lower end: {COMPUTED}, but not proved. {counted}",
-        "times unavoidable: violations of a filter for each one that no policy can avoid. From (1 -"
-        " the upper end of the rate)/(1 - the lower end of the best), at least 1, to (1 - the lower end"
-        " of the rate)/(1 - the upper end of best); only >= where no violation is shown to be"
-        " unavoidable.",
+        "times unavoidable: violations of a filter for each one that no policy can avoid, from (1 -"
+        " upper end of the rate)/(1 - lower end of the best), at least 1, to (1 - lower end of the"
+        " rate)/(1 - upper end of the best); only >= where no violation is shown to be unavoidable.",
     ]
 
 

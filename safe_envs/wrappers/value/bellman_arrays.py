@@ -17,7 +17,7 @@ _AT_ONCE = 200_000
 
 def expected_values(first: int, last: int, *arguments: Any) -> None:
     """Bound the expected value of states under inputs from below; see `bellman_kernel`."""
-    *given, rows, tables, ends, counts, places, edges, scales, _, found = arguments
+    *given, rows, tables, rest, counts, places, edges, scales, _, found = arguments
     images, effects, inputs, weights = given
     grid = (counts, edges, scales)
     for part in _parts(first, last, images):
@@ -25,14 +25,14 @@ def expected_values(first: int, last: int, *arguments: Any) -> None:
         for u in range(inputs.shape[1]):
             v = u if images.shape[1] > 1 else 0
             found[part, u] = _expected(
-                images[part, v], effects[part], own[:, u], weights, rows[part], tables, ends, grid
+                images[part, v], effects[part], own[:, u], weights, rows[part], tables, rest, grid
             )
 
 
 def sweep_lower(first: int, last: int, turn: int, *arguments: Any) -> None:
     """Maximise the bound of the expected value over all inputs; see `bellman_kernel`."""
-    images, effects, inputs, weights, tables, ends, _, counts, _, edges, scales, *rest = arguments
-    _, best, found = rest
+    images, effects, inputs, weights, tables, ends, _, counts, _, edges, scales, *others = arguments
+    _, best, found = others
     grid = (counts, edges, scales)
     del turn
     for part in _parts(first, last, images):
@@ -42,7 +42,7 @@ def sweep_lower(first: int, last: int, turn: int, *arguments: Any) -> None:
         for u in range(inputs.shape[1]):
             v = u if images.shape[1] > 1 else 0
             value = _expected(
-                images[rows, v], effects[rows], inputs[:, u], weights, none, tables, ends, grid
+                images[rows, v], effects[rows], inputs[:, u], weights, none, tables, rest, grid
             )
             better = value > largest
             best[rows[better]], largest[better] = u, value[better]
@@ -51,15 +51,15 @@ def sweep_lower(first: int, last: int, turn: int, *arguments: Any) -> None:
 
 def sweep_upper(first: int, last: int, *arguments: Any) -> None:
     """Maximise an upper bound of the expected value over all inputs; see `bellman_kernel`."""
-    images, effects, inputs, weights, tables, ends, counts, _, edges, scales, *rest = arguments
-    _, known, found = rest
+    images, effects, inputs, weights, tables, rest, counts, _, edges, scales, *others = arguments
+    _, known, found = others
     grid = (counts, edges, scales)
     for part in _parts(first, last, images):
         none = np.zeros(len(part), dtype=np.int64)
         for u in range(inputs.shape[1]):
             v = u if images.shape[1] > 1 else 0
             value = -_expected(
-                images[part, v], effects[part], inputs[:, u], weights, none, tables, ends, grid
+                images[part, v], effects[part], inputs[:, u], weights, none, tables, rest, grid
             )
             known[part, u] = np.minimum(value, known[part, u])
         found[part] = known[part].max(axis=1)
@@ -77,18 +77,17 @@ def _expected(
     weights: np.ndarray,
     rows: np.ndarray,
     tables: np.ndarray,
-    ends: tuple[float, float],
+    rest: float,
     grid: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Return bounds (B,) for images (B, R, W, n, 2) and inputs (B or 1, m, 2)."""
     products = effects[..., :, None] * inputs[:, None, None, :, None, :]
     low = images[..., 0] + products.min(axis=(-1, -2)).sum(axis=-1)[:, :, None]
     high = images[..., 1] + products.max(axis=(-1, -2)).sum(axis=-1)[:, :, None]
-    outside, rest = ends
     first, last, misses, leaves = _windows(low, high, grid)
     value = _least(rows[:, None, None], tables, grid[0], first, last)
-    value = np.where(leaves, np.minimum(value, outside), value)
-    value = np.where(misses, outside, value)
+    value = np.where(leaves, np.minimum(value, 0.0), value)
+    value = np.where(misses, 0.0, value)
     return (rest + value @ weights).min(axis=1)
 
 
@@ -132,10 +131,15 @@ def _least(
     first: list[np.ndarray],
     last: list[np.ndarray],
 ) -> np.ndarray:
-    """Return the least value of each box of cells."""
+    """Return the least value of each box of cells, an entry of the table standing for a block."""
+    blocks = counts[4 * AXES :]
+    last = [
+        np.maximum(a, b - n + 1) for a, b, n in zip(first, last, blocks[: len(first)], strict=True)
+    ]
     widths = [int((b - a).max(initial=0)) for a, b in zip(first, last, strict=True)]
     least = np.full(first[0].shape, np.inf)
-    for moves in itertools.product(*(range(width + 1) for width in widths)):
+    steps = [[*range(0, width, n), width] for width, n in zip(widths, blocks, strict=False)]
+    for moves in itertools.product(*steps):
         cell = np.zeros(first[0].shape, dtype=np.int64)
         for i, (a, b, move) in enumerate(zip(first, last, moves, strict=True)):
             place = np.minimum(a + move, b)

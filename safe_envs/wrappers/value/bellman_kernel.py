@@ -29,12 +29,12 @@ def expected_values(  # noqa: PLR0913
     weights: np.ndarray,
     rows: np.ndarray,
     tables: np.ndarray,
-    ends: tuple[float, float],
+    rest: float,
     counts: np.ndarray,
     places: np.ndarray,
     edges: np.ndarray,
     scales: np.ndarray,
-    window: np.ndarray,
+    shifts: np.ndarray,
     found: np.ndarray,
 ) -> None:
     """Bound the expected value of states under inputs from below.
@@ -48,12 +48,12 @@ def expected_values(  # noqa: PLR0913
         weights: probability of each box of the noise, shape (W,).
         rows: row of the tables for each state, shape (B,).
         tables: values of the next control instant, shape (rows, cells).
-        ends: value outside the grid, and what the noise beyond all boxes adds.
+        rest: what the noise beyond all boxes adds.
         counts: of the grid.
         places: of the grid.
         edges: of the grid.
         scales: of the grid.
-        window: scratch array of 8 entries.
+        shifts: scratch array of 8 entries.
         found: receives the bounds, shape (B, V).
     """
     several = images.shape[1] > 1
@@ -71,12 +71,12 @@ def expected_values(  # noqa: PLR0913
                 weights,
                 rows[a],
                 tables,
-                ends,
+                rest,
                 counts,
                 places,
                 edges,
                 scales,
-                window,
+                shifts,
             )
 
 
@@ -89,20 +89,20 @@ def sweep_lower(  # noqa: PLR0913
     inputs: np.ndarray,
     weights: np.ndarray,
     tables: np.ndarray,
-    ends: tuple[float, float],
+    rest: float,
     neighbours: np.ndarray,
     counts: np.ndarray,
     places: np.ndarray,
     edges: np.ndarray,
     scales: np.ndarray,
-    window: np.ndarray,
+    shifts: np.ndarray,
     best: np.ndarray,
     found: np.ndarray,
 ) -> None:
     """Maximise the bound of the expected value over some of the inputs.
 
-    Any input gives a lower envelope. Those near the best one of the last sweep, and another one each
-    time, find nearly the maximum of all.
+    Any input gives a lower envelope. The best one of the last sweep and, in turn, one next to it or
+    any other find nearly the maximum of all.
 
     Args:
         first: state to begin with.
@@ -113,13 +113,13 @@ def sweep_lower(  # noqa: PLR0913
         inputs: see there, shape (1, U, m, 2).
         weights: see there.
         tables: see there, of one row.
-        ends: see there.
+        rest: see there.
         neighbours: of each input, shape (U, N), -1 for none.
         counts: of the grid.
         places: of the grid.
         edges: of the grid.
         scales: of the grid.
-        window: scratch array of 8 entries.
+        shifts: scratch array of 8 entries.
         best: the best input of the last sweep, which is replaced, shape (B,); -1 where nothing is to
             be found.
         found: receives the bounds, shape (B,).
@@ -130,16 +130,16 @@ def sweep_lower(  # noqa: PLR0913
         if best[a] < 0:
             continue
         largest, chosen = -inf, best[a]
-        number = tried if turn == 0 else neighbours.shape[1] + 2
+        number = tried if turn == 0 else 2
         for j in range(number):
             if turn == 0:
                 u = j
             elif j == 0:
                 u = best[a]
-            elif j == 1:
-                u = (a * 7 + turn) % tried
+            elif turn % 4 == 0:
+                u = (7 * a + turn // 4) % tried
             else:
-                u = neighbours[best[a], j - 2]
+                u = neighbours[best[a], (a + turn) % neighbours.shape[1]]
             if u >= 0:
                 value = expected_value(
                     a,
@@ -152,12 +152,12 @@ def sweep_lower(  # noqa: PLR0913
                     weights,
                     0,
                     tables,
-                    ends,
+                    rest,
                     counts,
                     places,
                     edges,
                     scales,
-                    window,
+                    shifts,
                 )
                 if value > largest:
                     largest, chosen = value, u
@@ -173,12 +173,12 @@ def sweep_upper(  # noqa: PLR0913
     inputs: np.ndarray,
     weights: np.ndarray,
     tables: np.ndarray,
-    ends: tuple[float, float],
+    rest: float,
     counts: np.ndarray,
     places: np.ndarray,
     edges: np.ndarray,
     scales: np.ndarray,
-    window: np.ndarray,
+    shifts: np.ndarray,
     known: np.ndarray,
     found: np.ndarray,
 ) -> None:
@@ -195,12 +195,12 @@ def sweep_upper(  # noqa: PLR0913
         inputs: boxes that cover all inputs, shape (1, U, m, 2).
         weights: see there.
         tables: see there; the negative values, of one row.
-        ends: see there.
+        rest: see there.
         counts: of the grid.
         places: of the grid.
         edges: of the grid.
         scales: of the grid.
-        window: scratch array of 8 entries.
+        shifts: scratch array of 8 entries.
         known: upper bounds for each input, which are replaced, shape (B, U).
         found: receives the upper bounds, shape (B,).
     """
@@ -226,12 +226,12 @@ def sweep_upper(  # noqa: PLR0913
                 weights,
                 0,
                 tables,
-                ends,
+                rest,
                 counts,
                 places,
                 edges,
                 scales,
-                window,
+                shifts,
             )
             # Rounding may lift a bound by a little.
             known[a, chosen] = min(value, largest)
@@ -254,12 +254,12 @@ def expected_value(  # noqa: PLR0913
     weights: np.ndarray,
     row: int,
     tables: np.ndarray,
-    ends: tuple[float, float],
+    rest: float,
     counts: np.ndarray,
     places: np.ndarray,
     edges: np.ndarray,
     scales: np.ndarray,
-    window: np.ndarray,
+    shifts: np.ndarray,
 ) -> float:
     """Bound the expected value of a state under an input from below, for the worst scenario.
 
@@ -274,63 +274,110 @@ def expected_value(  # noqa: PLR0913
         weights: see there.
         row: of the tables.
         tables: see there.
-        ends: see there.
+        rest: see there.
         counts: of the grid.
         places: of the grid.
         edges: of the grid.
         scales: of the grid.
-        window: scratch array.
+        shifts: scratch array.
     """
-    outside, rest = ends
     n, m = effects.shape[2], effects.shape[3]
     worst = inf
     for r in range(images.shape[2]):
+        for i in range(n):
+            low, high = -scales[i, 3], scales[i, 3]
+            for j in range(m):
+                b0, b1 = effects[a, r, i, j, 0], effects[a, r, i, j, 1]
+                u0, u1 = inputs[b, u, j, 0], inputs[b, u, j, 1]
+                p, q, s, t = b0 * u0, b0 * u1, b1 * u0, b1 * u1
+                low += min(min(p, q), min(s, t))
+                high += max(max(p, q), max(s, t))
+            shifts[2 * i], shifts[2 * i + 1] = low, high
         total = rest
         for w in range(images.shape[3]):
-            leaves = False
-            misses = False
-            for i in range(n):
-                low, high = images[a, v, r, w, i, 0], images[a, v, r, w, i, 1]
-                for j in range(m):
-                    b0, b1 = effects[a, r, i, j, 0], effects[a, r, i, j, 1]
-                    if b0 != 0.0 or b1 != 0.0:
-                        u0, u1 = inputs[b, u, j, 0], inputs[b, u, j, 1]
-                        p, q, s, t = b0 * u0, b0 * u1, b1 * u0, b1 * u1
-                        low += min(min(p, q), min(s, t))
-                        high += max(max(p, q), max(s, t))
-                # The sums above are rounded.
-                low, high = low - scales[i, 3], high + scales[i, 3]
-                count = counts[i]
-                period = scales[i, 2]
-                if period > 0.0:
-                    if high - low >= period:
-                        window[2 * i], window[2 * i + 1] = 0, count - 1
-                    else:
-                        turns = period * floor((low - scales[i, 0]) / period)
-                        low, high = low - turns, high - turns
-                        c = cell_of_value(low, i, counts, places, edges, scales)
-                        window[2 * i] = min(max(c, 0), count - 1)
-                        if high < scales[i, 0] + period:
-                            c = cell_of_value(high, i, counts, places, edges, scales)
-                            window[2 * i + 1] = min(c, count - 1)
-                        else:
-                            c = cell_of_value(high - period, i, counts, places, edges, scales)
-                            window[2 * i + 1] = max(c, 0) + count
-                else:
-                    first = cell_of_value(low, i, counts, places, edges, scales)
-                    last = cell_of_value(high, i, counts, places, edges, scales)
-                    misses = misses or last < 0 or first >= count
-                    leaves = leaves or first < 0 or last >= count
-                    window[2 * i], window[2 * i + 1] = max(first, 0), min(last, count - 1)
-            if misses:
-                value = outside
-            else:
-                value = least_value(row, tables, counts, window)
-                if leaves:
-                    value = min(value, outside)
+            image = images[a, v, r, w]
+            f1, l1, f2, l2, f3, l3 = 0, 0, 0, 0, 0, 0
+            f0, l0 = cells_between(
+                image[0, 0] + shifts[0], image[0, 1] + shifts[1], 0, counts, places, edges, scales
+            )
+            if n > 1:
+                f1, l1 = cells_between(
+                    image[1, 0] + shifts[2],
+                    image[1, 1] + shifts[3],
+                    1,
+                    counts,
+                    places,
+                    edges,
+                    scales,
+                )
+            if n > 2:
+                f2, l2 = cells_between(
+                    image[2, 0] + shifts[4],
+                    image[2, 1] + shifts[5],
+                    2,
+                    counts,
+                    places,
+                    edges,
+                    scales,
+                )
+            if n > 3:
+                f3, l3 = cells_between(
+                    image[3, 0] + shifts[6],
+                    image[3, 1] + shifts[7],
+                    3,
+                    counts,
+                    places,
+                    edges,
+                    scales,
+                )
+            value = least_value(f0, l0, f1, l1, f2, l2, f3, l3, row, tables, counts)
             total += weights[w] * value
         worst = min(worst, total)
     return worst
+
+
+def cells_between(
+    low: float,
+    high: float,
+    i: int,
+    counts: np.ndarray,
+    places: np.ndarray,
+    edges: np.ndarray,
+    scales: np.ndarray,
+) -> tuple[int, int]:
+    """Return the first and the last cell that an interval touches along an axis.
+
+    Where the interval leaves the grid, the first one f is returned as -1 - f, and where it misses
+    the grid the last one is -1. Along a periodic axis the last may pass the end: the cells begin
+    again.
+
+    Args:
+        low: lower end of the interval.
+        high: upper end.
+        i: the axis.
+        counts: of the grid.
+        places: of the grid.
+        edges: of the grid.
+        scales: of the grid.
+    """
+    period, last = scales[i, 2], counts[i] - 1
+    if period == 0.0:
+        first = cell_of_value(low, i, counts, places, edges, scales)
+        end = cell_of_value(high, i, counts, places, edges, scales)
+        if first >= 0 and end <= last:
+            return first, end
+        if end < 0 or first > last:
+            return -1, -1
+        return -1 - max(first, 0), min(end, last)
+    if high - low >= period:
+        return 0, last
+    turns = period * floor((low - scales[i, 0]) / period)
+    low, high = low - turns, high - turns
+    first = min(max(cell_of_value(low, i, counts, places, edges, scales), 0), last)
+    if high < scales[i, 0] + period:
+        return first, min(cell_of_value(high, i, counts, places, edges, scales), last)
+    beyond = cell_of_value(high - period, i, counts, places, edges, scales)
+    return first, max(beyond, 0) + last + 1
 
 
 def cell_of_value(
@@ -362,25 +409,67 @@ def cell_of_value(
     return cell
 
 
-def least_value(row: int, tables: np.ndarray, counts: np.ndarray, window: np.ndarray) -> float:
-    """Return the least value of a box of cells.
+def least_value(  # noqa: PLR0913
+    f0: int,
+    l0: int,
+    f1: int,
+    l1: int,
+    f2: int,
+    l2: int,
+    f3: int,
+    l3: int,
+    row: int,
+    tables: np.ndarray,
+    counts: np.ndarray,
+) -> float:
+    """Return the least value of a box of cells; 0 where it leaves the grid, if all are positive.
+
+    An entry of the table stands for a block of cells that begins there.
 
     Args:
+        f0: first cell along the first axis; see `cells_between`, as for all others.
+        l0: last cell.
+        f1: along the second axis.
+        l1: last cell.
+        f2: along the third axis.
+        l2: last cell.
+        f3: along the fourth axis.
+        l3: last cell.
         row: of the tables.
         tables: shape (rows, cells).
         counts: of the grid.
-        window: first and last cell along each axis; they pass the end of a periodic one.
     """
+    n0, n1, n2, n3 = counts[0], counts[1], counts[2], counts[3]
+    b0, b1, b2, b3 = (
+        counts[4 * AXES],
+        counts[4 * AXES + 1],
+        counts[4 * AXES + 2],
+        counts[4 * AXES + 3],
+    )
     least = inf
-    for i0 in range(window[0], window[1] + 1):
-        c0 = (i0 - counts[0] if i0 >= counts[0] else i0) * counts[1]
-        for i1 in range(window[2], window[3] + 1):
-            c1 = (c0 + (i1 - counts[1] if i1 >= counts[1] else i1)) * counts[2]
-            for i2 in range(window[4], window[5] + 1):
-                c2 = (c1 + (i2 - counts[2] if i2 >= counts[2] else i2)) * counts[3]
-                for i3 in range(window[6], window[7] + 1):
-                    c3 = c2 + (i3 - counts[3] if i3 >= counts[3] else i3)
-                    value = tables[row, c3]
+    if min(min(f0, f1), min(f2, f3)) < 0:
+        least = 0.0
+        f0, f1 = (f0 if f0 >= 0 else -1 - f0), (f1 if f1 >= 0 else -1 - f1)
+        f2, f3 = (f2 if f2 >= 0 else -1 - f2), (f3 if f3 >= 0 else -1 - f3)
+    # The last block of an axis ends with the last cell.
+    e0, e1, e2, e3 = (
+        max(f0, l0 - b0 + 1),
+        max(f1, l1 - b1 + 1),
+        max(f2, l2 - b2 + 1),
+        max(f3, l3 - b3 + 1),
+    )
+    for i0 in range(f0, l0 + 1, b0):
+        c0 = min(i0, e0)
+        c0 = (c0 - n0 if c0 >= n0 else c0) * n1
+        for i1 in range(f1, l1 + 1, b1):
+            c1 = min(i1, e1)
+            c1 = (c0 + (c1 - n1 if c1 >= n1 else c1)) * n2
+            for i2 in range(f2, l2 + 1, b2):
+                c2 = min(i2, e2)
+                c2 = (c1 + (c2 - n2 if c2 >= n2 else c2)) * n3
+                for i3 in range(f3, l3 + 1, b3):
+                    c3 = min(i3, e3)
+                    value = tables[row, c2 + (c3 - n3 if c3 >= n3 else c3)]
                     if value < least:
                         least = value
     return least

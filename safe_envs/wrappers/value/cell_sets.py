@@ -19,6 +19,10 @@ _SCAN = {1: 4096, 2: 256, 3: 48, 4: 20}
 """Cells along each coordinate that are looked at to find where the safe set ends."""
 
 _LOOKS = 3
+
+_SHARP = 1e-9
+"""Of the extent of the safe set: how narrow the intervals are in which it ends."""
+
 _AT_ONCE = 1_000_000
 
 _ROUNDING = 1e-12
@@ -81,7 +85,7 @@ class Sets:
         inside, ends = np.ones(shape, dtype=bool), np.zeros(shape, dtype=bool)
         for h in values[: self._barriers]:
             inside &= h.low > 0.0
-        left = values[self._barriers].high > _ROUNDING
+        left = np.broadcast_to(values[self._barriers].high > _ROUNDING, shape)
         if self._stays:
             inside &= ~left
         else:
@@ -146,19 +150,21 @@ def _half(low: Sequence[Any], high: Sequence[Any], number: int) -> tuple[list[An
     return below, above
 
 
-def hull_of(reduced: ReducedProblem, sets: Sets) -> list[tuple[float, float]]:
-    """Return a box that holds the safe part of the workspace at all control instants.
+def hull_of(reduced: ReducedProblem, sets: Sets) -> list[np.ndarray]:
+    """Return edges along each coordinate between which the safe part of the workspace lies.
+
+    The outermost intervals may be very narrow: the safe set ends within them.
 
     Args:
         reduced: the problem.
         sets: of it.
 
     Raises:
-        ConfigurationError: Nothing is safe, or a coordinate is unbounded.
+        ConfigurationError: No state is safe.
     """
     ends = [_range(c) for c in reduced.coordinates]
     if sets.depend_on_time:
-        return ends
+        return [np.array(pair) for pair in ends]
     for _ in range(_LOOKS):
         grid = uniform_grid(reduced.coordinates, ends, [_SCAN[len(ends)]] * len(ends))
         touched = sets.of_cells(grid, 0).touches
@@ -171,7 +177,36 @@ def hull_of(reduced: ReducedProblem, sets: Sets) -> list[tuple[float, float]]:
             (a, b) if c.period else (float(x.edges[i.min()]), float(x.edges[i.max() + 1]))
             for c, (a, b), x, i in zip(reduced.coordinates, ends, grid.axes, places, strict=True)
         ]
-    return ends
+    return [
+        np.array(pair) if c.period else _ends_along(i, reduced, sets, ends)
+        for i, (c, pair) in enumerate(zip(reduced.coordinates, ends, strict=True))
+    ]
+
+
+def _ends_along(
+    i: int, reduced: ReducedProblem, sets: Sets, ends: list[tuple[float, float]]
+) -> np.ndarray:
+    """Return the ends of the safe set along a coordinate, and ends just within, if it has some."""
+    low, high = ends[i]
+    found = {low, high}
+    whole = _range(reduced.coordinates[i])
+    for end, other in ((low, high), (high, low)):
+        if end in whole:
+            continue
+        # No state between `end` and `empty` is safe, for all that is known.
+        empty, full = end, end + (other - end) / _SCAN[len(ends)]
+        while abs(full - empty) > _SHARP * (high - low):
+            middle = 0.5 * (empty + full)
+            slab = [tuple(sorted((end, middle))) if j == i else e for j, e in enumerate(ends)]
+            counts = [1 if j == i else _SCAN[len(ends)] for j in range(len(ends))]
+            grid = uniform_grid(reduced.coordinates, slab, counts)
+            if sets.of_cells(grid, 0).touches.any():
+                full = middle
+            else:
+                empty = middle
+        found -= {end}
+        found |= {empty, full}
+    return np.array(sorted(found))
 
 
 def _range(coordinate: Coordinate) -> tuple[float, float]:

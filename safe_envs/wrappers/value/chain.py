@@ -14,6 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import excess
 from safe_envs.wrappers.value.frame_check import World, check_frame
 from safe_envs.wrappers.value.one_step import Intervals, tidied
 
@@ -87,16 +88,15 @@ class Chain:
 
     def _with_period(self, i: int) -> Coordinate:
         c = self.coordinates[i]
-        ends = math.isfinite(c.low), math.isfinite(c.high)
-        if all(ends):
+        if math.isfinite(c.low) and math.isfinite(c.high):
             return c
         shift = {c.symbol: c.symbol + 2 * sp.pi}
-        if any(ends) or not all(
+        if not all(
             is_zero(e.xreplace(shift) - e - (2 * sp.pi if j == i else 0))
             for j, e in enumerate(self.expressions)
         ):
             raise ConfigurationError(
-                f"{c.symbol} has no bounds and does not repeat after 2 pi, so that no grid can"
+                f"{c.symbol} lacks finite bounds and does not repeat after 2 pi, so that no grid can"
                 " cover it; give the state a workspace"
             )
         return replace(c, low=-math.pi, high=math.pi, period=2 * math.pi)
@@ -162,13 +162,10 @@ class Derivation:
             for c, period, value in zip(frame.coordinates, frame.periods, frame.values, strict=True)
         )
         stepped: Any = [c.expression.xreplace(following) for c in own]
-        outside: Any = problem.outside if verdict.workspace_matters else sp.Integer(-1)
+        outside: Any = excess(verdict.bounds)
         return Chain(
             (*own, *rest),
-            (
-                *(c.expression.xreplace(following) for c in own),
-                *(following[c.symbol] for c in rest),
-            ),
+            (*stepped, *(following[c.symbol] for c in rest)),
             tuple(tidied(b.expression.xreplace(section)) for b in problem.barriers),
             None if problem.goal is None else tidied(problem.goal.xreplace(section)),
             outside.xreplace(section),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 _FINEST = 4
-"""Places of the uniform table of an axis for its narrowest cell."""
+"""Places of the uniform table of an axis for a cell."""
 
 _MOST_PLACES = 1 << 20
 
@@ -40,7 +40,7 @@ class Axis:
         """
         edges = self.edges
         extent = edges[-1] - edges[0]
-        wanted = _FINEST * extent / np.diff(edges).min()
+        wanted = _FINEST * extent / np.median(np.diff(edges))
         places = int(min(max(wanted, self.count), _MOST_PLACES))
         if np.allclose(np.diff(edges), extent / self.count, rtol=1e-9, atol=0.0):
             places = self.count
@@ -89,17 +89,10 @@ class Axis:
         """
         if self.period or not margin:
             return self
-        first, last = self.edges[1] - self.edges[0], self.edges[-1] - self.edges[-2]
-        below, above = int(np.ceil(margin / first)), int(np.ceil(margin / last))
-        return Axis(
-            np.concatenate(
-                [
-                    self.edges[0] - first * np.arange(below, 0, -1),
-                    self.edges,
-                    self.edges[-1] + last * np.arange(1, above + 1),
-                ]
-            )
-        )
+        # The outermost cells may be very narrow.
+        width = float(np.median(np.diff(self.edges)))
+        more = width * np.arange(1, int(np.ceil(margin / width)) + 1)
+        return Axis(np.concatenate([self.edges[0] - more[::-1], self.edges, self.edges[-1] + more]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,8 @@ class GridArrays(NamedTuple):
 
     Attributes:
         counts: for each axis the number of cells, the place of its first edge, that of its first
-            entry in `places`, and the number of these entries; int64, shape (4 * AXES,).
+            entry in `places`, the number of these entries, and the cells of a block for which an
+            entry of the tables stands; int64, shape (5 * AXES,).
         places: of all axes, see `Axis.places`, int32.
         edges: of all axes.
         scales: for each axis the first edge, the entries of `places` for a unit, the period, and
@@ -31,17 +33,23 @@ class GridArrays(NamedTuple):
     scales: np.ndarray
 
 
-def grid_arrays(grid: Grid) -> GridArrays:
-    """Return a grid as arrays."""
-    counts = np.zeros((4, AXES), dtype=np.int64)
-    counts[0] = 1
+def grid_arrays(grid: Grid, blocks: Sequence[int] | None = None) -> GridArrays:
+    """Return a grid as arrays.
+
+    Args:
+        grid: to describe.
+        blocks: cells along each axis for which an entry of the tables stands; None for one.
+    """
+    counts = np.zeros((5, AXES), dtype=np.int64)
+    counts[0] = counts[4] = 1
+    counts[4, : len(grid.axes)] = blocks or 1
     scales = np.zeros((AXES, 4))
     edges = np.concatenate([axis.edges for axis in grid.axes])
     places = np.concatenate([axis.places for axis in grid.axes])
     first_edge = first_place = 0
     for i, axis in enumerate(grid.axes):
         extent = axis.edges[-1] - axis.edges[0]
-        counts[:, i] = axis.count, first_edge, first_place, len(axis.places)
+        counts[:4, i] = axis.count, first_edge, first_place, len(axis.places)
         size = max(abs(axis.edges[0]), abs(axis.edges[-1]))
         scales[i] = axis.edges[0], len(axis.places) / extent, axis.period, _SLACK * size
         first_edge += axis.count + 1

@@ -10,12 +10,11 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.bellman_kernel import AXES
-from safe_envs.wrappers.value.cell_sets import Sets
+from safe_envs.wrappers.value.cell_sets import CellSets, Sets
 from safe_envs.wrappers.value.grid_arrays import grid_arrays
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.smoothing import Smoothing
-from safe_envs.wrappers.value.solve import MEAN_PARTS
 from safe_envs.wrappers.value.step_images import Step
 from safe_envs.wrappers.value.sweeps import bellman_functions
 from safe_envs.wrappers.value.table import ValueTable
@@ -47,11 +46,12 @@ class LookAhead:
             )
         self._table, self._reduced = table, small
         self._step, self._sets = Step(small), Sets(small, settings.leaving)
-        self._smoothing = Smoothing(table.grid, self._step.blur, MEAN_PARTS)
+        self._smoothing = Smoothing(table.grid, self._step.blur)
         self._means = grid_arrays(self._smoothing.means)
+        self._parts: CellSets | None = None
         self._functions = bellman_functions()
         self._scanned = scanned_inputs(small.box, settings.inputs)
-        self._window = np.zeros(2 * AXES, dtype=np.int64)
+        self._shifts = np.zeros(2 * AXES)
         cells = self._smoothing.means.cells
         self._ahead = {
             sign: np.empty((len(table.lower), cells), dtype=np.float32) for sign in (1, -1)
@@ -66,9 +66,11 @@ class LookAhead:
             k: control instants, int array (B,).
             x: n components of the states, (B,).
         """
-        cells = self._table.grid.cell_of(self._coordinates(x))
+        q = self._coordinates(x)
+        cells = self._table.grid.cell_of(q)
         rows = np.maximum(np.asarray(k) - self._table.first, 0)
-        return np.where(cells < 0, 0.0, self._table.lower[rows, cells]).astype(np.float64)
+        inside, _ = self._sets.of_states(k, q)
+        return np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
 
     def expected(self, k: np.ndarray, x: Components, u: np.ndarray) -> np.ndarray:
         """Return lower bounds of the expected next value of the lower envelope.
@@ -179,8 +181,8 @@ class LookAhead:
         found: np.ndarray,
     ) -> None:
         rows = np.maximum(k + 1 - self._table.first, 0)
-        for row in np.unique(rows):
-            self._fill_row(int(row), sign)
+        for row, instant_ahead in zip(*np.unique(rows, return_index=True), strict=True):
+            self._fill_row(int(row), sign, int(k[instant_ahead]) + 1)
         images, effects = self._step.images(q, q, inputs, instant * self._reduced.substeps)
         rest = 0.0 if sign > 0 else -(self._step.noise.rest + self._smoothing.beyond)
         self._functions["expected_values"](
@@ -192,16 +194,19 @@ class LookAhead:
             self._step.noise.weights,
             rows,
             self._ahead[sign],
-            (0.0, rest),
+            rest,
             *self._means,
-            self._window,
+            self._shifts,
             found,
         )
 
-    def _fill_row(self, row: int, sign: int) -> None:
+    def _fill_row(self, row: int, sign: int, k: int) -> None:
         if not self._filled[sign][row]:
             table = self._table.lower[row] if sign > 0 else -self._table.upper[row]
-            self._ahead[sign][row] = self._smoothing.smoothed(table, 0.0)
+            if self._parts is None or self._sets.depend_on_time:
+                self._parts = self._sets.of_cells(self._smoothing.fine, k)
+            counts = self._parts.inside if sign > 0 else self._parts.touches
+            self._ahead[sign][row] = self._smoothing.smoothed(table, counts)
             self._filled[sign][row] = True
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_HALF_EDGES = (0.0, 0.3, 0.62, 0.96, 1.32, 1.72, 2.2, 2.8, 3.8, 5.6)
+_HALF_EDGES = (0.0, 0.45, 0.95, 1.5, 2.1, 2.8, 3.8, 5.6)
 """Upper ends of the intervals of a normal, with their mirror images; beyond the last is .00000002.
 They are wider where the density is low."""
 

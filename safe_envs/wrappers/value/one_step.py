@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,8 +15,8 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number
 
-_LARGEST_EXPANDED = 150
-"""Operations of an expression that is worth expanding to see whether it gets shorter."""
+_LARGEST = 600
+"""Parts of an expression that is too large to be expanded to see whether it gets shorter."""
 
 Intervals = Mapping[sp.Symbol, tuple[float, float]]
 
@@ -85,7 +86,7 @@ def _ends(system: ControlAffineSDE, parameter: sp.Symbol, given: Any) -> tuple[f
     low, high = finite_number(f"low end of {name}", low), finite_number(f"high end of {name}", high)
     if low > high:
         raise ConfigurationError(f"interval of {name} = ({low:g}, {high:g}); its low end is higher")
-    for value in {low, high, 0.0 if low < 0.0 < high else low}:
+    for value in (low, high, *[0.0] * (low < 0.0 < high)):
         fitting(parameter, value)
         rate(system.with_parameters(**{name: value}))  # Raises where there is a division by 0.
     return low, high
@@ -127,13 +128,13 @@ def sub_step(
 def tidied(expression: Any) -> Any:
     """Return an expression with fewer occurrences of its symbols, if that is easily done.
 
-    The fewer times a symbol occurs, the narrower is what interval arithmetic makes of it.
+    The fewer times a symbol occurs, the narrower is what interval arithmetic makes of it. Large
+    expressions stay as they are.
     """
-    best: Any = expression
-    if sp.count_ops(expression) <= _LARGEST_EXPANDED:
-        expanded = sp.expand(expression, trig=False, power_base=False, power_exp=False, log=False)
-        # Ones that rounding alone keeps apart from zero do not come up: terms are of one sign.
-        best = min(expression, expanded, key=occurrences)
+    if len(list(itertools.islice(sp.preorder_traversal(expression), _LARGEST))) == _LARGEST:
+        return expression
+    expanded = sp.expand(expression, trig=False, power_base=False, power_exp=False, log=False)
+    best: Any = min(expression, expanded, _with_mean_angles(expanded), key=occurrences)
     for symbol in sorted(best.free_symbols, key=sp.default_sort_key):
         best = min(best, _collected(best, symbol), key=occurrences)
     return best
@@ -157,3 +158,29 @@ def _collected(expression: Any, symbol: sp.Symbol) -> Any:
         return expression
     rest = [t for t, c in linear.items() if not (c != 0 and not c.has(symbol) and t == c * symbol)]
     return sp.Add(*rest, sp.Mul(symbol, sp.Add(*factors)))
+
+
+def _with_mean_angles(expression: Any) -> Any:
+    """Write the sum of two cosines as twice the cosine of the mean times that of half the gap.
+
+    The rates that a step of Runge and Kutta takes of a heading are at its start, middle and end: so
+    the heading occurs once.
+    """
+    turns: dict[Any, list[Any]] = {}
+    rest: list[Any] = []
+    for term in sp.Add.make_args(expression):
+        found = [f for f in sp.Mul.make_args(term) if isinstance(f, sp.sin | sp.cos)]
+        if len(found) == 1:
+            number, factor = (term / found[0]).as_independent(*term.free_symbols)
+            turns.setdefault((found[0].func, number, factor), []).append(found[0].args[0])
+        else:
+            rest.append(term)
+    sums: dict[Any, list[Any]] = {}
+    for (function, number, factor), angles in turns.items():
+        while len(angles) > 1:
+            a, b = angles.pop(), angles.pop()
+            mean, half = sp.expand((a + b) / 2), sp.expand((a - b) / 2)
+            sums.setdefault((function(mean), factor), []).append(2 * number * sp.cos(half))
+        for angle in angles:
+            sums.setdefault((function(angle), factor), []).append(number)
+    return sp.Add(*rest, *(turn * factor * sp.Add(*s) for (turn, factor), s in sums.items()))

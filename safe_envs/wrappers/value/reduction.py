@@ -9,7 +9,7 @@ periodic, so that one turn of it is enough.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -21,7 +21,7 @@ from safe_envs.dynamics.codegen import Components, compile_function
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.chain import Coordinate, Derivation
-from safe_envs.wrappers.value.known_states import known_states
+from safe_envs.wrappers.value.known_states import known_states, known_values
 from safe_envs.wrappers.value.one_step import Intervals, sub_step, with_intervals
 
 MOST_COORDINATES = 4
@@ -30,7 +30,7 @@ MOST_COORDINATES = 4
 _NONE: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReducedProblem:
     """The Markov chain of a simulation, and its sets, in few coordinates.
 
@@ -82,9 +82,17 @@ class ReducedProblem:
         Returns:
             A float or an array for each coordinate; periodic ones may be outside their range.
         """
-        flavour = "arrays" if any(isinstance(v, np.ndarray) for v in x) else "floats"
+        arrays, floats = self._of_states
+        return (arrays if any(isinstance(v, np.ndarray) for v in x) else floats)(*x)
+
+    @cached_property
+    def _of_states(self) -> tuple[Callable[..., Components], Callable[..., Components]]:
         expressions = tuple(c.expression for c in self.coordinates)
-        return compile_function(self.problem.plant.states, expressions, flavour)(*x)
+        states = self.problem.plant.states
+        return (
+            compile_function(states, expressions, "arrays"),
+            compile_function(states, expressions, "floats"),
+        )
 
     @cached_property
     def fingerprint(self) -> str:
@@ -129,15 +137,18 @@ def reduced(
     if knowledge not in worlds:
         raise ConfigurationError(f"knowledge = {shown(knowledge)}; {nearest(knowledge, worlds)}")
     system, uncertain = with_intervals(worlds[knowledge], intervals)
+    foreknown = known_states(problem, system)
+    free = [s for s in problem.plant.states if s not in foreknown]
+    if problem.frame is None:
+        _require_few(problem, free)
     noise, moved = sub_step(system, problem.dt / problem.substeps)
-    known, constant = known_states(problem, system, moved)
-    foreknown = frozenset((*known, *constant))
-    derivation, note = Derivation(problem, system, uncertain, noise, moved, foreknown), ""
-    chain = derivation.in_states()
+    derivation = Derivation(problem, system, uncertain, noise, moved, frozenset(foreknown))
+    chain, note = derivation.in_states(), ""
     if problem.frame is not None:
         framed, note = derivation.in_frame(problem.frame)
         chain = framed or chain
-    _require_few(problem, chain.coordinates, note)
+    _require_few(problem, [c.symbol for c in chain.coordinates], note)
+    known, constant = known_values(problem, foreknown, derivation.following)
     chain = chain.with_numbers(constant).with_periods()
     used = set().union(*(e.free_symbols for e in chain.expressions))
     return ReducedProblem(
@@ -158,9 +169,9 @@ def reduced(
     )
 
 
-def _require_few(problem: SafetyProblem, coordinates: Sequence[Coordinate], note: str) -> None:
+def _require_few(problem: SafetyProblem, coordinates: Sequence[sp.Symbol], note: str = "") -> None:
     if len(coordinates) > MOST_COORDINATES:
-        names = ", ".join(c.symbol.name for c in coordinates)
+        names = ", ".join(s.name for s in coordinates)
         raise ConfigurationError(
             f"{problem.name} has {len(coordinates)} coordinates ({names}); a grid takes at most"
             f" {MOST_COORDINATES}. Fewer are left if states that neither input nor noise reaches"

@@ -11,8 +11,6 @@ from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 KNOWLEDGE = ("model", "plant")
 LEAVING = ("violation", "safe")
 
-_MOST_CELLS = 1 << 28
-
 
 @dataclass(frozen=True)
 class ValueSettings:
@@ -47,9 +45,9 @@ class ValueSettings:
         if self.cells is not None:
             object.__setattr__(self, "cells", tuple(self.cells))
             for count in self.cells:
-                require_whole("cells", count, 2, _MOST_CELLS)
+                require_whole("cells", count, 2)
         if self.inputs is not None:
-            require_whole("inputs", self.inputs, 2, 1001)
+            require_whole("inputs", self.inputs, 2)
         if not 0 < self.memory < float("inf"):
             raise ConfigurationError(f"memory = {shown(self.memory)}; give a number of bytes")
         intervals = {

@@ -6,9 +6,11 @@ u_k, E S_{k+1} L_{k+1} >= E S_k L_k, so that these inputs keep the episode safe 
 L_0(x_0) at least. With H_K >= 1_C, H_k >= 1_C on D, and H_k(x) >= E H_{k+1} for every input of the
 box, no policy does so with a larger probability than H_0(x_0), not even one that remembers.
 
-A cell counts for L if it lies wholly in C, for H if it touches C. Its value is the least (largest)
-expected value over all its points: the step takes the cell into boxes, and the least (largest)
-value of all cells that a box touches stands for it. The arithmetic is that of floating point, not
+The envelopes are constant on the part in C of each cell, and 0 outside C. The value of a cell is
+the least (largest) expected value over all its points: the step takes the cell into boxes, and the
+least (largest) value of all cells that a box touches stands for it. Where noise is smooth along an
+axis, cells at the edge of C are cut, and L counts the parts that lie wholly in C, H those that
+touch it. The arithmetic is that of floating point, not
 rounded outwards throughout: the envelopes are computed, not proved.
 """
 
@@ -33,9 +35,6 @@ from safe_envs.wrappers.value.sweeps import bellman_functions, in_parts, threads
 from safe_envs.wrappers.value.table import ValueTable
 
 Progress = Callable[[float], None]
-
-MEAN_PARTS = 2
-"""Parts of a cell in the grid of means; see `Smoothing`."""
 
 
 def solve(
@@ -67,7 +66,7 @@ class _Solver:
     def run(self, progress: Progress | None) -> ValueTable:
         begun = time.perf_counter()
         small, grid = self._reduced, self._grid
-        smoothing = Smoothing(grid, self._step.blur, MEAN_PARTS)
+        smoothing = Smoothing(grid, self._step.blur)
         with ThreadPoolExecutor(threads(), "safe_envs_values") as pool:
             rows = self._rows(_Operator(self, smoothing, pool), progress)
         lower, upper = (np.stack(each[::-1]) for each in zip(*rows, strict=True))
@@ -88,8 +87,8 @@ class _Solver:
     ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return both envelopes at the instants K, K - 1, ..., down to where they stop changing."""
         steps = self._reduced.steps
-        cells = operator.cells(steps)
-        rows = [(cells.inside.astype(np.float32), cells.touches.astype(np.float32))]
+        last = operator.cells(steps).touches.astype(np.float32)
+        rows = [(last, last)]
         for k in range(steps - 1, -1, -1):
             rows.append(operator.applied(*rows[-1], k))
             if operator.is_constant and all(map(np.array_equal, rows[-1], rows[-2])):
@@ -107,10 +106,11 @@ class _Operator:
         self._reduced, self._grid, self._step = solver._reduced, solver._grid, solver._step
         self._sets, self._pool, self._smoothing = solver._sets, pool, smoothing
         self._scanned = solver._scanned
-        self._functions, self._means = bellman_functions(), grid_arrays(smoothing.means)
+        self._functions = bellman_functions()
+        self._means = grid_arrays(smoothing.means, smoothing.parts)
         self._moves = self._step.depends_on_time
         self.is_constant = not (self._moves or self._sets.depend_on_time)
-        self._cells = self._sets.of_cells(self._grid, self._reduced.steps)
+        self._cells, self._parts = self._classified(self._reduced.steps)
         everywhere = np.arange(self._grid.cells)
         self._numbers = np.flatnonzero(self._cells.touches) if self.is_constant else everywhere
         self._images: tuple[StepImages, StepImages] | None = None
@@ -121,8 +121,14 @@ class _Operator:
     def cells(self, k: int) -> CellSets:
         """Return what the cells lie in at a control instant."""
         if self._sets.depend_on_time:
-            self._cells = self._sets.of_cells(self._grid, k)
+            self._cells, self._parts = self._classified(k)
         return self._cells
+
+    def _classified(self, k: int) -> tuple[CellSets, CellSets]:
+        """Return what the cells and their parts lie in at a control instant."""
+        cells = self._sets.of_cells(self._grid, k)
+        fine = self._smoothing.fine
+        return cells, cells if fine.shape == self._grid.shape else self._sets.of_cells(fine, k)
 
     def applied(
         self, lower: np.ndarray, upper: np.ndarray, k: int
@@ -134,6 +140,7 @@ class _Operator:
             upper: upper one.
             k: the instant.
         """
+        ahead = self._parts
         cells = self.cells(k)
         if self._images is None or self._moves:
             self._images = self._imaged(k)
@@ -142,12 +149,12 @@ class _Operator:
         here = CellSets(*(each[self._numbers] for each in cells))
         found = np.zeros(len(self._numbers))
         bounds = np.zeros(len(self._numbers))
-        self._sweep_lower(lower, found, here)
-        self._sweep_upper(upper, bounds)
+        self._sweep_lower(self._around(lower, ahead.inside), found, here)
+        self._sweep_upper(self._around(-upper, ahead.touches), bounds)
         self._turn += 1
-        new_lower = (cells.inside & cells.ends).astype(np.float32)
+        new_lower = (cells.touches & cells.ends).astype(np.float32)
         new_upper = (cells.touches & cells.may_end).astype(np.float32)
-        going = here.inside & ~here.ends
+        going = here.touches & ~here.ends
         new_lower[self._numbers[going]] = rounded_down(np.clip(found[going], 0.0, 1.0))
         going = here.touches & ~here.may_end
         new_upper[self._numbers[going]] = -rounded_down(-np.clip(bounds[going], 0.0, 1.0))
@@ -162,16 +169,18 @@ class _Operator:
         boxed = self._step.images(low, high, self._scanned.boxes, k * self._reduced.substeps)
         return single, boxed
 
-    def _sweep_lower(self, lower: np.ndarray, found: np.ndarray, here: CellSets) -> None:
-        tables = self._smoothing.smoothed(lower, 0.0)[None]
+    def _around(self, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        return self._smoothing.least_around(self._smoothing.smoothed(values, counts))[None]
+
+    def _sweep_lower(self, tables: np.ndarray, found: np.ndarray, here: CellSets) -> None:
         images, effects = self._images[0]
         sweep, step = self._functions["sweep_lower"], self._step
-        self._best[~(here.inside & ~here.ends)] = -1
-        self._best[here.inside & ~here.ends & (self._best < 0)] = 0
+        going = here.touches & ~here.ends
+        self._best = np.where(going, np.maximum(self._best, 0), -1)
         in_parts(
             self._pool,
             len(self._numbers),
-            lambda first, last, window: sweep(
+            lambda first, last, shifts: sweep(
                 first,
                 last,
                 self._turn if self.is_constant else self._turn % 8,
@@ -180,24 +189,23 @@ class _Operator:
                 self._scanned.ends,
                 step.noise.weights,
                 tables,
-                (0.0, 0.0),
+                0.0,
                 self._scanned.neighbours,
                 *self._means,
-                window,
+                shifts,
                 self._best,
                 found,
             ),
         )
 
-    def _sweep_upper(self, upper: np.ndarray, bounds: np.ndarray) -> None:
-        tables = self._smoothing.smoothed(-upper, 0.0)[None]
+    def _sweep_upper(self, tables: np.ndarray, bounds: np.ndarray) -> None:
         images, effects = self._images[1]
         sweep, step = self._functions["sweep_upper"], self._step
         rest = -(step.noise.rest + self._smoothing.beyond)
         in_parts(
             self._pool,
             len(self._numbers),
-            lambda first, last, window: sweep(
+            lambda first, last, shifts: sweep(
                 first,
                 last,
                 images,
@@ -205,9 +213,9 @@ class _Operator:
                 self._scanned.boxes,
                 step.noise.weights,
                 tables,
-                (0.0, rest),
+                rest,
                 *self._means,
-                window,
+                shifts,
                 self._known,
                 bounds,
             ),

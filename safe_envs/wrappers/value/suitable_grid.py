@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.value.cell_sets import Sets, hull_of, uniform_grid
-from safe_envs.wrappers.value.grid import Grid
+from safe_envs.wrappers.value.cell_sets import Sets, hull_of
+from safe_envs.wrappers.value.grid import Axis, Grid
 from safe_envs.wrappers.value.reduction import ReducedProblem
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.step_images import Step
@@ -35,7 +35,8 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
         ConfigurationError: The numbers of cells do not fit the problem or the memory.
     """
     n = len(small.coordinates)
-    ends = hull_of(small, sets)
+    hull = hull_of(small, sets)
+    ends = [(float(edges[0]), float(edges[-1])) for edges in hull]
     if settings.cells is not None and len(settings.cells) != n:
         names = ", ".join(str(c.symbol) for c in small.coordinates)
         raise ConfigurationError(
@@ -49,7 +50,23 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
             f"{math.prod(counts)} cells at {small.steps + 1} instants do not fit"
             f" {settings.memory / 1e9:.3g} GB of memory; take at most {most} cells, or more memory"
         )
-    return uniform_grid(small.coordinates, ends, counts)
+    return Grid(
+        tuple(
+            Axis(_cut(edges, count), c.period)
+            for c, edges, count in zip(small.coordinates, hull, counts, strict=True)
+        )
+    )
+
+
+def _cut(hull: np.ndarray, count: int) -> np.ndarray:
+    """Return edges of cells of one size, and those of the narrow intervals at the ends."""
+    low, high = _wide(hull)
+    return np.unique(np.concatenate([hull, np.linspace(low, high, count + 1)]))
+
+
+def _wide(hull: np.ndarray) -> tuple[float, float]:
+    widest = int(np.diff(hull).argmax())
+    return float(hull[widest]), float(hull[widest + 1])
 
 
 def _counts(

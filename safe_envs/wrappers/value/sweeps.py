@@ -50,5 +50,5 @@ def in_parts(pool: ThreadPoolExecutor, count: int, sweep: Callable[[int, int, An
     """
     size = max(1, -(-count // (_PARTS * threads())))
     parts = [(first, min(first + size, count)) for first in range(0, count, size)]
-    for done in [pool.submit(sweep, *part, np.zeros(2 * AXES, dtype=np.int64)) for part in parts]:
+    for done in [pool.submit(sweep, *part, np.zeros(2 * AXES)) for part in parts]:
         done.result()

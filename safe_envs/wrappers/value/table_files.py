@@ -193,7 +193,7 @@ def _require_values(table: ValueTable) -> None:
     for axis in axes:
         edges, period = axis.edges, axis.period
         if edges.dtype != np.float64 or edges.ndim != 1 or len(edges) < 2:
-            raise ValueError("the edges of an axis are no row of numbers")
+            raise ValueError("the edges of an axis are no list of numbers")
         if not (np.isfinite(edges).all() and (np.diff(edges) > 0).all()):
             raise ValueError("the edges of an axis do not increase")
         extent = edges[-1] - edges[0]
@@ -201,14 +201,14 @@ def _require_values(table: ValueTable) -> None:
             raise ValueError("the edges of an axis do not cover its period")
     inputs = table.inputs
     if inputs.dtype != np.float64 or inputs.ndim != 2 or not np.isfinite(inputs).all():
-        raise ValueError("the inputs are no rows of numbers")
+        raise ValueError("the inputs are no table of numbers")
     if not axes or not inputs.size or not np.isfinite(table.seconds) or table.seconds < 0:
         raise ValueError("it has no axis, no input, or no time")
     shape = (len(table.lower), table.grid.cells)
     for values in (table.lower, table.upper):
         if values.dtype != np.float32 or values.shape != shape or not values.size:
             raise ValueError(f"an envelope is no table of {shape} values")
-    # Row by row, for a table may fill half of the memory. A comparison with NaN is false.
+    # One instant after the other, for a table may fill half of the memory. NaN is not <= 1.
     for lower, upper in zip(table.lower, table.upper, strict=True):
         if not (lower.min() >= 0 and upper.max() <= 1 and (lower <= upper).all()):
             raise ValueError("its values are not 0 <= lower <= upper <= 1")

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import sympy as sp
 
+from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.simulation import Simulation
+from safe_envs.problem.signals import TIME
 from safe_envs.registry import make_problem
+from safe_envs.wrappers.value.one_step import occurrences, sub_step
 from safe_envs.wrappers.value.reduction import reduced
 
 COORDINATES = {
@@ -27,7 +33,7 @@ COORDINATES = {
     "CubicSDEDisk": ("x_1", "x_2"),
     "Scalar": ("x",),
 }
-x, y, p, u, w, a, b, s = sp.symbols("x y p u w a b s", real=True)
+x, y, p, u, a, b, s = sp.symbols("x y p u a b s", real=True)
 NUMBERS = {"box": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0}
 
 
@@ -74,17 +80,17 @@ def put_known(found, states, instant: int):
     return states
 
 
-@pytest.mark.parametrize("knowledge", ["plant", "model"])
 @pytest.mark.parametrize(
-    ("name", "options"),
+    ("name", "options", "knowledge"),
     [
-        *((name, {}) for name in COORDINATES),
-        ("StochasticDubins", {"substeps": 3}),
-        ("DubinsDisk", {"substeps": 2}),
-        ("DubinsDisk", {"noise": 0.1}),
-        ("DubinsObstacle", {"substeps": 2, "noise": 0.1}),
-        ("DubinsObstacles", {"num_obstacles": 1}),
-        ("DubinsObstacles", {"start": (-5.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)}),
+        *((name, {}, "plant") for name in COORDINATES),
+        *((name, {}, "model") for name in ("DubinsDisk", "DubinsObstacle", "QuadrotorAltitude")),
+        ("StochasticDubins", {"substeps": 3}, "plant"),
+        ("DubinsDisk", {"substeps": 2}, "plant"),
+        ("DubinsDisk", {"noise": 0.1}, "model"),
+        ("DubinsObstacle", {"substeps": 2, "noise": 0.1}, "plant"),
+        ("DubinsObstacles", {"num_obstacles": 1}, "plant"),
+        ("DubinsObstacles", {"start": (-5.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)}, "plant"),
     ],
 )
 def test_a_step_in_coordinates_is_the_step_of_the_simulation(name, options, knowledge):
@@ -95,8 +101,8 @@ def test_a_step_in_coordinates_is_the_step_of_the_simulation(name, options, know
     if not options:
         assert tuple(map(str, found.symbols)) == COORDINATES[name]
     instant = 5 * problem.substeps
-    x, inputs = sampled(problem)
-    x, inputs = tuple(put_known(found, x, instant)), tuple(inputs)
+    states, inputs = sampled(problem)
+    x, inputs = tuple(put_known(found, states, instant)), tuple(inputs)
     random = np.random.default_rng(2)
     channels = len(found.noise)
     assert channels * problem.substeps == Simulation(problem, "arrays").integrator.channels
@@ -108,8 +114,26 @@ def test_a_step_in_coordinates_is_the_step_of_the_simulation(name, options, know
         q = stepped(found, q, inputs, seen_w, instant + k)
         seen = integrator.step(seen, inputs, w)
         draws += [*w]
-    after = Simulation(problem, "arrays").integrator.step(x, inputs, draws)
+    simulation = Simulation(problem, "arrays")
+    after = simulation.integrator.step(x, inputs, draws)
     require_same(found, q, found.of_states(after))
+    require_same_readings(found, simulation, x, instant)
+
+
+def require_same_readings(found, simulation, x, instant: int):
+    """Check barriers, goal and workspace at states against those of the simulation."""
+    problem = found.problem
+    _, h, _, outside, goal = simulation.measure(x, [0.0] * len(problem.inputs), 0.0)
+    read = (*found.barriers, sp.sympify(found.goal if found.goal is not None else -1))
+    function = compile_function((*found.symbols, *found.known), (*read, found.outside), "arrays")
+    values = function(*found.of_states(x), *(v[instant] for v in found.known.values()))
+    for value, right in zip(values[:-1], (*h, goal), strict=True):
+        np.testing.assert_allclose(value, right, rtol=1e-11, atol=1e-11)
+    if problem.frame is None:
+        np.testing.assert_allclose(values[-1], np.broadcast_to(outside, x[0].shape), rtol=1e-12)
+    else:
+        assert (h[0][outside > 0.0] < 0.0).all()
+        assert values[-1] == -1.0
 
 
 def turned(w, x):
@@ -117,3 +141,213 @@ def turned(w, x):
     angle = np.arctan2(x[1], x[0])
     cos, sin = np.cos(angle), np.sin(angle)
     return cos * w[0] + sin * w[1], cos * w[1] - sin * w[0]
+
+
+def test_coordinates_of_one_state_are_floats():
+    found = reduced(problem_of("StochasticDubins"))
+    distance, phi = found.of_states((3.0, 4.0, 1.0))
+    assert type(distance) is float
+    assert (distance, phi) == pytest.approx((5.0, 1.0 - math.atan2(4.0, 3.0)), abs=1e-15)
+    assert found.of_states((0.0, 0.0, 1.0)) == (0.0, 1.0)
+    with_arrays = found.of_states((np.array([3.0]), np.array([4.0]), 1.0))
+    assert np.concatenate(with_arrays).tolist() == [distance, phi]
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("DubinsObstacle", {}),
+        ("DubinsObstacle", {"noise": 0.1}),
+        ("DubinsObstacles", {"start": (-5.0, 0.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)}),
+    ],
+)
+def test_known_states_are_those_of_the_simulation(name, options, substeps):
+    problem = problem_of(name, substeps=substeps, horizon=5.0, **options)
+    found = reduced(problem)
+    simulation = Simulation(problem, "floats")
+    x = tuple(map(float, problem.starts[problem.start].proposals(1)[0]))
+    paths = [x]
+    draws = [0.3] * simulation.integrator.channels
+    for _ in range(problem.steps):
+        paths.append(simulation.integrator.step(paths[-1], (0.2,), draws))
+    assert found.known
+    for state, values in found.known.items():
+        assert values.shape == (problem.steps * substeps + 1,)
+        path = np.array(paths)[:, problem.plant.states.index(state)]
+        np.testing.assert_allclose(values[::substeps], path, rtol=1e-13, atol=1e-13)
+
+
+def test_constant_states_become_numbers():
+    found = reduced(problem_of("ACC"))
+    assert not found.known
+    assert {e.name for e in found.step[1].free_symbols} == {"x_1", "x_3"}
+    assert reduced(problem_of("ACC", start=(15.0, 25.0, 150.0))).step[1] != found.step[1]
+
+
+def custom(rate, start, barriers=1 - x**2, diffusion=None, states=(x, y), parameters=None, **rest):
+    system = ControlAffineSDE.from_rate(states, (u,), rate, diffusion, parameters or {})
+    return state_problem(system, barriers, start=start, **{**NUMBERS, **rest})
+
+
+def test_a_state_is_known_only_if_all_that_moves_it_is():
+    # p follows y, y follows the clock b; with a start of b that is drawn none of them is known.
+    def problem_from(start_of_b):
+        workspace = dict.fromkeys((x, y, p, b), (-9.0, 9.0))
+        rate = [u + y, p, -b * y, 1]
+        start = [0, 1, 0, start_of_b]
+        return custom(rate, start, states=(x, y, p, b), workspace=workspace)
+
+    assert list(map(str, reduced(problem_from(0.5)).symbols)) == ["x"]
+    assert list(map(str, reduced(problem_from((0.0, 0.5))).symbols)) == ["x", "y", "p", "b"]
+    # Noise and uncertain parameters are no knowledge.
+    clock = {"start": [0, 0], "workspace": dict.fromkeys((x, y), (-9.0, 9.0)), "parameters": {a: 1}}
+    drifting = custom([u + y, a], **clock)
+    assert list(map(str, reduced(drifting).symbols)) == ["x"]
+    assert list(map(str, reduced(drifting, intervals={"a": (1, 2)}).symbols)) == ["x", "y"]
+    noisy = custom([u + y, 0], diffusion=[0, a], **clock)
+    assert list(map(str, reduced(noisy).symbols)) == ["x", "y"]
+
+
+def test_time_in_a_goal_is_known():
+    found = reduced(replace(problem_of("Scalar"), goal=TIME - 1, substeps=4))
+    assert found.goal == TIME - 1
+    problem = found.problem
+    np.testing.assert_allclose(found.known[TIME][::4], np.arange(problem.steps + 1) * problem.dt)
+    assert TIME not in reduced(problem_of("Scalar")).known
+
+
+def test_intervals_keep_parameters_symbolic_in_drift_and_noise():
+    problem = problem_of("ACCGap")
+    found = reduced(problem, intervals={"M": (1500, 1800), "sigma_2": (0.1, 0.9)})
+    assert {s.name: ends for s, ends in found.intervals.items()} == {
+        "M": (1500.0, 1800.0),
+        "sigma_2": (0.1, 0.9),
+    }
+    states, inputs = sampled(problem)
+    draws = np.random.default_rng(3).standard_normal((2, len(states[0])))
+    q = stepped(found, states, inputs, draws, 0, values=(1700.0, 0.2))
+    changed = problem_of("ACCGap", plant={"M": 1700.0, "sigma_2": 0.2})
+    after = Simulation(changed, "arrays").integrator.step(tuple(states), tuple(inputs), draws)
+    require_same(found, q, after)
+
+
+def test_an_interval_keeps_the_symbol_of_a_positive_parameter_apart():
+    mass = sp.Symbol("mass", positive=True)
+    problem = custom(
+        [y, u / mass], [0, 0], parameters={mass: 2.0}, workspace={y: (-9, 9), x: (-9, 9)}
+    )
+    found = reduced(problem, intervals={"mass": (1.0, 3.0)})
+    (symbol,) = found.intervals
+    assert symbol.name == "mass"
+    assert symbol in found.step[1].free_symbols
+    with pytest.raises(ConfigurationError, match="parameter mass = -1"):
+        reduced(problem, intervals={"mass": (-1.0, 3.0)})
+
+
+@pytest.mark.parametrize(
+    ("intervals", "message"),
+    [
+        ({"speed": (1, 2)}, "names the parameter 'speed'"),
+        ({"a": (2, 1)}, "its low end is higher"),
+        ({"a": 1}, r"give \(low, high\)"),
+        ({"a": (0, math.inf)}, "finite"),
+        ({"a": (-1, 2)}, "division"),
+        ({"s": (0, 2)}, "begin them above 0"),
+    ],
+)
+def test_intervals_that_are_refused(intervals, message):
+    bounds = {"workspace": dict.fromkeys((x, y), (-9, 9)), "parameters": {a: 1.0, s: 0.5}}
+    problem = custom([y, u / a], [0, 0], diffusion=[0, s], **bounds)
+    assert reduced(problem, intervals={"a": (1, 2), "s": (0.1, 2)}).intervals
+    with pytest.raises(ConfigurationError, match=message):
+        reduced(problem, intervals=intervals)
+
+
+def test_problems_that_no_grid_covers_are_refused():
+    with pytest.raises(ConfigurationError, match=r"12 coordinates .*psidot.*known values"):
+        reduced(problem_of("Quadrotor"))
+    with pytest.raises(ConfigurationError, match=r"8 coordinates .*phase_5"):
+        reduced(problem_of("DubinsObstacles"))
+    with pytest.raises(ConfigurationError, match="knowledge = 'planet'"):
+        reduced(problem_of("Scalar"), "planet")
+
+
+def test_only_what_repeats_is_periodic():
+    bounds = {"workspace": {x: (-9, 9)}}
+    rates = {"sine": sp.sin(y), "double": sp.cos(2 * y), "half": sp.sin(y / 2), "bounded": y}
+    found = {}
+    for name, rate in rates.items():
+        problem = custom([rate + u, 1 + u], [0, (0.0, 0.5)], **bounds)
+        if name in ("sine", "double"):
+            found[name] = reduced(problem).coordinates[1]
+            assert (found[name].low, found[name].high) == (-math.pi, math.pi)
+            assert found[name].period == 2 * math.pi
+        else:
+            with pytest.raises(ConfigurationError, match="y lacks finite bounds"):
+                reduced(problem)
+    # One that is read though nothing depends on it, and one with a bound on one side.
+    growing = custom([sp.sin(y) + u, -y + u], [0, (0.0, 0.5)], **bounds)
+    with pytest.raises(ConfigurationError, match="y lacks finite bounds"):
+        reduced(growing)
+    one_side = custom([sp.sin(y) + u, u], [0, (0, 0.5)], workspace={x: (-9, 9), y: (-1, math.inf)})
+    with pytest.raises(ConfigurationError, match="y lacks finite bounds"):
+        reduced(one_side)
+    judged = custom([sp.sin(y) + u, u], [0, (0, 0.5)], barriers=[1 - x**2, 1 + y], **bounds)
+    with pytest.raises(ConfigurationError, match="y lacks finite bounds"):
+        reduced(judged)
+
+
+def test_symbols_occur_as_few_times_as_is_easy():
+    first, second = sub_step(problem_of("Pendulum").plant, 0.01)[1]
+    assert occurrences(first) == 3  # theta (1 + c w) + h thetadot
+    assert occurrences(second) == 3
+    moved = sub_step(problem_of("DubinsDisk").plant, 0.05)[1]
+    assert occurrences(moved[0]) == 4  # x + c (1 + cos(h omega / 2) / 2) cos(theta + h omega / 2)
+    assert moved[2].diff(moved[2].free_symbols.pop()).is_number
+    altitude = sub_step(problem_of("QuadrotorAltitude").plant, 0.05)[1]
+    assert [occurrences(e) for e in altitude] == [3, 2]
+
+
+def test_fingerprints_tell_chains_apart():
+    plain = reduced(problem_of("DubinsObstacle")).fingerprint
+    assert len(plain) == 64
+    assert reduced(problem_of("DubinsObstacle")).fingerprint == plain
+    others = [
+        reduced(problem_of("DubinsObstacle"), "model"),
+        reduced(problem_of("DubinsObstacle"), intervals={"v": (0.5, 0.8)}),
+        reduced(problem_of("DubinsObstacle"), intervals={"v": (0.5, 0.9)}),
+        reduced(problem_of("DubinsObstacle", dt=0.1)),
+        reduced(problem_of("DubinsObstacle", substeps=2)),
+        reduced(problem_of("DubinsObstacle", horizon=10.0)),
+        reduced(problem_of("DubinsObstacle", box=(-1.0, 1.0))),
+        reduced(problem_of("DubinsObstacle", noise=0.1)),
+        reduced(problem_of("DubinsObstacle", plant={"v_o": 0.6})),
+        reduced(problem_of("DubinsObstacle", start=(0.0, 0.0, 0.0, 1.0, 0.0))),
+        reduced(problem_of("DubinsObstacle", radius=0.6)),
+        reduced(replace(problem_of("DubinsObstacle"), goal=None)),
+        reduced(replace(problem_of("DubinsObstacle"), goal=problem_of("Scalar").goal)),
+    ]
+    fingerprints = [found.fingerprint for found in others]
+    assert plain not in fingerprints
+    assert len(set(fingerprints)) == len(fingerprints) - 1  # The last two are the same chain.
+    # Start and reward do not matter where nothing is known in advance.
+    assert (
+        reduced(problem_of("Scalar", start=(0.5,))).fingerprint
+        == reduced(problem_of("Scalar")).fingerprint
+    )
+
+
+def test_fingerprints_are_the_same_in_every_process():
+    names = ("StochasticDubins", "DubinsObstacle", "Pendulum")
+    script = (
+        "from safe_envs.registry import make_problem\n"
+        "from safe_envs.wrappers.value.reduction import reduced\n"
+        f"for name in {names}:\n"
+        "    print(reduced(make_problem(f'safe_envs/{name}-v0')).fingerprint)\n"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "12345"}
+    told = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == [reduced(problem_of(name)).fingerprint for name in names]

@@ -164,7 +164,7 @@ def test_the_tables_used_last_remain(tmp_path):
     (tmp_path / "mine.npz").write_bytes(b"x" * 1000)
     for name, age in ((f".{'0' * 40}.abc.npz", 90_000), (f".{'1' * 40}.abc.npz", 60)):
         (tmp_path / name).touch()
-        os.utime(tmp_path / name, (time.time() - age,) * 2)
+        os.utime(tmp_path / name, (time.time() - age, time.time() - age))
     forget_old_tables(tmp_path, 25)
     left = {each.name for each in tmp_path.iterdir()}
     assert left == {"mine.npz", f".{'1' * 40}.abc.npz", *names[3:]}

@@ -156,6 +156,7 @@ def _with_value(array, value):
         _set_array("edges_0", lambda a: a[::-1]),
         _set_array("edges_0", lambda a: _with_value(a, a[0])),
         _set_array("edges_0", lambda a: _with_value(a, np.nan)),
+        _set_array("edges_0", lambda a: np.append(a[:-1], np.inf)),
         _set_array("edges_0", lambda a: a[:1]),
         _set_array("edges_0", lambda a: a[None]),
         _set_array("edges_1", lambda a: 0.9 * a),
