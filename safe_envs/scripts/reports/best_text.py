@@ -50,11 +50,11 @@ def outwards(lower: float, upper: float) -> tuple[str, str]:
     """
     low, high = 100.0 * lower, 100.0 * upper
     digits = next((d for d in range(1, _MOST_DIGITS) if upper == 1.0 or _up(high, d) < 100.0), 9)
-    # What is a decimal number but for its last bits stays as it is.
-    return f"{-_up(-low, digits):.{digits}f}", f"{_up(high, digits):.{digits}f}"
+    return f"{0.0 - _up(-low, digits):.{digits}f}", f"{_up(high, digits):.{digits}f}"
 
 
 def _up(percentage: float, digits: int) -> float:
+    # What is a decimal number but for its last bits stays as it is.
     return math.ceil(percentage * 10**digits - 1e-6) / 10**digits
 
 
