@@ -107,7 +107,7 @@ def best_notes(best: AttainableSafety | None) -> list[str]:
         f" safe as its lower end: {COMPUTED}, but not proved. {counted}",
         "times unavoidable: violations of a filter for each one that no policy can avoid, from (1 -"
         " upper end of the rate)/(1 - lower end of the best), at least 1, to (1 - lower end of the"
-        " rate)/(1 - upper end of the best); only >= where no violation is shown to be unavoidable.",
+        " rate)/(1 - upper end of the best); only >= where none is shown to be unavoidable.",
     ]
 
 

@@ -19,12 +19,12 @@ from safe_envs.agents.evaluation.yardstick import (
     held_against,
     times_unavoidable,
 )
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.value import table_cache
 from safe_envs.wrappers.value.settings import ValueSettings
 from tests.agents.policies.coarse import COARSE, SHORT, coarse
-from tests.conftest import problem_of
 
-NEAR_THE_EDGES = {**SHORT, "start": [0.3], "noise": 1.5}
+NEAR_THE_EDGE = {**SHORT, "start": [0.8], "noise": 1.5}
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def made_up(lower, upper) -> AttainableSafety:
 
 
 def test_the_greedy_policy_has_a_rate_between_the_ends():
-    found, _ = attainable_safety(problem_of("Scalar-v0", **NEAR_THE_EDGES), COARSE, episodes=2000)
+    found, _ = attainable_safety(make_problem("Scalar-v0", **NEAR_THE_EDGE), COARSE, episodes=2000)
     s = found.simulated
     assert s is not None
     assert found.lower is not None
@@ -52,7 +52,7 @@ def test_the_greedy_policy_has_a_rate_between_the_ends():
 
 
 def test_the_simulation_is_that_of_evaluate():
-    problem = problem_of("Scalar-v0", **NEAR_THE_EDGES)
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
     found, policy = attainable_safety(problem, coarse(leaving="safe"), episodes=300, num_envs=128)
     row = evaluate(problem, policy, "none", episodes=300, bounds=False, best=False).rows[0]
     assert found.simulated is not None
@@ -61,8 +61,8 @@ def test_the_simulation_is_that_of_evaluate():
 
 
 def test_leaving_is_counted_as_it_was_asked_for():
-    # Above x = 3 the workspace ends, in the safe set.
-    problem = problem_of("Scalar-v0", **{**SHORT, "start": [2.9], "noise": 1.0})
+    # Below x = -3 the workspace ends, in the safe set.
+    problem = make_problem("Scalar-v0", **{**SHORT, "start": [-2.9], "noise": 2.0})
     _, policy = attainable_safety(problem, COARSE, episodes=0)
     staying = simulate(policy, 400, 0, 0.95, 400)
     policy.settings = coarse(leaving="safe")
@@ -74,8 +74,9 @@ def test_leaving_is_counted_as_it_was_asked_for():
 
 
 def test_the_worlds_of_plant_and_model_differ():
-    problem = problem_of("Pendulum-v0", horizon=0.05, noise=0.4, plant={"m": 4.0})
-    settings = ValueSettings(knowledge="plant", cells=(40, 40), inputs=3)
+    # The plant cannot be held at this angle, the model can.
+    problem = make_problem("Pendulum-v0", horizon=0.3, start=[0.3, 0.0], plant={"m": 4.0})
+    settings = ValueSettings(knowledge="plant", cells=(60, 60), inputs=3)
     found = [
         attainable_safety(each, replace(settings, knowledge=knowledge), episodes=50)[0]
         for each, knowledge in (
@@ -94,7 +95,7 @@ def test_the_worlds_of_plant_and_model_differ():
     [(0.7, 0.9, ""), (0.7, 0.75, "above the upper"), (0.85, 0.9, "below the lower")],
 )
 def test_bounds_that_the_greedy_policy_contradicts_are_withheld(lower, upper, where):
-    problem = problem_of("Scalar-v0", **NEAR_THE_EDGES)
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
     found, _ = attainable_safety(problem, COARSE, episodes=10)
     assert found.simulated is not None
     rate = replace(found.simulated, rate=0.8, safe=8000, episodes=10_000)
@@ -105,7 +106,15 @@ def test_bounds_that_the_greedy_policy_contradicts_are_withheld(lower, upper, wh
 
 
 def test_bounds_that_a_row_exceeds_are_withheld():
-    rows = evaluate("Scalar-v0", filters="cbf", episodes=60, bounds=False, best=False).rows
+    rows = evaluate(
+        "Scalar-v0",
+        "zero",
+        "cbf",
+        options={"horizon": 0.2, "start": [0.0]},
+        episodes=60,
+        bounds=False,
+        best=False,
+    ).rows
     assert rows[0].safe == 60
     assert held_against(made_up(0.5, 1.0), rows).upper == 1.0
     judged = held_against(made_up(0.5, 0.7), rows)
@@ -150,16 +159,16 @@ def test_the_interval_holds_the_true_ratio():
 def test_where_the_countings_are_the_same_is_known():
     same = {"DubinsDisk-v0", "StochasticDubins-v0", "Pendulum-v0", "CubicSDEDisk-v0"}
     others = {"Scalar-v0", "ACC-v0", "CubicSDE-v0", "QuadrotorAltitude-v0"}
-    assert [name for name in sorted(same | others) if not leaves_safely(problem_of(name))] == (
+    assert [name for name in sorted(same | others) if not leaves_safely(make_problem(name))] == (
         sorted(same)
     )
-    # The workspace of a larger disk does not hold it.
-    assert leaves_safely(problem_of("Pendulum-v0", barrier={"scale": 3.0}))
+    # A larger ellipse is not within the workspace.
+    assert leaves_safely(make_problem("Pendulum-v0", barrier={"level": 3.0}))
 
 
 def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache):
     monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
-    given = {"options": NEAR_THE_EDGES, "filters": ["none"], "episodes": 50, "bounds": False}
+    given = {"options": NEAR_THE_EDGE, "filters": ["none"], "episodes": 50, "bounds": False}
     assert evaluate("Scalar-v0", **given).document()["best"] is None
     computed = evaluate("Scalar-v0", best=True, **given)
     best = computed.best
@@ -176,10 +185,11 @@ def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache)
     assert evaluate("Scalar-v0", monitoring="continuous", **given).best is None
 
 
-def test_what_has_no_table_is_an_error_only_if_it_is_asked_for(empty_cache):
+def test_what_has_no_table_is_an_error_only_if_it_is_asked_for(empty_cache, tmp_path):
+    (tmp_path / f"{'0' * 64}.npz").touch()  # Another table is there.
     with pytest.raises(ConfigurationError, match="12 coordinates"):
         evaluate("Quadrotor-v0", best=True)
-    assert best_at_hand(problem_of("Quadrotor-v0")) is None
+    assert best_at_hand(make_problem("Quadrotor-v0")) is None
     with pytest.raises(ConfigurationError, match="monitoring = 'continuous'"):
         evaluate("Scalar-v0", best=True, monitoring="continuous")
     with pytest.raises(ConfigurationError, match="give True, False or None"):
