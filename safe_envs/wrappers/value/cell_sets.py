@@ -65,7 +65,15 @@ class Sets:
         self.depend_on_time = bool(used & set(reduced.known))
 
     def of_cells(self, grid: Grid, k: int) -> CellSets:
-        """Classify the cells of a grid at a control instant."""
+        """Classify the cells of a grid.
+
+        Args:
+            grid: of the coordinates.
+            k: control instant.
+
+        Returns:
+            What each cell lies in.
+        """
         parts = []
         for first in range(0, grid.cells, _AT_ONCE):
             cells = np.arange(first, min(first + _AT_ONCE, grid.cells))
@@ -197,7 +205,8 @@ def _ends_along(
         empty, full = end, end + (other - end) / _SCAN[len(ends)]
         while abs(full - empty) > _SHARP * (high - low):
             middle = 0.5 * (empty + full)
-            slab = [tuple(sorted((end, middle))) if j == i else e for j, e in enumerate(ends)]
+            slab = [*ends]
+            slab[i] = (min(end, middle), max(end, middle))
             counts = [1 if j == i else _SCAN[len(ends)] for j in range(len(ends))]
             grid = uniform_grid(reduced.coordinates, slab, counts)
             if sets.of_cells(grid, 0).touches.any():

@@ -74,6 +74,11 @@ class Step:
         self._scenarios = _scenarios(reduced.intervals)
 
     @property
+    def scenarios(self) -> int:
+        """Number of boxes of the uncertain parameters."""
+        return len(self._scenarios)
+
+    @property
     def depends_on_time(self) -> bool:
         """Whether states that are known in advance occur in the step."""
         used = set().union(*(e.free_symbols for e in reduced_expressions(self._parts)))
@@ -130,7 +135,7 @@ class Step:
         instant: int,
     ) -> None:
         rest, effect = self._functions
-        n, m = effects.shape[2:4]
+        m = effects.shape[3]
         known = [float(values[instant]) for values in self._reduced.known.values()]
         wide = [
             Interval(c.low[:, None, None, None], c.high[:, None, None, None]) for c in coordinates

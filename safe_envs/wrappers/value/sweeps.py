@@ -13,12 +13,8 @@ from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Functions, Program, is_available
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers.value import bellman_arrays
-from safe_envs.wrappers.value.bellman_kernel import (
-    AXES,
-    expected_values,
-    sweep_lower,
-    sweep_upper,
-)
+from safe_envs.wrappers.value.bellman_kernel import expected_values, sweep_lower, sweep_upper
+from safe_envs.wrappers.value.expected_value_kernel import AXES
 
 _PARTS = 8
 """Parts for each thread, so that all threads end at about the same time."""
