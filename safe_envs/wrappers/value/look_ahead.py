@@ -146,7 +146,8 @@ class LookAhead:
         inside, ends = self.sets_at(k, x)
         lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
         upper = np.where(ends, 1.0, self.largest(k, x))
-        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(inside, upper, 0.0).clip(0, 1)
+        near = self._sets.may_hold(k, self._coordinates(x))
+        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(near, upper, 0.0).clip(0, 1)
 
     def sets_at(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return whether states are in the safe set, and whether the episode ends in them.
