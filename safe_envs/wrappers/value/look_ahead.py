@@ -59,6 +59,11 @@ class LookAhead:
         self._filled = {sign: np.zeros(len(table.lower), dtype=bool) for sign in (1, -1)}
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
 
+    @property
+    def noise_boxes(self) -> int:
+        """Number of boxes into which the noise of a step is divided."""
+        return len(self._step.noise.weights)
+
     def values(self, k: np.ndarray, x: Components) -> np.ndarray:
         """Return the lower envelope at states, 0 outside the safe set.
 
