@@ -8,20 +8,23 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
-from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
+from safe_envs.agents.evaluation.guarantees import together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
 from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
 from safe_envs.agents.evaluation.players import Player, player_of
+from safe_envs.agents.evaluation.promise_bound import Averager, averager_of
 from safe_envs.agents.evaluation.repeats import pooled
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts, conditions_of
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, held_against
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
 from safe_envs.wrappers.learning import LearnedModel
@@ -45,6 +48,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     monitoring: str = "discrete",
+    best: bool | None = None,
     jobs: int | None = None,
     progress: Progress | None = None,
     record: bool = False,
@@ -90,6 +94,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned.
         monitoring: where h is checked, "discrete" or "continuous".
+        best: whether to compute how safe any policy can be, see
+            `safe_envs.agents.evaluation.yardstick`; None to tell it if its table is in the cache.
         jobs: number of processes, or of threads of the compiled engine; the result is the same.
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
@@ -119,6 +125,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         bounds=bounds,
         repeats=repeats,
         monitoring=monitoring,
+        best=best,
     )
     settings = RunSettings(num_envs, jobs, record, progress, engine, keep_episodes, episodes_out)
     return run_evaluation(spec, settings)
@@ -139,7 +146,8 @@ class _Runner:
 
     def __init__(self, resolved: ResolvedEvaluation, settings: RunSettings) -> None:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
-        parts = len(resolved.learning.missing()) + sum(map(resolved.repeats, resolved.names))
+        parts = resolved.parts + sum(map(resolved.repeats, resolved.names))
+        parts += resolved.prepares + bool(resolved.spec.best)
         self._work = WorkParts(settings.progress, parts)
         identifications = sum(map(resolved.repeats, resolved.names))
         self._keeps = settings.keeps(self._spec.episodes * identifications)
@@ -150,6 +158,7 @@ class _Runner:
         """Run all filters and compare them."""
         resolved, spec, settings = self._resolved, self._spec, self._settings
         resolved.learn(self._work.part)
+        best = self._best()
         # Made before the first episode: what is wrong with any of them shows at once.
         players = {
             name: [player_of(resolved, conditions, settings) for conditions in each]
@@ -188,7 +197,18 @@ class _Runner:
             resolved.learning.models(),
             resolved.is_deterministic,
             kept and kept.joined(),
+            best and held_against(best, rows),
         )
+
+    def _best(self) -> AttainableSafety | None:
+        """Return how safe any policy can be, if it is asked for or known already."""
+        resolved = self._resolved
+        if self._spec.best:
+            return best_for(resolved.problem, self._work.part())
+        third_party = resolved.target.filter_spec is not None
+        if self._spec.best is False or third_party or self._spec.monitoring == "continuous":
+            return None
+        return best_at_hand(resolved.problem)
 
     def _simulated(
         self,
@@ -196,12 +216,12 @@ class _Runner:
         players: Sequence[Player],
         trajectories: Trajectories | None,
         sinks: Sequence[EpisodeSink],
-    ) -> tuple[list[EpisodeStatistics], list[GuaranteeAverager], float]:
+    ) -> tuple[list[EpisodeStatistics], list[Averager], float]:
         """Run the episodes under a filter, with each identification, and take the time in s."""
         resolved, episodes = self._resolved, self._spec.episodes
         found = []
         averagers = [
-            GuaranteeAverager(c, resolved.problem, self._spec.knowledge, self._why_no_bound)
+            averager_of(c, resolved.problem, self._spec, self._why_no_bound)
             for c in resolved.filters[name]
         ]
         # The search for bounds is over: what is timed are episodes.
@@ -224,10 +244,10 @@ class _Runner:
         self,
         name: str,
         totals: Sequence[EpisodeStatistics],
-        averagers: Sequence[GuaranteeAverager],
+        averagers: Sequence[Averager],
         policy: str,
     ) -> EvaluationRow:
-        conditions = self._resolved.filters[name]
+        conditions = [conditions_of(each) for each in self._resolved.filters[name]]
         summaries = [each.summary(self._spec.confidence) for each in totals]
         bounds = [a.summary(t.visited) for a, t in zip(averagers, totals, strict=True)]
         learning = describe(
@@ -246,7 +266,7 @@ class _Runner:
         self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float
     ) -> FilterTiming:
         steps = sum(each.steps for each in totals)
-        learning = seconds_of(self._resolved.filters[name])
+        learning = seconds_of([conditions_of(each) for each in self._resolved.filters[name]])
         return FilterTiming(
             name, seconds, steps, steps / seconds, learning, player.engine, player.jobs
         )

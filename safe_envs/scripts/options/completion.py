@@ -19,10 +19,11 @@ FILTERS = (
     "learned-hocbf",
     "ddscbf",
     "bayesian-scbf",
+    "promise",
 )
 """Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""
 
-POLICIES = ("nominal", "clf", "zero", "random")
+POLICIES = ("nominal", "clf", "zero", "random", "best")
 """Names of policies, as `safe_envs.agents.policies.registry` knows them."""
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3")

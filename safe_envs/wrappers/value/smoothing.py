@@ -25,7 +25,7 @@ density differs by exp(-2 (2 pi)^2) of it at most."""
 _COARSE = 16
 """Cells of a standard deviation beyond the grid, at least, where the values are far away."""
 
-_PARTS = 2
+_PARTS = 1
 """Of a cell along an axis with noise."""
 
 _AT_ONCE = 96
