@@ -131,7 +131,7 @@ def test_nothing_outside_has_a_value(case):
 
 
 def test_the_greedy_policy_keeps_what_the_table_says(case):
-    problem, table, ahead = case
+    problem, _, ahead = case
     episodes, rng = 3000, np.random.default_rng(5)
     start = np.array([float(e) for e in problem.starts[problem.start].state])
     at = tuple(np.full(episodes, c) for c in start)

