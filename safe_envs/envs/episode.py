@@ -62,6 +62,8 @@ class Episodes:
         begun: the envs whose episode began in the last step, bool (num_envs,).
         everywhere: True for each env; not to be written to.
         started: whether all envs have a state.
+        last_states: with same-step autoreset, the states in which the episodes that ended last did
+            so, (num_envs, n); of the other envs anything.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -72,6 +74,7 @@ class Episodes:
         self.begun = self._nowhere = np.zeros(num_envs, dtype=bool)
         self.everywhere = np.ones(num_envs, dtype=bool)
         self.started = False
+        self.last_states = np.empty((num_envs, 0))
 
     def due(self) -> np.ndarray | None:
         """Return the envs that the coming step restarts (next-step autoreset); None without any."""

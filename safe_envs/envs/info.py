@@ -26,7 +26,19 @@ and with a filter
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
 
-At reset, before anything is executed, both are the point within the input bounds nearest to 0.
+and with a specification, of the trace of the episode so far
+
+| key | type | meaning |
+|---|---|---|
+| `robustness` | float | how far it is from changing whether it satisfies, positive where it does |
+| `satisfied` | bool | it satisfies the specification, if the episode ends here |
+| `verdict` | int | 1 where it will, whatever follows, -1 where it will not, 0 where that is open |
+| `automaton_state` | int | state of the specification's automaton |
+
+A robustness is -inf or inf where the trace is too short for anything to count.
+
+At reset, before anything is executed, both actions are the point within the input bounds nearest
+to 0.
 """
 
 from __future__ import annotations
@@ -81,6 +93,23 @@ class FilterInfo(TypedDict):
 def filter_info(**values: Unpack[FilterInfo]) -> Info:
     """Return what a filter adds, all of `FilterInfo`."""
     return {**values}
+
+
+def specification_info(robustness: Any, satisfied: Any, verdict: Any, automaton_state: Any) -> Info:
+    """Return what a specification adds; see the table above.
+
+    Args:
+        robustness: of the trace so far.
+        satisfied: whether it satisfies the specification.
+        verdict: whether that is settled.
+        automaton_state: after the trace.
+    """
+    return {
+        "robustness": robustness,
+        "satisfied": satisfied,
+        "verdict": verdict,
+        "automaton_state": automaton_state,
+    }
 
 
 def with_masks(info: Info, present: np.ndarray) -> Info:

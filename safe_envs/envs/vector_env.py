@@ -265,12 +265,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> VectorStep:
         """Return what a step tells, with autoreset."""
         observation, reward, terminated, truncated, info = found
-        episodes = self.episodes
-        ended = terminated | truncated
+        episodes, ended = self.episodes, terminated | truncated
         last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = last_of_episode(ended, observation, info)
+                episodes.last_states = self.state
                 observation, _, _, _, info = stepper.begin(ended)
             episodes.begun = ended
         else:

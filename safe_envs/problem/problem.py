@@ -25,6 +25,7 @@ from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions
+from safe_envs.problem.regions import sound_regions
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
 from safe_envs.validators import numbers_in
@@ -54,6 +55,7 @@ class SafetyProblem:
         horizon: length of an episode in s.
         features: entries of the observation; the states by default.
         goal: the episode ends where this expression is >= 0.
+        regions: further sets that specifications name, expressions of the states, >= 0 inside.
         noise: names of the diffusion parameters, in the order of the `noise` argument.
         gains: rates p_1..p_r in 1/s that the conditions use by default, for all
             barriers; or such a tuple for each.
@@ -85,6 +87,7 @@ class SafetyProblem:
     features: tuple[Feature, ...] = ()
     start: str = ""
     goal: sp.Expr | None = None
+    regions: Mapping[str, sp.Expr] = field(default_factory=dict)
     noise: tuple[str, ...] = ()
     gains: tuple[float, ...] | tuple[tuple[float, ...], ...] = (1.0,)
     filter: str = "hocbf"
@@ -137,6 +140,7 @@ class SafetyProblem:
         for law in self.nominal:
             known = (*(f.symbol for f in self.features), *model.parameters)
             plant.require_known("the nominal controller", law.free_symbols, known)
+        object.__setattr__(self, "regions", sound_regions(self.regions, plant))
         if self.clf is not None:
             self.clf.require_known(model)
         if self.frame is not None:

@@ -8,6 +8,7 @@ MODULES = {
     "DubinsDisk": "dubins",
     "DubinsObstacle": "dubins_obstacle",
     "DubinsObstacles": "dubins_obstacles",
+    "DubinsReach": "dubins_reach",
     "StochasticDubins": "stochastic_dubins",
     "QuadrotorAltitude": "quadrotor_altitude",
     "Quadrotor": "quadrotor",

@@ -28,7 +28,10 @@ _OBSTACLE_START = (-1.0, 0.0)
 
 
 def vehicle_among(
-    speed: float, obstacles: Mapping[sp.Symbol, sp.Expr], parameters: Mapping[sp.Symbol, float]
+    speed: float,
+    obstacles: Mapping[sp.Symbol, sp.Expr],
+    parameters: Mapping[sp.Symbol, float],
+    noise: float = 0.0,
 ) -> ControlAffineSDE:
     """Return the vehicle of Eq. (3.27) with obstacles, whose coordinates are states.
 
@@ -36,12 +39,13 @@ def vehicle_among(
         speed: v of the vehicle, in m/s.
         obstacles: rate of each coordinate, in its unit a second.
         parameters: value of the symbols in the rates.
+        noise: sigma_1 = sigma_2 of the vehicle, in m/sqrt(s).
 
     Source: thesis Sec. 3.5.1. The thesis drives the obstacle by the clock and forgets its velocity
         in the
     derivatives of h; here its position is a state, so that nothing can be forgotten.
     """
-    car = vehicle(speed, noise=0.0)
+    car = vehicle(speed, noise)
     rest = [0] * len(obstacles)
     return ControlAffineSDE(
         states=(*car.states, *obstacles),

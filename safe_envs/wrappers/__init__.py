@@ -7,6 +7,8 @@ from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.env_wrappers.safety_filter import SafetyFilterWrapper
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import SafetyFilterVectorWrapper
+from safe_envs.wrappers.env_wrappers.specification_monitor import SpecificationMonitor
+from safe_envs.wrappers.env_wrappers.specification_monitor_vector import SpecificationMonitorVector
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
@@ -19,6 +21,8 @@ __all__ = [
     "SafetyFilterWrapper",
     "SafetyMonitor",
     "SafetyMonitorVector",
+    "SpecificationMonitor",
+    "SpecificationMonitorVector",
 ]
 __all__ += conditions.__all__
 

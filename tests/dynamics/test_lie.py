@@ -26,7 +26,8 @@ from safe_envs.envs.simulation import Simulation
 from tests.conftest import problem_of
 
 DEGREES = {
-    "DubinsDisk": 2, "DubinsObstacle": 2, "DubinsObstacles": 2, "StochasticDubins": 2,
+    "DubinsDisk": 2, "DubinsObstacle": 2, "DubinsObstacles": 2, "DubinsReach": 2,
+    "StochasticDubins": 2,
     "QuadrotorAltitude": 2, "Quadrotor": 2, "QuadrotorLimits": 2,
     "ACC": 1, "ACCGap": 2, "Pendulum": 1, "CubicSDE": 1, "CubicSDEDisk": 1, "Scalar": 1,
 }  # fmt: skip

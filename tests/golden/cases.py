@@ -53,6 +53,7 @@ SYSTEMS = {
     "DubinsDisk-v0": System("hocbf", 0.05, False, "--plant v=0.7 --model v=0.6"),
     "DubinsObstacle-v0": System("hocbf", 0.05, False, "--plant v=0.7 --model v=0.6"),
     "DubinsObstacles-v0": System("hocbf", 0.05, False, "--plant v=0.7 --model v=0.6"),
+    "DubinsReach-v0": System("hocbf", 0.2, False, "--plant v=1.1 --model v=0.9"),
     "StochasticDubins-v0": System("scbf", 0.05, False, "--plant v=2.2 --model v=1.8"),
     "QuadrotorAltitude-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
     "Quadrotor-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),

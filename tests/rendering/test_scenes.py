@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -44,7 +46,7 @@ def test_obstacles_and_goal_are_to_scale():
     scene = env.viewer._picture._scene
     axes = next(iter(scene._plane._views))
     assert [circle.radius for circle in scene._obstacles] == pytest.approx([0.7])
-    assert scene._goal.radius == pytest.approx(0.3)
+    assert scene._disks["goal"].radius == pytest.approx(0.3)
     center = env.state[3:5]
     x, y = axes.place(center[0], center[1] - 0.7)
     column = frame[int(y) - 3 : int(y) + 4, int(x)].astype(int)
@@ -53,6 +55,23 @@ def test_obstacles_and_goal_are_to_scale():
     assert (
         np.abs(frame[int(y) - 3 : int(y) + 4, int(x)].astype(int) - style.GOAL).sum(axis=-1) < 60
     ).any()
+
+
+def test_regions_are_outlined_to_scale():
+    problem = problem_of("safe_envs/DubinsReach-v0")
+    frames = []
+    for regions in ({}, problem.regions):
+        env = SafeEnv(replace(problem, regions=regions), render_mode="rgb_array")
+        env.reset(seed=0)
+        frames.append(env.render().astype(int))
+    scene = env.viewer._picture._scene
+    axes = next(iter(scene._plane._views))
+    rows, columns = np.nonzero((frames[0] != frames[1]).any(axis=-1))
+    x, y = axes.place(-0.6, 1.1)
+    radius = 0.4 * axes.scale[0]
+    assert columns.min() == pytest.approx(x - radius, abs=2)
+    assert columns.max() == pytest.approx(x + radius, abs=2)
+    assert rows.max() == pytest.approx(y + radius, abs=2)
 
 
 def test_required_gap_is_where_the_barrier_vanishes():

@@ -37,7 +37,8 @@ def test_every_env_is_drawn(env_id):
     # An episode that begins has neither a trail nor a past of h.
     env.reset(seed=1)
     np.testing.assert_array_equal(env.render(), first)
-    edges = style.VIOLATION if "Obstacle" in env_id else style.EDGE
+    ringed = "Obstacle" in env_id or "Reach" in env_id
+    edges = style.VIOLATION if ringed else style.EDGE
     for color in (edges, style.INK):
         assert shown(first[:, SCENE], color) > 0
 

@@ -181,7 +181,7 @@ def _play(
         trajectories.note(0, first, batch.alive, h, world.components)
     state, start = None, np.ones(len(h), dtype=bool)
     for k in range(1, steps + 1):
-        actions, state = _acted(policy, observation, state, start)
+        actions, state = acted(policy, observation, state, start)
         before = world.components
         observation, reward, terminated, truncated, info = env.step(actions)
         h = smallest(info["barrier"])
@@ -200,8 +200,21 @@ def _play(
     return batch
 
 
-def _acted(policy: Any, observation: np.ndarray, state: Any, start: np.ndarray) -> tuple[Any, Any]:
-    """Return the actions and the state of a policy, whose failure is that of what was given."""
+def acted(policy: Any, observation: np.ndarray, state: Any, start: np.ndarray) -> tuple[Any, Any]:
+    """Return the actions and the state of a policy, whose failure is that of what was given.
+
+    Args:
+        policy: anything with Stable-Baselines3's `predict`.
+        observation: of each env, shape (B, k).
+        state: of the policy, as it returned it last; None at first.
+        start: which envs begin an episode, bool (B,).
+
+    Returns:
+        The actions, shape (B, m), and the state.
+
+    Raises:
+        InvalidInputError: The policy failed.
+    """
     try:
         actions, state = policy.predict(observation, state, start, deterministic=True)
     except SafeEnvsError:

@@ -12,13 +12,15 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.regions import GOAL
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.safe_set import LEVELS, STEP, tint
 from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import BOX, StatePlane
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import GOAL, GREY, INK, PAPER, SMALL, VIOLATION, mix
+from safe_envs.rendering.style import GOAL as GOAL_COLOR
+from safe_envs.rendering.style import GREY, INK, PAPER, SMALL, VIOLATION, mix
 
 _LENGTH = 15.0
 _MOVED = 2.0
@@ -88,7 +90,7 @@ class TopView(Scene):
 
     Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are circles
     inside of which a barrier is negative, drawn with their recent paths; after a violation, also
-    where they were then.
+    where they were then. The goal is a disk, and a region the outline of one, where they are round.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -99,7 +101,9 @@ class TopView(Scene):
         self._obstacles = [
             circle for circle in circles if circle is not None and not circle.encloses
         ]
-        self._goal = None if problem.goal is None else circle_of(problem, problem.goal, x, y)
+        named = problem.regions if problem.goal is None else {**problem.regions, GOAL: problem.goal}
+        disks = {name: circle_of(problem, expression, x, y) for name, expression in named.items()}
+        self._disks = {name: disk for name, disk in disks.items() if disk is not None}
         self._rings = len(self._obstacles) == len(circles)
         self._plane = StatePlane(
             self, ("x", "y"), BOX, chosen=[] if self._rings else None, equal=True
@@ -111,19 +115,23 @@ class TopView(Scene):
         with canvas.within(axes.box):
             self._draw_obstacles(canvas, axes, snapshot)
             self._draw_hit(canvas, axes, snapshot)
-            if self._goal is not None:
-                self._draw_goal(canvas, axes, snapshot, self._goal)
+            for name, disk in self._disks.items():
+                self._draw_region(canvas, axes, snapshot, name, disk)
             at = self._plane.trail(canvas, axes, snapshot)
             draw_vehicle(canvas, at, float(snapshot.state[self._heading]), snapshot)
 
-    def _draw_goal(
-        self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot, goal: Circle
+    def _draw_region(
+        self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot, name: str, disk: Circle
     ) -> None:
-        at = axes.place(*goal.middles(snapshot.states[-1:])[0])
-        radius = goal.radius * axes.scale[0]
-        canvas.disk(at, radius, mix(GOAL, PAPER, 0.35), GOAL, 2)
-        canvas.disk(at, 2, INK)
-        canvas.text("goal", (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
+        """Draw the goal, or the outline of another region, with its name."""
+        at = axes.place(*disk.middles(snapshot.states[-1:])[0])
+        radius = disk.radius * axes.scale[0]
+        if name == GOAL:
+            canvas.disk(at, radius, mix(GOAL_COLOR, PAPER, 0.35), GOAL_COLOR, 2)
+            canvas.disk(at, 2, INK)
+        else:
+            canvas.disk(at, radius, None, GREY, 1)
+        canvas.text(name, (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
 
     def _draw_obstacles(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         paths = [

@@ -157,6 +157,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
             **info.get("final_info", {}),
             **with_masks(self._seen(last, self.episodes.everywhere), ended),
         }
+        self.episodes.last_states = np.stack(self._x, axis=-1)
         self.episodes.restart(ended)
         return self._seen(observation, ended)
 

@@ -10,57 +10,49 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.value.bellman_kernel import AXES
+from safe_envs.wrappers.value.expected_value_kernel import AXES
+from safe_envs.wrappers.value.grid_arrays import GridArrays
 
 _AT_ONCE = 200_000
 
 
 def expected_values(first: int, last: int, *arguments: Any) -> None:
     """Bound the expected value of states under inputs from below; see `bellman_kernel`."""
-    *given, rows, tables, rest, counts, places, edges, scales, _, found = arguments
-    images, effects, inputs, weights = given
-    grid = (counts, edges, scales)
+    images, effects, inputs, weights, layers, tables, beyond, *grid, _, found = arguments
     for part in _parts(first, last, images):
         own = inputs[part] if len(inputs) > 1 else inputs
         for u in range(inputs.shape[1]):
             v = u if images.shape[1] > 1 else 0
-            found[part, u] = _expected(
-                images[part, v], effects[part], own[:, u], weights, rows[part], tables, rest, grid
-            )
+            given = images[part, v], effects[part], own[:, u], weights, layers[part]
+            found[part, u] = _expected(*given, tables, beyond, GridArrays(*grid))
 
 
 def sweep_lower(first: int, last: int, turn: int, *arguments: Any) -> None:
     """Maximise the bound of the expected value over all inputs; see `bellman_kernel`."""
-    images, effects, inputs, weights, tables, ends, _, counts, _, edges, scales, *others = arguments
-    _, best, found = others
-    grid = (counts, edges, scales)
-    del turn
+    images, effects, inputs, weights, tables, beyond, _, *grid, _, best, found = arguments
+    del turn  # Arrays try all inputs each time.
     for part in _parts(first, last, images):
-        rows = part[best[part] >= 0]
-        largest = np.full(len(rows), -np.inf)
-        none = np.zeros(len(rows), dtype=np.int64)
+        going = part[best[part] >= 0]
+        largest = np.full(len(going), -np.inf)
+        layers = np.zeros(len(going), dtype=np.int64)
         for u in range(inputs.shape[1]):
             v = u if images.shape[1] > 1 else 0
-            value = _expected(
-                images[rows, v], effects[rows], inputs[:, u], weights, none, tables, rest, grid
-            )
+            given = images[going, v], effects[going], inputs[:, u], weights, layers
+            value = _expected(*given, tables, beyond, GridArrays(*grid))
             better = value > largest
-            best[rows[better]], largest[better] = u, value[better]
-        found[rows] = largest
+            best[going[better]], largest[better] = u, value[better]
+        found[going] = largest
 
 
 def sweep_upper(first: int, last: int, *arguments: Any) -> None:
     """Maximise an upper bound of the expected value over all inputs; see `bellman_kernel`."""
-    images, effects, inputs, weights, tables, rest, counts, _, edges, scales, *others = arguments
-    _, known, found = others
-    grid = (counts, edges, scales)
+    images, effects, inputs, weights, tables, beyond, *grid, _, known, _, _, found = arguments
     for part in _parts(first, last, images):
-        none = np.zeros(len(part), dtype=np.int64)
+        layers = np.zeros(len(part), dtype=np.int64)
         for u in range(inputs.shape[1]):
             v = u if images.shape[1] > 1 else 0
-            value = -_expected(
-                images[part, v], effects[part], inputs[:, u], weights, none, tables, rest, grid
-            )
+            given = images[part, v], effects[part], inputs[:, u], weights, layers
+            value = -_expected(*given, tables, beyond, GridArrays(*grid))
             known[part, u] = np.minimum(value, known[part, u])
         found[part] = known[part].max(axis=1)
 
@@ -75,27 +67,27 @@ def _expected(
     effects: np.ndarray,
     inputs: np.ndarray,
     weights: np.ndarray,
-    rows: np.ndarray,
+    layers: np.ndarray,
     tables: np.ndarray,
     rest: float,
-    grid: tuple[np.ndarray, np.ndarray, np.ndarray],
+    grid: GridArrays,
 ) -> np.ndarray:
     """Return bounds (B,) for images (B, R, W, n, 2) and inputs (B or 1, m, 2)."""
     products = effects[..., :, None] * inputs[:, None, None, :, None, :]
     low = images[..., 0] + products.min(axis=(-1, -2)).sum(axis=-1)[:, :, None]
     high = images[..., 1] + products.max(axis=(-1, -2)).sum(axis=-1)[:, :, None]
     first, last, misses, leaves = _windows(low, high, grid)
-    value = _least(rows[:, None, None], tables, grid[0], first, last)
+    value = _least(layers[:, None, None], tables, grid.counts, first, last)
     value = np.where(leaves, np.minimum(value, 0.0), value)
     value = np.where(misses, 0.0, value)
     return (rest + value @ weights).min(axis=1)
 
 
 def _windows(
-    low: np.ndarray, high: np.ndarray, grid: tuple[np.ndarray, np.ndarray, np.ndarray]
+    low: np.ndarray, high: np.ndarray, grid: GridArrays
 ) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray, np.ndarray]:
     """Return the first and the last cell along each axis, and what misses or leaves the grid."""
-    counts, edges, scales = grid
+    counts, _, edges, scales = grid
     firsts, lasts = [], []
     misses = np.zeros(low.shape[:-1], dtype=bool)
     leaves = np.zeros(low.shape[:-1], dtype=bool)
@@ -125,7 +117,7 @@ def _windows(
 
 
 def _least(
-    rows: np.ndarray,
+    layers: np.ndarray,
     tables: np.ndarray,
     counts: np.ndarray,
     first: list[np.ndarray],
@@ -133,7 +125,9 @@ def _least(
 ) -> np.ndarray:
     """Return the least value of each box of cells, an entry of the table standing for a block."""
     blocks = counts[4 * AXES :]
-    last = [np.maximum(a, b - n + 1) for a, b, n in zip(first, last, blocks[: len(first)], strict=True)]
+    last = [
+        np.maximum(a, b - n + 1) for a, b, n in zip(first, last, blocks[: len(first)], strict=True)
+    ]
     widths = [int((b - a).max(initial=0)) for a, b in zip(first, last, strict=True)]
     least = np.full(first[0].shape, np.inf)
     steps = [[*range(0, width, n), width] for width, n in zip(widths, blocks, strict=False)]
@@ -142,5 +136,5 @@ def _least(
         for i, (a, b, move) in enumerate(zip(first, last, moves, strict=True)):
             place = np.minimum(a + move, b)
             cell = cell * counts[i] + np.where(place >= counts[i], place - counts[i], place)
-        np.minimum(least, tables[rows, cell], out=least)
+        np.minimum(least, tables[layers, cell], out=least)
     return least

@@ -12,12 +12,14 @@ a grid: see `GridArrays`.
 
 from __future__ import annotations
 
-from math import floor, inf
+from math import inf
 
 import numpy as np
 
-AXES = 4
-"""Axes of the tables in kernels; those that a problem does not have are of one cell."""
+from safe_envs.wrappers.value.expected_value_kernel import expected_value
+
+_LOSS = 0.003
+"""Of the value of a state in a step, for which it does not pay to try all inputs."""
 
 
 def expected_values(  # noqa: PLR0913
@@ -27,7 +29,7 @@ def expected_values(  # noqa: PLR0913
     effects: np.ndarray,
     inputs: np.ndarray,
     weights: np.ndarray,
-    rows: np.ndarray,
+    layers: np.ndarray,
     tables: np.ndarray,
     rest: float,
     counts: np.ndarray,
@@ -46,8 +48,8 @@ def expected_values(  # noqa: PLR0913
         effects: see the module, shape (B, R, n, m, 2).
         inputs: ends of each input, shape (B or 1, V, m, 2).
         weights: probability of each box of the noise, shape (W,).
-        rows: row of the tables for each state, shape (B,).
-        tables: values of the next control instant, shape (rows, cells).
+        layers: which of the tables to take for each state, shape (B,).
+        tables: values of the next control instant, shape (T, cells).
         rest: what the noise beyond all boxes adds.
         counts: of the grid.
         places: of the grid.
@@ -69,7 +71,7 @@ def expected_values(  # noqa: PLR0913
                 effects,
                 inputs,
                 weights,
-                rows[a],
+                layers[a],
                 tables,
                 rest,
                 counts,
@@ -102,17 +104,17 @@ def sweep_lower(  # noqa: PLR0913
     """Maximise the bound of the expected value over some of the inputs.
 
     Any input gives a lower envelope. The best one of the last sweep and, in turn, one next to it or
-    any other find nearly the maximum of all.
+    any other find nearly the maximum of all; where they lose much, all inputs are tried.
 
     Args:
         first: state to begin with.
         last: state to end before.
-        turn: number of the sweep; all inputs are tried where it is 0.
+        turn: number of the sweep.
         images: see `expected_values`, as for all others.
         effects: see there.
         inputs: see there, shape (1, U, m, 2).
         weights: see there.
-        tables: see there, of one row.
+        tables: see there.
         rest: see there.
         neighbours: of each input, shape (U, N), -1 for none.
         counts: of the grid.
@@ -120,26 +122,29 @@ def sweep_lower(  # noqa: PLR0913
         edges: of the grid.
         scales: of the grid.
         shifts: scratch array of 8 entries.
-        best: the best input of the last sweep, which is replaced, shape (B,); -1 where nothing is to
-            be found.
-        found: receives the bounds, shape (B,).
+        best: the best input of the last sweep, which is replaced, shape (B,); -1 where none is
+            wanted.
+        found: holds values that are good enough, and receives the bounds, shape (B,).
     """
     several = images.shape[1] > 1
     tried = inputs.shape[1]
     for a in range(first, last):
         if best[a] < 0:
             continue
-        largest, chosen = -inf, best[a]
-        number = tried if turn == 0 else 2
-        for j in range(number):
-            if turn == 0:
-                u = j
+        largest, chosen = -inf, int(best[a])
+        few = 1 + turn % 2
+        # The number of inputs is small where nothing is lost, and nothing can be won then.
+        for j in range(few + tried):
+            if j == few and largest >= found[a] - _LOSS:
+                break
+            if j >= few:
+                u = j - few
             elif j == 0:
-                u = best[a]
-            elif turn % 4 == 0:
-                u = (7 * a + turn // 4) % tried
+                u = chosen
+            elif turn % 8 == 1:
+                u = (7 * a + turn // 8) % tried
             else:
-                u = neighbours[best[a], (a + turn) % neighbours.shape[1]]
+                u = int(neighbours[chosen, (a + turn // 2) % neighbours.shape[1]])
             if u >= 0:
                 value = expected_value(
                     a,
@@ -161,6 +166,8 @@ def sweep_lower(  # noqa: PLR0913
                 )
                 if value > largest:
                     largest, chosen = value, u
+                if j >= few and largest >= found[a]:
+                    break
         best[a] = chosen
         found[a] = largest
 
@@ -180,6 +187,8 @@ def sweep_upper(  # noqa: PLR0913
     scales: np.ndarray,
     shifts: np.ndarray,
     known: np.ndarray,
+    leader: np.ndarray,
+    rival: np.ndarray,
     found: np.ndarray,
 ) -> None:
     """Maximise an upper bound of the expected value over all inputs.
@@ -194,7 +203,7 @@ def sweep_upper(  # noqa: PLR0913
         effects: see there.
         inputs: boxes that cover all inputs, shape (1, U, m, 2).
         weights: see there.
-        tables: see there; the negative values, of one row.
+        tables: see there; the negative values.
         rest: see there.
         counts: of the grid.
         places: of the grid.
@@ -202,24 +211,20 @@ def sweep_upper(  # noqa: PLR0913
         scales: of the grid.
         shifts: scratch array of 8 entries.
         known: upper bounds for each input, which are replaced, shape (B, U).
+        leader: the input of the largest of them, which is replaced, shape (B,).
+        rival: the largest bound of all others, which is replaced, shape (B,).
         found: receives the upper bounds, shape (B,).
     """
     several = images.shape[1] > 1
     tried = inputs.shape[1]
     for a in range(first, last):
-        settled = -inf
-        for _ in range(tried):
-            largest, chosen = -inf, 0
-            for u in range(tried):
-                if known[a, u] > largest:
-                    largest, chosen = known[a, u], u
-            if largest <= settled:
-                break
+        for _ in range(tried + 1):
+            u = int(leader[a])
             value = -expected_value(
                 a,
-                chosen if several else 0,
+                u if several else 0,
                 0,
-                chosen,
+                u,
                 images,
                 effects,
                 inputs,
@@ -234,242 +239,18 @@ def sweep_upper(  # noqa: PLR0913
                 shifts,
             )
             # Rounding may lift a bound by a little.
-            known[a, chosen] = min(value, largest)
-            settled = max(settled, known[a, chosen])
-        largest = -inf
-        for u in range(tried):
-            if known[a, u] > largest:
-                largest = known[a, u]
-        found[a] = largest
-
-
-def expected_value(  # noqa: PLR0913
-    a: int,
-    v: int,
-    b: int,
-    u: int,
-    images: np.ndarray,
-    effects: np.ndarray,
-    inputs: np.ndarray,
-    weights: np.ndarray,
-    row: int,
-    tables: np.ndarray,
-    rest: float,
-    counts: np.ndarray,
-    places: np.ndarray,
-    edges: np.ndarray,
-    scales: np.ndarray,
-    shifts: np.ndarray,
-) -> float:
-    """Bound the expected value of a state under an input from below, for the worst scenario.
-
-    Args:
-        a: the state.
-        v: place of the input in `images`.
-        b: place of the state in `inputs`.
-        u: place of the input in `inputs`.
-        images: see `expected_values`, as for all others.
-        effects: see there.
-        inputs: see there.
-        weights: see there.
-        row: of the tables.
-        tables: see there.
-        rest: see there.
-        counts: of the grid.
-        places: of the grid.
-        edges: of the grid.
-        scales: of the grid.
-        shifts: scratch array.
-    """
-    n, m = effects.shape[2], effects.shape[3]
-    worst = inf
-    for r in range(images.shape[2]):
-        for i in range(n):
-            low, high = -scales[i, 3], scales[i, 3]
-            for j in range(m):
-                b0, b1 = effects[a, r, i, j, 0], effects[a, r, i, j, 1]
-                u0, u1 = inputs[b, u, j, 0], inputs[b, u, j, 1]
-                p, q, s, t = b0 * u0, b0 * u1, b1 * u0, b1 * u1
-                low += min(min(p, q), min(s, t))
-                high += max(max(p, q), max(s, t))
-            shifts[2 * i], shifts[2 * i + 1] = low, high
-        total = rest
-        for w in range(images.shape[3]):
-            image = images[a, v, r, w]
-            f1, l1, f2, l2, f3, l3 = 0, 0, 0, 0, 0, 0
-            f0, l0 = cells_between(
-                image[0, 0] + shifts[0], image[0, 1] + shifts[1], 0, counts, places, edges, scales
-            )
-            if n > 1:
-                f1, l1 = cells_between(
-                    image[1, 0] + shifts[2],
-                    image[1, 1] + shifts[3],
-                    1,
-                    counts,
-                    places,
-                    edges,
-                    scales,
-                )
-            if n > 2:
-                f2, l2 = cells_between(
-                    image[2, 0] + shifts[4],
-                    image[2, 1] + shifts[5],
-                    2,
-                    counts,
-                    places,
-                    edges,
-                    scales,
-                )
-            if n > 3:
-                f3, l3 = cells_between(
-                    image[3, 0] + shifts[6],
-                    image[3, 1] + shifts[7],
-                    3,
-                    counts,
-                    places,
-                    edges,
-                    scales,
-                )
-            value = least_value(f0, l0, f1, l1, f2, l2, f3, l3, row, tables, counts)
-            total += weights[w] * value
-        worst = min(worst, total)
-    return worst
-
-
-def cells_between(
-    low: float,
-    high: float,
-    i: int,
-    counts: np.ndarray,
-    places: np.ndarray,
-    edges: np.ndarray,
-    scales: np.ndarray,
-) -> tuple[int, int]:
-    """Return the first and the last cell that an interval touches along an axis.
-
-    Where the interval leaves the grid, the first one f is returned as -1 - f, and where it misses
-    the grid the last one is -1. Along a periodic axis the last may pass the end: the cells begin
-    again.
-
-    Args:
-        low: lower end of the interval.
-        high: upper end.
-        i: the axis.
-        counts: of the grid.
-        places: of the grid.
-        edges: of the grid.
-        scales: of the grid.
-    """
-    period, last = scales[i, 2], counts[i] - 1
-    if period == 0.0:
-        first = cell_of_value(low, i, counts, places, edges, scales)
-        end = cell_of_value(high, i, counts, places, edges, scales)
-        if first >= 0 and end <= last:
-            return first, end
-        if end < 0 or first > last:
-            return -1, -1
-        return -1 - max(first, 0), min(end, last)
-    if high - low >= period:
-        return 0, last
-    turns = period * floor((low - scales[i, 0]) / period)
-    low, high = low - turns, high - turns
-    first = min(max(cell_of_value(low, i, counts, places, edges, scales), 0), last)
-    if high < scales[i, 0] + period:
-        return first, min(cell_of_value(high, i, counts, places, edges, scales), last)
-    beyond = cell_of_value(high - period, i, counts, places, edges, scales)
-    return first, max(beyond, 0) + last + 1
-
-
-def cell_of_value(
-    value: float,
-    i: int,
-    counts: np.ndarray,
-    places: np.ndarray,
-    edges: np.ndarray,
-    scales: np.ndarray,
-) -> int:
-    """Return the cell of a value along an axis; -1 below the grid, and their number above it.
-
-    Args:
-        value: of the coordinate.
-        i: the axis.
-        counts: of the grid.
-        places: of the grid.
-        edges: of the grid.
-        scales: of the grid.
-    """
-    t = (value - scales[i, 0]) * scales[i, 1]
-    if not t >= 0.0:
-        return -1
-    last = counts[3 * AXES + i] - 1
-    cell = int(places[counts[2 * AXES + i] + (int(t) if t < last else last)])
-    count, first = counts[i], counts[AXES + i]
-    while cell < count and edges[first + cell + 1] <= value:
-        cell += 1
-    return cell
-
-
-def least_value(  # noqa: PLR0913
-    f0: int,
-    l0: int,
-    f1: int,
-    l1: int,
-    f2: int,
-    l2: int,
-    f3: int,
-    l3: int,
-    row: int,
-    tables: np.ndarray,
-    counts: np.ndarray,
-) -> float:
-    """Return the least value of a box of cells; 0 where it leaves the grid, if all are positive.
-
-    An entry of the table stands for a block of cells that begins there.
-
-    Args:
-        f0: first cell along the first axis; see `cells_between`, as for all others.
-        l0: last cell.
-        f1: along the second axis.
-        l1: last cell.
-        f2: along the third axis.
-        l2: last cell.
-        f3: along the fourth axis.
-        l3: last cell.
-        row: of the tables.
-        tables: shape (rows, cells).
-        counts: of the grid.
-    """
-    n0, n1, n2, n3 = counts[0], counts[1], counts[2], counts[3]
-    b0, b1, b2, b3 = (
-        counts[4 * AXES],
-        counts[4 * AXES + 1],
-        counts[4 * AXES + 2],
-        counts[4 * AXES + 3],
-    )
-    least = inf
-    if min(min(f0, f1), min(f2, f3)) < 0:
-        least = 0.0
-        f0, f1 = (f0 if f0 >= 0 else -1 - f0), (f1 if f1 >= 0 else -1 - f1)
-        f2, f3 = (f2 if f2 >= 0 else -1 - f2), (f3 if f3 >= 0 else -1 - f3)
-    # The last block of an axis ends with the last cell.
-    e0, e1, e2, e3 = (
-        max(f0, l0 - b0 + 1),
-        max(f1, l1 - b1 + 1),
-        max(f2, l2 - b2 + 1),
-        max(f3, l3 - b3 + 1),
-    )
-    for i0 in range(f0, l0 + 1, b0):
-        c0 = min(i0, e0)
-        c0 = (c0 - n0 if c0 >= n0 else c0) * n1
-        for i1 in range(f1, l1 + 1, b1):
-            c1 = min(i1, e1)
-            c1 = (c0 + (c1 - n1 if c1 >= n1 else c1)) * n2
-            for i2 in range(f2, l2 + 1, b2):
-                c2 = min(i2, e2)
-                c2 = (c1 + (c2 - n2 if c2 >= n2 else c2)) * n3
-                for i3 in range(f3, l3 + 1, b3):
-                    c3 = min(i3, e3)
-                    value = tables[row, c2 + (c3 - n3 if c3 >= n3 else c3)]
-                    if value < least:
-                        least = value
-    return least
+            settled = min(value, known[a, u])
+            known[a, u] = settled
+            if settled >= rival[a]:
+                break
+            largest, second, chosen = -inf, -inf, u
+            for v in range(tried):
+                bound = known[a, v]
+                if bound > largest:
+                    largest, second, chosen = bound, largest, v
+                elif bound > second:
+                    second = bound
+            leader[a], rival[a] = chosen, second
+            if chosen == u:
+                break
+        found[a] = known[a, leader[a]]

@@ -65,16 +65,22 @@ class Sets:
         self.depend_on_time = bool(used & set(reduced.known))
 
     def of_cells(self, grid: Grid, k: int) -> CellSets:
-        """Classify the cells of a grid at a control instant."""
+        """Classify the cells of a grid.
+
+        Args:
+            grid: of the coordinates.
+            k: control instant.
+
+        Returns:
+            What each cell lies in.
+        """
         parts = []
         for first in range(0, grid.cells, _AT_ONCE):
             cells = np.arange(first, min(first + _AT_ONCE, grid.cells))
             parts.append(self._classified(*grid.corners(cells), k, _HALVINGS))
         return CellSets(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
-    def of_states(
-        self, k: np.ndarray, q: Sequence[np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def of_states(self, k: np.ndarray, q: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return whether states are in the safe set, and whether the episode ends in them.
 
         Args:
@@ -116,9 +122,7 @@ class Sets:
             )
         return found
 
-    def _evaluated(
-        self, low: Sequence[np.ndarray], high: Sequence[np.ndarray], k: int
-    ) -> CellSets:
+    def _evaluated(self, low: Sequence[np.ndarray], high: Sequence[np.ndarray], k: int) -> CellSets:
         boxes = [Interval(a, b) for a, b in zip(low, high, strict=True)]
         known = [float(values[k * self._substeps]) for values in self._known]
         values = self._function([*boxes, *known])
@@ -201,7 +205,8 @@ def _ends_along(
         empty, full = end, end + (other - end) / _SCAN[len(ends)]
         while abs(full - empty) > _SHARP * (high - low):
             middle = 0.5 * (empty + full)
-            slab = [tuple(sorted((end, middle))) if j == i else e for j, e in enumerate(ends)]
+            slab = [*ends]
+            slab[i] = (min(end, middle), max(end, middle))
             counts = [1 if j == i else _SCAN[len(ends)] for j in range(len(ends))]
             grid = uniform_grid(reduced.coordinates, slab, counts)
             if sets.of_cells(grid, 0).touches.any():

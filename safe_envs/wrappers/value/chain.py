@@ -96,8 +96,8 @@ class Chain:
             for j, e in enumerate(self.expressions)
         ):
             raise ConfigurationError(
-                f"{c.symbol} lacks finite bounds and does not repeat after 2 pi, so that no grid can"
-                " cover it; give the state a workspace"
+                f"{c.symbol} lacks finite bounds and does not repeat after 2 pi, so that no grid"
+                " can cover it; give the state a workspace"
             )
         return replace(c, low=-math.pi, high=math.pi, period=2 * math.pi)
 

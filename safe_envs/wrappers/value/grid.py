@@ -140,7 +140,6 @@ class Grid:
         for axis, place in zip(self.axes, places, strict=True):
             inside &= (place >= 0) & (place < axis.count)
         kept = [
-            np.clip(place, 0, axis.count - 1)
-            for axis, place in zip(self.axes, places, strict=True)
+            np.clip(place, 0, axis.count - 1) for axis, place in zip(self.axes, places, strict=True)
         ]
         return np.where(inside, np.ravel_multi_index(kept, self.shape), -1)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safe_envs.wrappers.value.bellman_kernel import AXES
+from safe_envs.wrappers.value.expected_value_kernel import AXES
 from safe_envs.wrappers.value.grid import Grid
 
 _SLACK = 1e-13

@@ -9,8 +9,8 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.bellman_kernel import AXES
 from safe_envs.wrappers.value.cell_sets import CellSets, Sets
+from safe_envs.wrappers.value.expected_value_kernel import AXES
 from safe_envs.wrappers.value.grid_arrays import grid_arrays
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
@@ -86,11 +86,27 @@ class LookAhead:
         return self._bounds(k, x, np.stack([u, u], axis=-1), 1)
 
     def scanned(self, k: np.ndarray, x: Components) -> np.ndarray:
-        """Return `expected` for all scanned inputs, shape (B, U)."""
+        """Return `expected` for all scanned inputs.
+
+        Args:
+            k: control instants before K, int array (B,).
+            x: n components of the states, (B,).
+
+        Returns:
+            Shape (B, U).
+        """
         return self._bounds(k, x, self._scanned.ends, 1)
 
     def largest(self, k: np.ndarray, x: Components) -> np.ndarray:
-        """Return upper bounds of the expected next value under any input, shape (B,)."""
+        """Return upper bounds of the expected next value under any input.
+
+        Args:
+            k: control instants before K, int array (B,).
+            x: n components of the states, (B,).
+
+        Returns:
+            Shape (B,).
+        """
         return -self._bounds(k, x, self._scanned.boxes, -1).min(axis=1)
 
     def best_input(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +127,7 @@ class LookAhead:
         unsettled = np.flatnonzero(alike.sum(axis=1) > 1)
         rank = np.where(alike, lower, -np.inf)
         if unsettled.size:
-            part = [np.asarray(c)[unsettled] for c in x]
+            part = tuple(np.asarray(c)[unsettled] for c in x)
             upper = -self._bounds(np.asarray(k)[unsettled], part, self._scanned.ends, -1)
             rank[unsettled] = np.where(alike[unsettled], upper, -np.inf)
         chosen = rank.argmax(axis=1)
@@ -150,7 +166,10 @@ class LookAhead:
         ]
 
     def _bounds(self, k: np.ndarray, x: Components, inputs: np.ndarray, sign: int) -> np.ndarray:
-        """Return bounds for inputs (1 or B, V, m, 2): of the lower table, or of the negative upper one."""
+        """Return bounds under inputs (1 or B, V, m, 2).
+
+        A positive sign is for the lower table, a negative one for that of the negative upper one.
+        """
         k, q = np.asarray(k), self._coordinates(x)
         found = np.empty((len(k), inputs.shape[1]))
         size = max(1, _AT_ONCE // len(self._step.noise.weights))
@@ -158,7 +177,9 @@ class LookAhead:
             for first in range(0, len(k), size):
                 part = slice(first, first + size)
                 own = inputs[part] if len(inputs) > 1 else inputs
-                found[part] = self._bounds(k[part], [np.asarray(c)[part] for c in x], own, sign)
+                found[part] = self._bounds(
+                    k[part], tuple(np.asarray(c)[part] for c in x), own, sign
+                )
             return found
         if self._step.depends_on_time:
             for instant in np.unique(k):

@@ -16,7 +16,7 @@ class ScannedInputs(NamedTuple):
     """Inputs, and boxes of inputs.
 
     Attributes:
-        values: the inputs, shape (U, m), the ends of the box among them.
+        values: the inputs, shape (U, m), the ends of the bounds among them.
         ends: the same as boxes of one point, shape (1, U, m, 2).
         boxes: as many boxes that cover all inputs, shape (1, U, m, 2).
         neighbours: of each input, those next to it along one input, shape (U, 2 m), -1 for none.
@@ -29,7 +29,7 @@ class ScannedInputs(NamedTuple):
 
 
 def scanned_inputs(box: Sequence[tuple[float, float]], number: int | None) -> ScannedInputs:
-    """Return inputs on a grid over the box.
+    """Return inputs on a grid within their bounds.
 
     Args:
         box: (low, high) of each input.

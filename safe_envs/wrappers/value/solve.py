@@ -3,8 +3,8 @@
 Let S_k = 1{X_0..X_k in C} for an episode, and D the set where episodes end. With L_K <= 1_C,
 L_k <= 1_C on D, and L_k(x) <= E L_{k+1}(X_{k+1} | X_k = x, u_k(x)) on C without D for some inputs
 u_k, E S_{k+1} L_{k+1} >= E S_k L_k, so that these inputs keep the episode safe with probability
-L_0(x_0) at least. With H_K >= 1_C, H_k >= 1_C on D, and H_k(x) >= E H_{k+1} for every input of the
-box, no policy does so with a larger probability than H_0(x_0), not even one that remembers.
+L_0(x_0) at least. With H_K >= 1_C, H_k >= 1_C on D, and H_k(x) >= E H_{k+1} for every input within
+its bounds, no policy does so with a larger probability than H_0(x_0), not even one that remembers.
 
 The envelopes are constant on the part in C of each cell, and 0 outside C. The value of a cell is
 the least (largest) expected value over all its points: the step takes the cell into boxes, and the
@@ -46,6 +46,9 @@ def solve(
         problem: whose plant or model is taken.
         settings: what is asked for.
         progress: called with the part of the work that is done.
+
+    Returns:
+        The table of both envelopes.
 
     Raises:
         ConfigurationError: The problem has too many coordinates, or unbounded ones, or the tables
@@ -113,9 +116,11 @@ class _Operator:
         self._cells, self._parts = self._classified(self._reduced.steps)
         everywhere = np.arange(self._grid.cells)
         self._numbers = np.flatnonzero(self._cells.touches) if self.is_constant else everywhere
-        self._images: tuple[StepImages, StepImages] | None = None
+        self._imaged_at = -1
         self._best = np.zeros(len(self._numbers), dtype=np.int64)
         self._known = np.full((len(self._numbers), len(self._scanned.values)), 2.0)
+        self._leader = np.zeros(len(self._numbers), dtype=np.int64)
+        self._rival = np.full(len(self._numbers), 2.0)
         self._turn = 0
 
     def cells(self, k: int) -> CellSets:
@@ -142,12 +147,13 @@ class _Operator:
         """
         ahead = self._parts
         cells = self.cells(k)
-        if self._images is None or self._moves:
-            self._images = self._imaged(k)
+        if self._imaged_at < 0 or self._moves:
+            self._images, self._imaged_at = self._imaged(k), k
         if not self.is_constant:
-            self._known[:] = 2.0
+            self._known[:] = self._rival[:] = 2.0
         here = CellSets(*(each[self._numbers] for each in cells))
-        found = np.zeros(len(self._numbers))
+        # Values do not rise backwards in time: those of the next instant are the best to be had.
+        found = lower[self._numbers].astype(np.float64)
         bounds = np.zeros(len(self._numbers))
         self._sweep_lower(self._around(lower, ahead.inside), found, here)
         self._sweep_upper(self._around(-upper, ahead.touches), bounds)
@@ -183,7 +189,7 @@ class _Operator:
             lambda first, last, shifts: sweep(
                 first,
                 last,
-                self._turn if self.is_constant else self._turn % 8,
+                self._turn,
                 images,
                 effects,
                 self._scanned.ends,
@@ -217,7 +223,8 @@ class _Operator:
                 *self._means,
                 shifts,
                 self._known,
+                self._leader,
+                self._rival,
                 bounds,
             ),
         )
-

@@ -74,6 +74,11 @@ class Step:
         self._scenarios = _scenarios(reduced.intervals)
 
     @property
+    def scenarios(self) -> int:
+        """Number of boxes of the uncertain parameters."""
+        return len(self._scenarios)
+
+    @property
     def depends_on_time(self) -> bool:
         """Whether states that are known in advance occur in the step."""
         used = set().union(*(e.free_symbols for e in reduced_expressions(self._parts)))
@@ -130,9 +135,11 @@ class Step:
         instant: int,
     ) -> None:
         rest, effect = self._functions
-        n, m = effects.shape[2:4]
+        m = effects.shape[3]
         known = [float(values[instant]) for values in self._reduced.known.values()]
-        wide = [Interval(c.low[:, None, None, None], c.high[:, None, None, None]) for c in coordinates]
+        wide = [
+            Interval(c.low[:, None, None, None], c.high[:, None, None, None]) for c in coordinates
+        ]
         worlds = [
             Interval(
                 np.array([s[i][0] for s in self._scenarios])[:, None],
@@ -180,9 +187,7 @@ def _parts_of(reduced: ReducedProblem) -> _Parts:
         rest = [e.subs(dict.fromkeys(inputs, 0)) for e in rest]
     else:
         effect = [[sp.Integer(0)] * len(inputs) for _ in rest]
-    return _Parts(
-        tuple(rest), tuple(map(tuple, effect)), tuple(blur), tuple(boxed), is_affine
-    )
+    return _Parts(tuple(rest), tuple(map(tuple, effect)), tuple(blur), tuple(boxed), is_affine)
 
 
 def _scenarios(
@@ -196,5 +201,3 @@ def _scenarios(
         ends = [low + (high - low) * i / number for i in range(number)] + [high]
         cut.append(list(itertools.pairwise(ends)))
     return list(itertools.product(*cut))
-
-

@@ -13,15 +13,18 @@ from safe_envs.wrappers.value.reduction import ReducedProblem
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.step_images import Step
 
-_CELLS = {1: 4000, 2: 40_000, 3: 300_000, 4: 600_000}
+_CELLS = {1: 4000, 2: 300_000, 3: 500_000, 4: 600_000}
+"""Cells of a problem whose noise is not divided into boxes."""
+
+_LESS = 0.75
+"""How the number of cells falls with that of the boxes of noise."""
+
 _SAMPLES = 512
 _BYTES = 8
 """Of both tables for a cell and an instant."""
 
 
-def suitable_grid(
-    small: ReducedProblem, settings: ValueSettings, sets: Sets, step: Step
-) -> Grid:
+def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, step: Step) -> Grid:
     """Return a grid over the safe part of the workspace.
 
     Coordinates that a step changes little get narrow cells, since a cell's width acts like a
@@ -46,7 +49,7 @@ def suitable_grid(
             f" coordinates ({names}): give a number for each"
         )
     most = int(settings.memory / 2 / (_BYTES * (small.steps + 1)))
-    counts = settings.cells or _counts(small, ends, step, min(_CELLS[n], most))
+    counts = settings.cells or _counts(small, ends, step, min(_usual(n, step), most))
     if math.prod(counts) > most:
         raise ConfigurationError(
             f"{math.prod(counts)} cells at {small.steps + 1} instants do not fit"
@@ -69,6 +72,12 @@ def _cut(hull: np.ndarray, count: int) -> np.ndarray:
 def _wide(hull: np.ndarray) -> tuple[float, float]:
     widest = int(np.diff(hull).argmax())
     return float(hull[widest]), float(hull[widest + 1])
+
+
+def _usual(n: int, step: Step) -> int:
+    """Return a number of cells that takes less than a minute or so."""
+    boxes = len(step.noise.weights) * step.scenarios
+    return _CELLS[n] if n == 1 else int(_CELLS[n] / boxes**_LESS)
 
 
 def _counts(

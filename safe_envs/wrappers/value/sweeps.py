@@ -13,12 +13,8 @@ from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Functions, Program, is_available
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers.value import bellman_arrays
-from safe_envs.wrappers.value.bellman_kernel import (
-    AXES,
-    expected_values,
-    sweep_lower,
-    sweep_upper,
-)
+from safe_envs.wrappers.value.bellman_kernel import expected_values, sweep_lower, sweep_upper
+from safe_envs.wrappers.value.expected_value_kernel import AXES
 
 _PARTS = 8
 """Parts for each thread, so that all threads end at about the same time."""
@@ -50,7 +46,5 @@ def in_parts(pool: ThreadPoolExecutor, count: int, sweep: Callable[[int, int, An
     """
     size = max(1, -(-count // (_PARTS * threads())))
     parts = [(first, min(first + size, count)) for first in range(0, count, size)]
-    for done in [
-        pool.submit(sweep, *part, np.zeros(2 * AXES)) for part in parts
-    ]:
+    for done in [pool.submit(sweep, *part, np.zeros(2 * AXES)) for part in parts]:
         done.result()

@@ -14,8 +14,8 @@ from safe_envs.wrappers.value.settings import ValueSettings
 class ValueTable:
     """Envelopes of a problem's value on the cells of a grid.
 
-    The rows of the tables are the control instants `first` to K; before `first` nothing changes any
-    more, so that its row stands for all earlier instants.
+    The tables are of the control instants `first` to K; before `first` nothing changes any more, so
+    that the first one stands for all earlier instants.
 
     Attributes:
         problem: its name.
@@ -23,7 +23,7 @@ class ValueTable:
         settings: what was asked for.
         grid: of the coordinates.
         inputs: that were scanned, in physical units, shape (U, m).
-        first: control instant of the first row.
+        first: control instant of the first one.
         lower: lower envelope, shape (K + 1 - first, cells), float32 in [0, 1]; 0 outside the grid.
         upper: upper envelope, of the same shape.
         seconds: that the computation took.

@@ -1,0 +1,139 @@
+"""Dubins vehicle with noise that is to reach a goal before a moving obstacle hits it."""
+
+from __future__ import annotations
+
+import math
+
+import sympy as sp
+
+from safe_envs.envs.system_env import SystemEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Feature, Variable
+from safe_envs.systems._common import positive, uniform_box
+from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, x, y
+from safe_envs.systems.dubins_obstacle import separation, v_o, vehicle_among, way_to, x_o, y_o
+
+_GOAL = (1.4, 1.0)
+_GATE, _GATE_RADIUS = (-0.6, 1.1), 0.4
+_START = (-1.5, -1.0, 0.4)
+_OBSTACLE_START = (0.0, -1.2)
+
+
+def dubins_reach(*, radius: float = 0.4) -> SafetyProblem:
+    """Build the problem of reaching a goal past a moving obstacle, with noise in the position.
+
+    Args:
+        radius: r_O of the obstacle, in m.
+    """
+    r = positive("radius", radius)
+    car = vehicle_among(1.0, {x_o: sp.Integer(0), y_o: v_o}, {v_o: 0.7}, noise=0.2)
+    return SafetyProblem(
+        name="DubinsReach",
+        plant=car,
+        model=car,
+        barriers=(Barrier(separation(x_o, y_o, r)),),
+        regions={"gate": _GATE_RADIUS**2 - (x - _GATE[0]) ** 2 - (y - _GATE[1]) ** 2},
+        states=(
+            Variable(x, -2.0, 2.0, "m"),
+            Variable(y, -2.0, 2.0, "m"),
+            Variable(theta, -math.inf, math.inf, "rad"),
+            Variable(x_o, -5.0, 5.0, "m"),
+            Variable(y_o, -5.0, 5.0, "m"),
+        ),
+        inputs=(Variable(omega, -3.0, 3.0, "rad/s"),),
+        features=(
+            Feature("x", x, -2.0, 2.0),
+            Feature("y", y, -2.0, 2.0),
+            *HEADING,
+            Feature("ahead_x", x_o - x, -7.0, 7.0),
+            Feature("ahead_y", y_o - y, -7.0, 7.0),
+        ),
+        starts={
+            "spread": uniform_box((*_START, *_OBSTACLE_START), (0.2, 0.2, 0.5, 0.0, 0.0)),
+            "fixed": Start.at((*_START, *_OBSTACLE_START)),
+        },
+        dt=0.2,
+        horizon=6.0,
+        gains=(1.0, 2.0),
+        filter="hocbf",
+        **SHOWN,
+        sampling=SamplingDomain(
+            region=((-2.0, 2.0), (-2.0, 2.0), (-math.pi, math.pi), (-0.5, 0.5), (-1.2, 3.0)),
+            coordinates=(sp.cos(theta), sp.sin(theta), x_o - x, y_o - y),
+        ),
+        **way_to(*_GOAL),
+    )
+
+
+class DubinsReach(SystemEnv):
+    """A vehicle with noise heads for a goal, and an obstacle moves across its way.
+
+    ## Description
+    As `DubinsObstacle`, with noise in the position and in a small workspace: what counts is to
+    reach the goal before the obstacle hits, "always safe & eventually goal". The obstacle's path is
+    known from the start, so that three coordinates and the time say everything. Nothing waits: the
+    vehicle cannot slow down, and the workspace ends 2 m from the centre. A step is .2 m long, five
+    cells of a table with 100 cells along x and y, whose bounds are close then.
+
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
+    dx_o = 0, dy_o = v_o dt
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x`, `y` | position of the vehicle | m | [-2, 2] |
+    | `theta` | heading | rad | unbounded |
+    | `x_o`, `y_o` | position of the obstacle | m | [-5, 5] |
+
+    ## Inputs
+    | symbol | meaning | unit | bounds |
+    |---|---|---|---|
+    | `omega` | turn rate | rad/s | [-3, 3] |
+
+    ## Observation
+    x, y, cos(theta), sin(theta), and the position of the obstacle seen from the vehicle, x_o - x
+    and y_o - y.
+
+    ## Barrier
+    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .4 m, of relative degree 2. Gains 1 and 2.
+    Default filter: `hocbf`, which ignores the noise.
+
+    ## Regions
+    `gate`, the disk of radius .4 m around (-.6, 1.1), for sequences: "always safe & eventually
+    (gate then goal)" leads around the obstacle's path.
+
+    ## Noise
+    `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both .2.
+
+    ## Mismatch
+    None: plant and model have v = 1 m/s and v_o = .7 m/s; `plant={"v": 1.2}` or `model={"v_o":
+    0.5}` makes them differ.
+
+    ## Reward
+    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in
+    units of v dt; and 10 on arrival. Neither circling nor leaving the workspace pays.
+
+    ## Nominal controller
+    Turns towards the goal with gain 2 1/s.
+
+    ## Start
+    `spread`: vehicle uniform within (.2 m, .2 m, .5 rad) of (-1.5, -1, .4), obstacle at (0, -1.2).
+    `fixed`: exactly there.
+
+    ## Episode end
+    Terminated within .3 m of the goal (1.4, 1) or outside the workspace, truncated after 6 s = 30
+    steps.
+
+    ## Arguments
+    `barrier={"radius": 0.4}`, the obstacle's radius r_O in m; for all others see `SystemEnv`.
+
+    ## Source
+    Our own: the vehicle of the thesis' Eq. (3.27) and Sec. 4.3.2 in a task of the kind of thesis
+    Sec. 3.5.1.
+    """
+
+    problem_factory = staticmethod(dubins_reach)

@@ -1,0 +1,98 @@
+"""Named sets of a problem: `safe`, `goal` and regions."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import ControlAffineSDE, SafetyProblem
+from safe_envs.errors import ConfigurationError, NumericalError, SystemDefinitionError
+from safe_envs.problem.builder import state_problem
+from safe_envs.problem.named_sets import NamedSets, set_expressions, set_names
+from tests.conftest import problem_of
+
+x, y, u, k = sp.symbols("x y u k", real=True)
+SYSTEM = ControlAffineSDE(
+    states=(x, y),
+    inputs=(u,),
+    drift=[y, -k * x],
+    input_matrix=[0, 1],
+    diffusion=[[0], [0]],
+    parameters={k: 2.0},
+)
+
+
+def own_problem(**rest) -> SafetyProblem:
+    return state_problem(
+        SYSTEM, [1 - y, 1 + y], box=(-1.0, 1.0), start=[0.0, 0.0], dt=0.1, horizon=1.0, **rest
+    )
+
+
+def test_sets_of_an_own_problem() -> None:
+    problem = own_problem(goal=x - 1, regions={"gate": 0.25 - x**2, "left": -x})
+    assert set_names(problem) == ("safe", "goal", "gate", "left")
+    assert set_names(own_problem()) == ("safe",)
+    assert set_expressions(problem, "safe") == (1 - y, 1 + y)
+    sets = NamedSets(problem, ("gate", "safe", "goal"))
+    states = (np.array([0.5, 0.0, 2.0]), np.array([0.5, -1.0, 3.0]))
+    values = sets.values(states)
+    np.testing.assert_allclose(values, [[0, 0.25, -3.75], [0.5, 0, -2], [-0.5, -1, 1]])
+    # At its edge a state is in a region, and not in the safe set.
+    expected = [[True, True, False], [True, False, False], [False, False, True]]
+    assert sets.inside(values).tolist() == expected
+
+
+def test_regions_outlive_other_numbers_and_pickle() -> None:
+    problem = own_problem(regions={"gate": 0.25 - x**2}).configured(dt=0.05, plant={"k": 3.0})
+    assert dict(problem.regions) == {"gate": 0.25 - x**2}
+    assert pickle.loads(pickle.dumps(problem)).regions == problem.regions
+
+
+@pytest.mark.parametrize("name", ["safe", "goal", "until", "not", "2nd", "a b", "", "ä", 3])
+def test_names_that_a_specification_could_not_read_are_refused(name: object) -> None:
+    with pytest.raises(SystemDefinitionError, match="a region is named"):
+        own_problem(regions={name: x})
+
+
+@pytest.mark.parametrize(
+    ("regions", "message"),
+    [
+        ({"gate": "x > 0"}, "region gate is a text"),
+        ({"gate": x > 0}, "true or false"),
+        ({"gate": sp.Symbol("x")}, "region gate uses the unknown symbol x"),
+        ({"gate": k * x}, "region gate uses the unknown symbol k"),
+        ([x], "give a mapping"),
+        ({f"r{i}": x for i in range(21)}, "up to 20 names"),
+    ],
+)
+def test_regions_are_expressions_of_the_states(regions: object, message: str) -> None:
+    with pytest.raises(SystemDefinitionError, match=message):
+        own_problem(regions=regions)
+
+
+def test_sets_that_are_not_there_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="has no set 'gat'; did you mean 'gate'"):
+        NamedSets(own_problem(regions={"gate": x}), ["gat"])
+    with pytest.raises(ConfigurationError, match="has no set 'goal'; allowed: safe"):
+        set_expressions(own_problem(), "goal")
+    with pytest.raises(ConfigurationError, match="the goal of problem depends on u"):
+        set_expressions(own_problem(goal=x - u), "goal")
+
+
+def test_a_set_without_a_value_is_reported() -> None:
+    sets = NamedSets(own_problem(regions={"gate": sp.sqrt(x)}), ["safe", "gate"])
+    with pytest.raises(NumericalError, match=r"the set 'gate' of problem has no value .*\[-1.0, 2"):
+        sets.values((np.array([1.0, -1.0]), np.array([1.0, 2.0])))
+
+
+def test_registered_problem_with_a_region() -> None:
+    problem = problem_of("safe_envs/DubinsReach-v0")
+    assert set_names(problem) == ("safe", "goal", "gate")
+    at = tuple(np.array([c]) for c in (-0.6, 1.1, 0.0, 0.0, -1.2))
+    safe, goal, gate = NamedSets(problem, set_names(problem)).values(at)[:, 0]
+    assert safe == pytest.approx(0.36 + 2.3**2 - 0.16)
+    assert goal == pytest.approx(0.09 - 4.0 - 0.01)
+    assert gate == pytest.approx(0.16)
