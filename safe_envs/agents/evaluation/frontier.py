@@ -68,9 +68,9 @@ def frontier(
     # Unknown names are errors before a long computation.
     wanted, left_out = _resolved(problem, spec)
     parts = WorkParts(progress, 1 + len(wanted) + settings.policies)
-    measure = FrontierEpisodes(problem, spec.seed, spec.confidence, settings.leaving)
     points = []
     values = price_violations(problem, settings, parts.part(1.0))
+    measure = FrontierEpisodes(values, spec.seed, spec.confidence)
     for (name, kind), resolved in wanted.items():
         try:
             points.append(measure.evaluated(name, kind, resolved, parts.part(spec.episodes)))
@@ -79,7 +79,7 @@ def frontier(
                 raise
             left_out[name] = str(error)
     attained = [
-        measure.at_price(values, i, spec.attained, parts.part(spec.attained))
+        measure.at_price(i, spec.attained, parts.part(spec.attained))
         for i in range(len(values.of_policies))
     ]
     return Frontier(problem, values, attained, points, left_out, spec.confidence)

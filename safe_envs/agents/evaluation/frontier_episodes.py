@@ -19,7 +19,6 @@ from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.policies.base import Policy
 from safe_envs.dynamics.codegen import Components, compile_function, filled
 from safe_envs.envs.vector_env import SafeVectorEnv
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.priced_values import PricedValues
 
 _BATCH = 1024
@@ -43,15 +42,15 @@ class FrontierEpisodes:
     """Simulates episodes, and makes points of them.
 
     Args:
-        problem: that is simulated.
+        values: the computed returns at prices of a violation.
         seed: whole number from 0.
         confidence: of all intervals.
-        leaving: how leaving the workspace counts, see `FrontierSettings`.
     """
 
-    def __init__(self, problem: SafetyProblem, seed: int, confidence: float, leaving: str) -> None:
-        self._problem, self._seed, self._confidence = problem, seed, confidence
-        self._counts_leaving = leaving == "violation"
+    def __init__(self, values: PricedValues, seed: int, confidence: float) -> None:
+        problem = self._problem = values.given.small.problem
+        self._values, self._seed, self._confidence = values, seed, confidence
+        self._counts_leaving = values.settings.leaving == "violation"
         self._outside = compile_function(problem.plant.states, (problem.outside,), "arrays")
 
     def evaluated(
@@ -74,13 +73,10 @@ class FrontierEpisodes:
         env = resolved.env(conditions, min(_BATCH, count))
         return self._point(name, kind, env, resolved.policy, progress, count)
 
-    def at_price(
-        self, values: PricedValues, price: int, count: int, progress: Progress | None
-    ) -> FrontierPoint:
+    def at_price(self, price: int, count: int, progress: Progress | None) -> FrontierPoint:
         """Simulate the policy that a price leads to.
 
         Args:
-            values: at all prices.
             price: place of the price among those whose policy is kept.
             count: number of episodes.
             progress: called with the number of episodes that are done.
@@ -89,8 +85,8 @@ class FrontierEpisodes:
             The point.
         """
         env = SafeVectorEnv(self._problem, min(_BATCH, count))
-        policy = PricedPolicy(values, price, env)
-        amount = float(values.prices[values.of_policies[price]])
+        policy = PricedPolicy(self._values, price, env)
+        amount = float(self._values.prices[self._values.of_policies[price]])
         found = self._point(f"price {amount:.3g}", "price", env, policy, progress, count)
         return replace(found, price=amount)
 
@@ -104,11 +100,12 @@ class FrontierEpisodes:
         episodes: int,
     ) -> FrontierPoint:
         watch = _LastStates()
-        results, left = [], []
+        results, left, starts = [], [], []
         batches = play(env, policy, range(episodes), self._seed, progress, watch)
         for batch in batches:
             count = len(batch.results.length)
             results.append(batch.results)
+            starts.append(batch.starts)
             shape = watch.last[0].shape
             left.append(filled(self._outside(*watch.last)[0], shape)[:count] > 0.0)
         env.close()
@@ -116,6 +113,7 @@ class FrontierEpisodes:
         only_left = found.safe & np.concatenate(left) & self._counts_leaving
         violations = int((~found.safe | only_left).sum())
         low, high = rate_interval(violations, episodes, self._confidence)
+        means = self._values.at_starts(tuple(np.concatenate(starts).T)).mean(axis=0)
         mean, half = _mean(found.returns, self._confidence)
         return FrontierPoint(
             name,
@@ -129,6 +127,7 @@ class FrontierEpisodes:
             mean,
             mean - half,
             mean + half,
+            tuple(means.tolist()),
         )
 
 

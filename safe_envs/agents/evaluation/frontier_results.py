@@ -28,6 +28,7 @@ class FrontierPoint:
         return_mean: mean return.
         return_low: lower end of its interval.
         return_high: upper end.
+        start_values: mean over its starts of the computed return less the price, at each price.
         price: of a violation, for the kind "price".
     """
 
@@ -42,6 +43,7 @@ class FrontierPoint:
     return_mean: float
     return_low: float
     return_high: float
+    start_values: tuple[float, ...]
     price: float | None = None
 
 
@@ -66,10 +68,14 @@ class Frontier:
     confidence: float
 
     def cost(self, point: FrontierPoint) -> float:
-        """Return by how much the mean return of a point is below the computed curve."""
-        return float(self.values.largest_return(np.array(point.violation_rate))) - (
-            point.return_mean
-        )
+        """Return by how much the mean return of a point is below the curve of its own starts."""
+        lines = np.array(point.start_values) + point.violation_rate * self.values.prices
+        return float(lines.min()) - point.return_mean
+
+    def needed(self, point: FrontierPoint) -> float:
+        """Return the least chance of a violation with which the return of a point can be had."""
+        values, prices = np.array(point.start_values)[1:], self.values.prices[1:]
+        return float(np.clip(((point.return_mean - values) / prices).max(), 0.0, 1.0))
 
     def curve(self, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
         """Return chances of a violation and the largest mean return at them, shape (count,).
@@ -102,7 +108,9 @@ class Frontier:
                 "seconds": values.seconds,
             },
             "attained": [asdict(point) for point in self.attained],
-            "points": [asdict(p) | {"cost": self.cost(p)} for p in self.points],
+            "points": [
+                asdict(p) | {"cost": self.cost(p), "needed": self.needed(p)} for p in self.points
+            ],
             "left_out": self.left_out,
             "confidence": self.confidence,
         }

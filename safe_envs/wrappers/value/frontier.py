@@ -19,6 +19,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -147,22 +148,26 @@ class _Frontier:
                         after[part.rows], violated_choice[k, part.rows] = values, choice[:, 0]
                 if progress:
                     progress((small.steps - k) / small.steps)
-        return PricedValues(
+        found = PricedValues(
             self._given,
             settings,
             prices,
-            self._at_starts(ahead, after, prices),
+            np.zeros(0),
             self._inputs,
             self._safe_grid,
             self._whole_grid,
             self._known,
             self._step,
             kept,
+            ahead,
+            after,
             safe_values,
             violated_values,
             violated_choice,
-            time.perf_counter() - self._begun,
+            0.0,
         )
+        means = found.at_starts(draw_starts(small.problem, _STARTS, 0)).mean(axis=0)
+        return replace(found, values=means, seconds=time.perf_counter() - self._begun)
 
     def _best(
         self, part: _Part, k: int, ahead: Any, after: np.ndarray, prices: np.ndarray | None
@@ -229,19 +234,6 @@ class _Frontier:
 
     def _size(self, noises: int) -> int:
         return max(1, _ENTRIES // (noises * len(self._inputs) * 2 ** len(self._safe_grid.counts)))
-
-    def _at_starts(self, ahead: np.ndarray, after: np.ndarray, prices: np.ndarray) -> np.ndarray:
-        x = draw_starts(self._given.small.problem, _STARTS, 0)
-        q = [np.asarray(c, dtype=np.float64) for c in self._given.small.of_states(x)]
-        table = np.full((self._safe_grid.size, len(prices)), np.nan)
-        table[self._nodes] = ahead
-        numbers, shares = self._safe_grid.corners(q)
-        shares = np.where(self._known[numbers] >= 0, shares, 0.0)
-        total = shares.sum(axis=0)
-        found = np.einsum("cb,cbp->bp", shares, np.nan_to_num(table)[numbers])
-        found /= np.where(total > 0.0, total, 1.0)[:, None]
-        lost = self._whole_grid.interpolated(after, q) - prices
-        return np.where(self._step.is_safe(q)[:, None], found, lost).mean(axis=0)
 
 
 def _spread(prices: int, policies: int) -> np.ndarray:

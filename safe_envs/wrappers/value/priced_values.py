@@ -60,6 +60,8 @@ class PricedValues:
         known: place of each node of `safe_grid` in the tables, -1 for none.
         step: a control period.
         of_policies: numbers of the prices whose policy can be asked for.
+        safe_start: of the safe nodes at instant 0 for all prices, shape (safe nodes, P).
+        violated_start: after a violation, at instant 0, shape (nodes, 1).
         safe_values: of the safe nodes at the instants 1 to K, shape (K, safe nodes, policies),
             float32.
         violated_values: after a violation, at the same instants, shape (K, nodes), float32.
@@ -77,6 +79,8 @@ class PricedValues:
     known: np.ndarray
     step: PricedStep
     of_policies: np.ndarray
+    safe_start: np.ndarray
+    violated_start: np.ndarray
     safe_values: np.ndarray
     violated_values: np.ndarray
     violated_choice: np.ndarray
@@ -96,6 +100,23 @@ class PricedValues:
         """
         lines = self.values + np.asarray(violations)[..., None] * self.prices
         return lines.min(axis=-1)
+
+    def at_starts(self, x: Components) -> np.ndarray:
+        """Return the values of starts for all prices, shape (B, P).
+
+        Args:
+            x: n components of the states, (B,).
+        """
+        given = self.given.small.of_states(tuple(np.asarray(c, dtype=np.float64) for c in x))
+        q = [filled(c, np.shape(x[0])) for c in given]
+        numbers, shares = self.safe_grid.corners(q)
+        places = self.known[numbers]
+        shares = np.where(places >= 0, shares, 0.0)
+        total = shares.sum(axis=0)
+        found = np.einsum("cb,cbp->bp", shares, self.safe_start[np.maximum(places, 0)])
+        found /= np.where(total > 0.0, total, 1.0)[:, None]
+        lost = self.whole_grid.interpolated(self.violated_start, q) - self.prices
+        return np.where(self.step.is_safe(q)[:, None], found, lost)
 
     def inputs_at(self, k: int, x: Components, violated: np.ndarray, price: int) -> np.ndarray:
         """Return the inputs that are best at states, by a step of look-ahead where all is safe.
