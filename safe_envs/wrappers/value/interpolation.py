@@ -53,7 +53,7 @@ def weighted_matrix(
     flat = weights.reshape(-1)
     kept = np.flatnonzero(flat)
     points: Sequence[np.ndarray] = [each.reshape(-1)[kept] for each in reached]
-    nodes, shares = grid.corners(points)
+    nodes, shares = grid.around(points, None if known is None else known >= 0)
     columns = grid.size
     if known is not None:
         columns = int(known.max()) + 1
@@ -64,7 +64,7 @@ def weighted_matrix(
         nodes = np.maximum(nodes, 0)
     rows = np.broadcast_to(kept // noises, nodes.shape)
     data = (shares * flat[kept]).astype(np.float32)
-    used = data.reshape(-1) > 0.0
+    used = data.reshape(-1) != 0.0
     entries = (
         data.reshape(-1)[used],
         (rows.reshape(-1)[used], nodes.reshape(-1)[used]),

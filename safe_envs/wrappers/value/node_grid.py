@@ -1,4 +1,4 @@
-"""Grids of nodes, between which values are interpolated linearly along each axis."""
+"""Grids of nodes, between which values are interpolated."""
 
 from __future__ import annotations
 
@@ -94,6 +94,49 @@ class NodeGrid:
             numbers.append(number)
             shares.append(product)
         return np.stack(numbers), np.stack(shares)
+
+    def around(
+        self, q: Sequence[np.ndarray], known: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return more nodes around points, and shares that are exact for cubic functions.
+
+        Where such a node lies beyond the grid or is not known, the shares are those of `corners`.
+
+        Args:
+            q: an array (B,) for each axis.
+            known: which nodes have values, shape (nodes,); None for all.
+
+        Returns:
+            Numbers of nodes and their shares, shape (4^n, B) each.
+        """
+        sides, linear = [], np.zeros(len(q[0]), dtype=bool)
+        for values, low, step, count, turns in self._axes(q):
+            t = (values - low) / step
+            t = t % count if turns else np.clip(t, 0.0, count - 1.0)
+            first = np.minimum(t.astype(np.int64), count - 1 if turns else count - 2)
+            sides.append((first, t - first, count))
+            if not turns:
+                linear |= (first < 1) | (first > count - 3)
+        number = np.zeros((1, len(q[0])), dtype=np.int64)
+        for first, _, count in sides:
+            places = np.stack([(first + j) % count for j in (-1, 0, 1, 2)])
+            number = (number[:, None] * count + places).reshape(4 * len(number), -1)
+        if known is not None:
+            linear |= ~known[number].all(axis=0)
+        share = np.ones((1, len(q[0])))
+        for _, s, _ in sides:
+            cubic = np.stack(
+                [
+                    -s * (s - 1.0) * (s - 2.0) / 6.0,
+                    (s + 1.0) * (s - 1.0) * (s - 2.0) / 2.0,
+                    -(s + 1.0) * s * (s - 2.0) / 2.0,
+                    (s + 1.0) * s * (s - 1.0) / 6.0,
+                ]
+            )
+            straight = np.stack([np.zeros_like(s), 1.0 - s, s, np.zeros_like(s)])
+            own = np.where(linear, straight, cubic)
+            share = (share[:, None] * own).reshape(4 * len(share), -1)
+        return number, share
 
     def interpolated(self, table: np.ndarray, q: Sequence[np.ndarray]) -> np.ndarray:
         """Return values at points.
