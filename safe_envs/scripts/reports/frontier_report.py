@@ -55,7 +55,7 @@ def print_report(console: Console, title: str, found: Frontier) -> None:
         f"The curve is computed from {len(values.prices)} prices of a violation on {grid} nodes of"
         f" ({names}) in {values.seconds:.1f} s: no policy crosses it but for the error of the grid,"
         " which is not bounded.",
-        "`price` names the policies that these prices lead to: they show what the curve promises.",
+        "`price` names the policies that these prices lead to: they show that it is attained.",
         *(f"Left out: {name} ({reason})" for name, reason in found.left_out.items()),
     ):
         say(console, line)

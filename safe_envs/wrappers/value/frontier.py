@@ -10,9 +10,10 @@ violation is v and whose mean return is R, R - c v <= J_0(c), the mean over the 
 J_0(c) + c v for every price c. The least of these lines is concave in v: it is the upper concave
 envelope of what can be had, also by policies that draw lots between others.
 
-Values between nodes are interpolated by cubic polynomials, which errs to neither side by design:
-the lines are computed, not proved. On a grid that is too coarse the largest values are a little too
-large, since inputs are chosen where interpolation overshoots.
+Values between nodes are interpolated: the lines are computed, not proved. On a coarse grid cubic
+polynomials, along one or two axes, make the largest values a little too large, since inputs are
+chosen where they overshoot; linear interpolation, along three axes, acts like further noise and
+makes values too small.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.starts import draw_starts
 from safe_envs.wrappers.value.sweeps import threads
 
-_NODES = {1: (1001,), 2: (130, 110), 3: (34, 34, 32)}
-_WHOLE = {1: (1001,), 2: (100, 100), 3: (26, 26, 24)}
+_NODES = {1: (1001,), 2: (130, 110), 3: (44, 44, 40)}
+_WHOLE = {1: (1001,), 2: (100, 100), 3: (36, 36, 32)}
 _INPUTS = {1: 21, 2: 7}
 _FEW_INPUTS = 3
 _LEAST_PRICE, _LARGEST_PRICE = 0.01, 30.0
@@ -190,6 +191,8 @@ class _Frontier:
             better = gain[u] > best
             np.copyto(best, gain[u], where=better)
             choice[better] = u
+        if prices is not None:
+            _limit(best, prices.astype(np.float32))
         return best, choice
 
     @property
@@ -235,6 +238,13 @@ class _Frontier:
 
     def _size(self, noises: int) -> int:
         return max(1, _ENTRIES // (noises * len(self._inputs) * 2 ** len(self._safe_grid.counts)))
+
+
+def _limit(values: np.ndarray, prices: np.ndarray) -> None:
+    """Remove what interpolation overshoots: a price costs between nothing and itself."""
+    for i in range(1, len(prices)):
+        before = values[:, i - 1]
+        np.clip(values[:, i], before - (prices[i] - prices[i - 1]), before, out=values[:, i])
 
 
 def _spread(prices: int, policies: int) -> np.ndarray:

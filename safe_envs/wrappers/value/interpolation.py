@@ -10,6 +10,10 @@ from scipy.sparse import csr_matrix
 
 from safe_envs.wrappers.value.node_grid import NodeGrid
 
+_CUBIC_AXES = 2
+"""Axes along which cubic polynomials are taken. On the coarse grids of more axes their overshoots,
+which the best inputs look for, would grow from step to step."""
+
 Points = list[np.ndarray]
 """An array for each coordinate."""
 
@@ -53,7 +57,10 @@ def weighted_matrix(
     flat = weights.reshape(-1)
     kept = np.flatnonzero(flat)
     points: Sequence[np.ndarray] = [each.reshape(-1)[kept] for each in reached]
-    nodes, shares = grid.around(points, None if known is None else known >= 0)
+    if len(grid.counts) <= _CUBIC_AXES:
+        nodes, shares = grid.around(points, None if known is None else known >= 0)
+    else:
+        nodes, shares = grid.corners(points)
     columns = grid.size
     if known is not None:
         columns = int(known.max()) + 1

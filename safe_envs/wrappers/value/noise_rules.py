@@ -10,7 +10,7 @@ import numpy as np
 _MOST_NODES = 81
 _FEW_POINTS, _MANY_POINTS = 64, 256
 _LEAST_WEIGHT = 1e-7
-_WIDTHS = {1: 0.5, 2: 0.8}
+_WIDTHS = {1: 0.25, 2: 0.8}
 _ENDS = {1: 4.75, 2: 4.4}
 
 

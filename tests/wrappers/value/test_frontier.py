@@ -68,7 +68,8 @@ def walked():
 
 def test_values_are_those_of_a_quadrature(walked):
     exact = _exact(walked.prices, walked.inputs[:, 0])
-    np.testing.assert_allclose(walked.values, exact, rtol=0, atol=2e-3 + 2e-4 * walked.prices)
+    np.testing.assert_allclose(walked.values, exact, rtol=0, atol=0.012)
+    assert exact[0] - exact[-1] > 2.0
 
 
 def test_values_fall_with_the_price_and_are_convex_in_it(walked):
@@ -87,9 +88,7 @@ def test_the_curve_is_concave_and_rises(walked):
 
 
 def test_without_a_price_nothing_depends_on_the_safe_set(walked):
-    free = price_violations(
-        _wide_walk(), FrontierSettings(prices=2, cells=(301,))
-    )
+    free = price_violations(_wide_walk(), FrontierSettings(prices=2, cells=(301,)))
     assert walked.values[0] == pytest.approx(free.values[0], abs=2e-3)
 
 
