@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.smoothing import Smoothing
 from safe_envs.wrappers.value.step_images import Step
-from safe_envs.wrappers.value.sweeps import bellman_functions
+from safe_envs.wrappers.value.sweeps import bellman_functions, in_parts, threads
 from safe_envs.wrappers.value.table import ValueTable
 
 
@@ -51,13 +52,17 @@ class LookAhead:
         self._parts: CellSets | None = None
         self._functions = bellman_functions()
         self._scanned = scanned_inputs(small.box, settings.inputs)
-        self._shifts = np.zeros(2 * AXES)
         cells = self._smoothing.means.cells
         self._ahead = {
             sign: np.empty((len(table.lower), cells), dtype=np.float32) for sign in (1, -1)
         }
         self._filled = {sign: np.zeros(len(table.lower), dtype=bool) for sign in (1, -1)}
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
+
+    @property
+    def noise_boxes(self) -> int:
+        """Number of boxes into which the noise of a step is divided."""
+        return len(self._step.noise.weights)
 
     def values(self, k: np.ndarray, x: Components) -> np.ndarray:
         """Return the lower envelope at states, 0 outside the safe set.
@@ -112,7 +117,7 @@ class LookAhead:
     def best_input(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return the scanned inputs of the largest bound, and these bounds.
 
-        Where several inputs are alike, the upper envelope decides.
+        Where the table says nothing, the upper envelope decides.
 
         Args:
             k: control instants before K, int array (B,).
@@ -122,16 +127,14 @@ class LookAhead:
             Shapes (B, m) and (B,).
         """
         lower = self.scanned(k, x)
-        most = lower.max(axis=1)
-        alike = lower >= most[:, None] - _ALIKE
-        unsettled = np.flatnonzero(alike.sum(axis=1) > 1)
-        rank = np.where(alike, lower, -np.inf)
-        if unsettled.size:
-            part = tuple(np.asarray(c)[unsettled] for c in x)
-            upper = -self._bounds(np.asarray(k)[unsettled], part, self._scanned.ends, -1)
-            rank[unsettled] = np.where(alike[unsettled], upper, -np.inf)
-        chosen = rank.argmax(axis=1)
-        return self.inputs[chosen], np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
+        chosen = lower.argmax(axis=1)
+        best = np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
+        silent = np.flatnonzero(best <= 0.0)
+        if silent.size:
+            part = tuple(np.asarray(c)[silent] for c in x)
+            upper = -self._bounds(np.asarray(k)[silent], part, self._scanned.ends, -1)
+            chosen[silent] = upper.argmax(axis=1)
+        return self.inputs[chosen], best
 
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
@@ -146,7 +149,8 @@ class LookAhead:
         inside, ends = self.sets_at(k, x)
         lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
         upper = np.where(ends, 1.0, self.largest(k, x))
-        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(inside, upper, 0.0).clip(0, 1)
+        near = self._sets.may_hold(k, self._coordinates(x))
+        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(near, upper, 0.0).clip(0, 1)
 
     def sets_at(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return whether states are in the safe set, and whether the episode ends in them.
@@ -206,20 +210,29 @@ class LookAhead:
             self._fill_row(int(row), sign, int(k[instant_ahead]) + 1)
         images, effects = self._step.images(q, q, inputs, instant * self._reduced.substeps)
         rest = 0.0 if sign > 0 else -(self._step.noise.rest + self._smoothing.beyond)
-        self._functions["expected_values"](
-            0,
-            len(k),
-            images,
-            effects,
-            inputs,
-            self._step.noise.weights,
-            rows,
-            self._ahead[sign],
-            rest,
-            *self._means,
-            self._shifts,
-            found,
-        )
+        expected = self._functions["expected_values"]
+
+        def sweep(first: int, last: int, shifts: np.ndarray) -> None:
+            expected(
+                first,
+                last,
+                images,
+                effects,
+                inputs,
+                self._step.noise.weights,
+                rows,
+                self._ahead[sign],
+                rest,
+                *self._means,
+                shifts,
+                found,
+            )
+
+        if found.size * len(self._step.noise.weights) < _LONG:
+            sweep(0, len(k), np.zeros(2 * AXES))
+        else:
+            with ThreadPoolExecutor(threads()) as pool:
+                in_parts(pool, len(k), sweep)
 
     def _fill_row(self, row: int, sign: int, k: int) -> None:
         if not self._filled[sign][row]:
@@ -233,5 +246,5 @@ class LookAhead:
 
 _AT_ONCE = 2_000_000
 
-_ALIKE = 1e-9
-"""Bounds that differ by less are alike."""
+_LONG = 100_000
+"""Expected values of single boxes that take longer than to start threads."""
