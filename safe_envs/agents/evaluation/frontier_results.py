@@ -72,6 +72,15 @@ class Frontier:
         lines = np.array(point.start_values) + point.violation_rate * self.values.prices
         return float(lines.min()) - point.return_mean
 
+    @property
+    def excess(self) -> float:
+        """By how much a point lies above the curve beyond both its intervals; 0 if none does."""
+        found = 0.0
+        for point in (*self.points, *self.attained):
+            lines = np.array(point.start_values) + point.violation_high * self.values.prices
+            found = max(found, point.return_low - float(lines.min()))
+        return found
+
     def needed(self, point: FrontierPoint) -> float:
         """Return the least chance of a violation with which the return of a point can be had."""
         values, prices = np.array(point.start_values)[1:], self.values.prices[1:]
@@ -111,6 +120,7 @@ class Frontier:
             "points": [
                 asdict(p) | {"cost": self.cost(p), "needed": self.needed(p)} for p in self.points
             ],
+            "excess": self.excess,
             "left_out": self.left_out,
             "confidence": self.confidence,
         }

@@ -56,6 +56,13 @@ def print_report(console: Console, title: str, found: Frontier) -> None:
         f" ({names}) in {values.seconds:.1f} s: no policy crosses it but for the error of the grid,"
         " which is not bounded.",
         "`price` names the policies that these prices lead to: they show that it is attained.",
+        *(
+            [
+                f"Points lie above the curve by {found.excess:.4g} beyond their intervals: so large"
+                " is the error of this grid; give more --cells."
+            ]
+            * (found.excess > 0.0)
+        ),
         *(f"Left out: {name} ({reason})" for name, reason in found.left_out.items()),
     ):
         say(console, line)
