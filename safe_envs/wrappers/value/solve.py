@@ -156,7 +156,8 @@ class _Operator:
             self._known[:] = self._rival[:] = 2.0
         here = CellSets(*(each[self._numbers] for each in cells))
         # Values do not rise backwards in time: those of the next instant are the best to be had.
-        found = lower[self._numbers].astype(np.float64)
+        ahead_of = lower if self.is_constant else np.where(lower > 0.0, lower, 1.0)
+        found = ahead_of[self._numbers].astype(np.float64)
         if self._known.size * len(self._step.noise.weights) < _SMALL:
             found[:] = np.inf  # All inputs are tried.
         bounds = np.zeros(len(self._numbers))
