@@ -74,6 +74,11 @@ class Step:
         self._scenarios = _scenarios(reduced.intervals)
 
     @property
+    def substeps(self) -> int:
+        """Sub-steps of a control period."""
+        return self._reduced.substeps
+
+    @property
     def scenarios(self) -> int:
         """Number of boxes of the uncertain parameters."""
         return len(self._scenarios)
