@@ -45,6 +45,10 @@ def automaton_of(specification: Specification) -> Automaton:
 def problem_automaton(problem: SafetyProblem, text: str) -> Automaton:
     """Return the automaton of a specification over the sets of a problem.
 
+    Args:
+        problem: which has the sets.
+        text: of the specification.
+
     Raises:
         ConfigurationError: The text is no specification over these sets, needs too many states, or
             has a window that ends after the episode.

@@ -149,7 +149,13 @@ class Sets:
 
 
 def halved(low: Sequence[Any], high: Sequence[Any], number: int) -> tuple[list[Any], list[Any]]:
-    """Return one of the 2**n parts of boxes that are halved along each axis."""
+    """Return one of the 2**n parts of boxes that are halved along each axis.
+
+    Args:
+        low: least coordinates, n arrays.
+        high: largest coordinates.
+        number: of the part.
+    """
     below, above = [], []
     for i, (a, b) in enumerate(zip(low, high, strict=True)):
         middle = 0.5 * (a + b)
