@@ -109,7 +109,11 @@ ALLOWED = (
     # (path, text around the word, reason)
     (r".*", r"(dynamic|linear|quadratic|cone|conic|semidefinite|convex) program", "mathematics"),
     (r".*/(value|promise)[^/]*(/.*)?", r"promis", "the name of that filter"),
-    (r".*", r"`?promise`? (filter|policy)", "the name of that filter"),
+    (
+        r".*",
+        r"`?promise`? (filter|policy)|[\"'`{]promise[\"'`:}]|promise:p=",
+        "the name of that filter",
+    ),
     (
         r".*",
         r"rows? (\([\w, ]+\)|of (an? |the )?(array|matrix|matrices|table|data|log|batch|result))",

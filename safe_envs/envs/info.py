@@ -26,6 +26,12 @@ and with a filter
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
 
+and with the promise filter
+
+| key | type | meaning |
+|---|---|---|
+| `promise` | float | p_k at the state reached: the probability that is still kept, p_0 at reset |
+
 and with a specification, of the trace of the episode so far
 
 | key | type | meaning |

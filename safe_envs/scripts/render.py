@@ -18,8 +18,8 @@ from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, w
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
+    from safe_envs.agents.evaluation.resolved import FilterParts
     from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.wrappers import Condition
 
 
 @with_env
@@ -133,7 +133,7 @@ class Run:
 
     Args:
         name: of the filter, "none" without.
-        conditions: of the filter, none for the unfiltered env.
+        conditions: of the filter, see `FilterParts`.
         problem: what is simulated.
         actor: the policy, anything with Stable-Baselines3's `predict`; each run has its own.
         seed: of the start and of the noise.
@@ -143,7 +143,7 @@ class Run:
     def __init__(
         self,
         name: str,
-        conditions: Sequence[Condition],
+        conditions: FilterParts,
         problem: SafetyProblem,
         actor: Any,
         seed: int,

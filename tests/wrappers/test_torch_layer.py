@@ -15,6 +15,7 @@ from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInpu
 from safe_envs.agents import make_problem
 from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.torch_layer import TorchFilter, layer
+from tests.wrappers.value.guesses import guess
 
 pytestmark = pytest.mark.slow
 
@@ -339,3 +340,11 @@ def test_functions_that_torch_lacks_are_refused():
     model = ControlAffineSDE((x,), (u,), [sp.besselj(0, x)], [[1]], [[0]])
     with pytest.raises(ConfigurationError, match="besselj"):
         TorchFilter(SafetyFilter(model, [(Barrier(1 - x), CBF(alpha=1.0))], [(-1.0, 1.0)]))
+
+
+def test_the_promise_filter_has_no_gradient_and_says_what_to_use():
+    problem = make_problem("safe_envs/Scalar-v0")
+    with pytest.raises(ConfigurationError, match=r"'promise:p=0\.9'.*no gradient.*'scbf'"):
+        TorchFilter.for_problem(problem, "promise:p=0.9")
+    with pytest.raises(ConfigurationError, match=r"'PromiseFilter'.*train an agent behind it"):
+        TorchFilter(guess())  # pyright: ignore[reportArgumentType]

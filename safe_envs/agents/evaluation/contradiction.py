@@ -21,6 +21,11 @@ Bounded = TypeVar("Bounded", bound=BoundSummary)
 
 ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 
+COMPUTED = "computed: the table is of floating-point numbers"
+"""Note on the bound of a promise filter, which is of the env's own steps."""
+
+_ADVICE_COMPUTED = "an interval misses the truth at times: try more episodes, or another table"
+
 
 def by_states(bound: Guarantee, visited: Sequence[VisitedStates]) -> str:
     """Return how the states of episodes contradict the numbers of a bound; "" if they do not.
@@ -36,18 +41,19 @@ def by_states(bound: Guarantee, visited: Sequence[VisitedStates]) -> str:
     return next(filter(None, found), "")
 
 
-def by_rate(bound: float | None, ci_high: float) -> str:
+def by_rate(bound: float | None, ci_high: float, advice: str = ADVICE) -> str:
     """Return how the interval of a measured rate contradicts a bound; "" if it does not.
 
     Args:
         bound: on the probability of being safe, None for none.
         ci_high: upper end of the interval.
+        advice: what to do.
     """
     if bound is None or ci_high >= bound:
         return ""
     return (
         f"the interval of the measured rate ends at {100 * ci_high:.1f} %, below {100 * bound:.1f}"
-        f" %; {ADVICE}"
+        f" %; {advice}"
     )
 
 
@@ -59,7 +65,8 @@ def judged(row: Bounded, ci_high: float) -> Bounded:
         ci_high: upper end of the interval of the rate.
     """
     posterior = row.posterior_bound
-    reason = by_rate(row.estimated_bound, ci_high) or by_rate(
+    advice = _ADVICE_COMPUTED if row.bound_note == COMPUTED else ADVICE
+    reason = by_rate(row.estimated_bound, ci_high, advice) or by_rate(
         posterior and posterior.probability, ci_high
     )
     return withheld(row, reason) if reason else row

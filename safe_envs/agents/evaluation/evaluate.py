@@ -12,12 +12,13 @@ from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
-from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
+from safe_envs.agents.evaluation.guarantees import together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
 from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
 from safe_envs.agents.evaluation.players import Player, player_of
+from safe_envs.agents.evaluation.promise_bound import Averager, averager_of
 from safe_envs.agents.evaluation.repeats import pooled
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts, conditions_of
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
@@ -139,7 +140,7 @@ class _Runner:
 
     def __init__(self, resolved: ResolvedEvaluation, settings: RunSettings) -> None:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
-        parts = len(resolved.learning.missing()) + sum(map(resolved.repeats, resolved.names))
+        parts = resolved.parts + sum(map(resolved.repeats, resolved.names))
         self._work = WorkParts(settings.progress, parts)
         identifications = sum(map(resolved.repeats, resolved.names))
         self._keeps = settings.keeps(self._spec.episodes * identifications)
@@ -196,12 +197,12 @@ class _Runner:
         players: Sequence[Player],
         trajectories: Trajectories | None,
         sinks: Sequence[EpisodeSink],
-    ) -> tuple[list[EpisodeStatistics], list[GuaranteeAverager], float]:
+    ) -> tuple[list[EpisodeStatistics], list[Averager], float]:
         """Run the episodes under a filter, with each identification, and take the time in s."""
         resolved, episodes = self._resolved, self._spec.episodes
         found = []
         averagers = [
-            GuaranteeAverager(c, resolved.problem, self._spec.knowledge, self._why_no_bound)
+            averager_of(c, resolved.problem, self._spec, self._why_no_bound)
             for c in resolved.filters[name]
         ]
         # The search for bounds is over: what is timed are episodes.
@@ -224,10 +225,10 @@ class _Runner:
         self,
         name: str,
         totals: Sequence[EpisodeStatistics],
-        averagers: Sequence[GuaranteeAverager],
+        averagers: Sequence[Averager],
         policy: str,
     ) -> EvaluationRow:
-        conditions = self._resolved.filters[name]
+        conditions = [conditions_of(each) for each in self._resolved.filters[name]]
         summaries = [each.summary(self._spec.confidence) for each in totals]
         bounds = [a.summary(t.visited) for a, t in zip(averagers, totals, strict=True)]
         learning = describe(
@@ -246,7 +247,7 @@ class _Runner:
         self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float
     ) -> FilterTiming:
         steps = sum(each.steps for each in totals)
-        learning = seconds_of(self._resolved.filters[name])
+        learning = seconds_of([conditions_of(each) for each in self._resolved.filters[name]])
         return FilterTiming(
             name, seconds, steps, steps / seconds, learning, player.engine, player.jobs
         )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property, partial
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation
 from safe_envs.agents.evaluation.rollout import play, play_in_processes
 from safe_envs.agents.evaluation.spec import Progress, RunSettings
 from safe_envs.agents.evaluation.targets import Env
@@ -17,7 +17,8 @@ from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.jobs.threads import available_threads
 from safe_envs.compiled.engine import compiled_or_none
 from safe_envs.errors import NotCompilableError
-from safe_envs.wrappers import Condition, SafetyFilter
+from safe_envs.wrappers import SafetyFilter
+from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
 class NumpyPlayer:
@@ -25,7 +26,7 @@ class NumpyPlayer:
 
     Args:
         resolved: what to simulate.
-        conditions: of the filter; none for the unfiltered env.
+        conditions: of the filter, see `FilterParts`.
         settings: how it is run.
 
     Attributes:
@@ -39,7 +40,7 @@ class NumpyPlayer:
     engine = "numpy"
 
     def __init__(
-        self, resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
+        self, resolved: ResolvedEvaluation, conditions: FilterParts, settings: RunSettings
     ) -> None:
         spec = self._spec = resolved.spec
         self._resolved, self._conditions = resolved, conditions
@@ -110,12 +111,16 @@ class CompiledPlayer:
     """
 
     def __init__(
-        self, resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
+        self, resolved: ResolvedEvaluation, conditions: FilterParts, settings: RunSettings
     ) -> None:
         spec = self._spec = resolved.spec
         if resolved.target.filter_spec is not None:
             raise NotCompilableError(
                 f"{resolved.target.title} is a third-party env, which only its own code can step"
+            )
+        if isinstance(conditions, PromiseSettings):
+            raise NotCompilableError(
+                f"the filter {conditions.text} looks up a table, which the engine 'numpy' alone can"
             )
         if settings.record:
             raise NotCompilableError(
@@ -169,13 +174,13 @@ Player = NumpyPlayer | CompiledPlayer
 
 
 def player_of(
-    resolved: ResolvedEvaluation, conditions: Sequence[Condition], settings: RunSettings
+    resolved: ResolvedEvaluation, conditions: FilterParts, settings: RunSettings
 ) -> Player:
     """Return who simulates the episodes under a filter; see `RunSettings.engine`.
 
     Args:
         resolved: what to simulate.
-        conditions: of the filter; none for the unfiltered env.
+        conditions: of the filter, see `FilterParts`.
         settings: how it is run.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,13 @@ from safe_envs.wrappers import (
     require_readable,
     spec_of,
 )
-from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
+from safe_envs.wrappers.conditions.text_parts import learned_parts, names_promise, require_known
+from safe_envs.wrappers.value.promise_filter import PromiseFilter
+from safe_envs.wrappers.value.promise_tables import promise_filter_for
+from safe_envs.wrappers.value.promise_text import PromiseSettings
+
+FilterParts = tuple[Condition, ...] | PromiseSettings
+"""The conditions of a filter, none for the unfiltered env, or the settings of a promise filter."""
 
 
 class ResolvedEvaluation:
@@ -46,7 +52,7 @@ class ResolvedEvaluation:
         policy: who acts.
         names: of the filters, each once.
         learning: what filters learn.
-        filters: the conditions of each filter, in each repeat; there once everything is learned.
+        filters: what each filter is made of, in each repeat; there once everything is learned.
 
     Raises:
         ConfigurationError: The spec names something unknown, or parts of it do not fit together.
@@ -71,22 +77,38 @@ class ResolvedEvaluation:
             if not isinstance(each, str)
         }
         texts = [name for name in self.names if name not in self._given]
+        self._promises = {
+            name: PromiseSettings.of_text(name) for name in texts if names_promise(name)
+        }
+        for settings in self._promises.values():
+            settings.require_fit(self.problem, spec.objective)
+        self._tables: list[PromiseFilter] = []
         self._texts = {name: _checked(name, self.problem) for name in texts}
         self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
         if self.target.filter_spec is not None and self.learning.missing():
             raise ConfigurationError(
                 "a filter over a third-party env takes what was learned from a log: NAME:file=FILE"
             )
-        self.filters: dict[str, list[tuple[Condition, ...]]] = {}
+        self.filters: dict[str, list[FilterParts]] = {}
+
+    @property
+    def parts(self) -> int:
+        """Of how many parts the work of `learn` is."""
+        return len(self.learning.missing()) + len(self._promises)
 
     def learn(self, part: Callable[[], Progress | None]) -> None:
-        """Learn what is missing, and read the filters.
+        """Learn what is missing, have the tables of promise filters, and read the filters.
 
         Args:
             part: returns the progress of the next part of the work.
         """
         for method, repeat in self.learning.missing():
             self.learning.learn(method, repeat, part())
+        # The envs of the filters find the tables as long as they are in use here.
+        self._tables = [
+            promise_filter_for(self.problem, settings, self.spec.knowledge, part())
+            for settings in self._promises.values()
+        ]
         for name in self.names:
             self.filters[name] = [
                 self._conditions(name, repeat) for repeat in range(self.repeats(name))
@@ -96,9 +118,11 @@ class ResolvedEvaluation:
         """Return how many identifications a filter is evaluated with."""
         return 1 if name in self._given else self.learning.repeats(name)
 
-    def _conditions(self, name: str, repeat: int) -> tuple[Condition, ...]:
+    def _conditions(self, name: str, repeat: int) -> FilterParts:
         if name == UNFILTERED:
             return ()
+        if name in self._promises:
+            return self._promises[name]
         return self._given.get(name) or self.learning.conditions(name, repeat)
 
     def _fitted(self, conditions: tuple[Condition, ...]) -> tuple[Condition, ...]:
@@ -114,14 +138,14 @@ class ResolvedEvaluation:
             condition.require_fit(self.problem)
         return fitted
 
-    def env(self, conditions: Sequence[Condition], num_envs: int) -> Env:
+    def env(self, conditions: FilterParts, num_envs: int) -> Env:
         """Return a batch of envs behind a filter, after a first step.
 
         That step compiles what the filter needs: an error shows before a long run, and the timing
         is of steps.
 
         Args:
-            conditions: one for each barrier; none for the unfiltered env.
+            conditions: see `FilterParts`.
             num_envs: size of the batch.
         """
         env = self.filtered(self.target.env(num_envs), conditions)
@@ -130,12 +154,12 @@ class ResolvedEvaluation:
         env.step(np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high))
         return env
 
-    def filtered(self, env: Any, conditions: Sequence[Condition]) -> Env:
-        """Return a batch of envs behind the filter of conditions.
+    def filtered(self, env: Any, conditions: FilterParts) -> Env:
+        """Return a batch of envs behind a filter.
 
         Args:
             env: unfiltered.
-            conditions: one for each barrier; none for the unfiltered env.
+            conditions: see `FilterParts`.
 
         Returns:
             The env itself without conditions.
@@ -169,7 +193,7 @@ class ResolvedEvaluation:
             "problem": _describe(self.problem),
             "policy": _describe_policy(spec.policy),
             "filters": [
-                {"name": name, "spec": self._texts.get(name) or spec_of(self.filters[name][0])}
+                {"name": name, "spec": self._texts.get(name) or _text_of(self.filters[name][0])}
                 for name in self.names
             ],
             "knowledge": spec.knowledge,
@@ -178,6 +202,15 @@ class ResolvedEvaluation:
             "confidence": spec.confidence,
             "monitoring": spec.monitoring,
         }
+
+
+def conditions_of(parts: FilterParts) -> tuple[Condition, ...]:
+    """Return the conditions of a filter; none for the unfiltered env and for a promise filter."""
+    return () if isinstance(parts, PromiseSettings) else parts
+
+
+def _text_of(parts: FilterParts) -> str:
+    return parts.text if isinstance(parts, PromiseSettings) else spec_of(parts)
 
 
 class WorkParts:
@@ -224,6 +257,8 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
             " alone or leave it out"
         )
     require_known(name, UNFILTERED)
+    if names_promise(name):
+        return PromiseSettings.of_text(name).text
     if learned_parts(name):
         require_readable(name, problem)
         return None

@@ -121,7 +121,7 @@ def estimate_rare(
         **fields,
     )
     resolved = ResolvedEvaluation(spec)
-    work = WorkParts(progress, len(resolved.learning.missing()) + 2 * len(resolved.names))
+    work = WorkParts(progress, resolved.parts + 2 * len(resolved.names))
     resolved.learn(work.part)
     config = {**resolved.config(), "particles": particles, "repetitions": repetitions}
     estimator = _Estimator(resolved, particles, repetitions, num_envs, engine, work)

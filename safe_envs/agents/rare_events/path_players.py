@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation
 from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.jobs.threads import available_threads
 from safe_envs.agents.rare_events.compiled_paths import CompiledPaths, PathProgram
@@ -15,7 +15,9 @@ from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
 from safe_envs.agents.rare_events.particles import PathPlayer
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from safe_envs.compiled.engine import compiled_or_none
+from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers import Condition, SafetyFilter
+from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
 class ChosenPlayer(NamedTuple):
@@ -34,7 +36,7 @@ class ChosenPlayer(NamedTuple):
 
 def player_of(
     resolved: ResolvedEvaluation,
-    conditions: tuple[Condition, ...],
+    conditions: FilterParts,
     num_envs: int,
     engine: str,
     periods: float,
@@ -43,15 +45,21 @@ def player_of(
 
     Args:
         resolved: what to simulate.
-        conditions: of the filter; none for the unfiltered env.
+        conditions: of the filter, see `FilterParts`.
         num_envs: the most envs of NumPy side by side.
         engine: one of `safe_envs.compiled.engine.ENGINES`.
         periods: control periods to simulate, about.
 
     Raises:
-        ConfigurationError: The compiled engine was asked for, and Numba is missing.
+        ConfigurationError: The filter remembers the path, or the compiled engine was asked for,
+            and Numba is missing.
         NotCompilableError: It was asked for, and cannot do this.
     """
+    if isinstance(conditions, PromiseSettings):
+        raise ConfigurationError(
+            f"the filter {conditions.text} remembers what was kept on the whole path, and paths"
+            " that are split go on from states alone; evaluate it with more episodes instead"
+        )
     continuous = resolved.spec.monitoring == "continuous"
     reference = NumpyPaths(
         resolved.problem,

@@ -12,6 +12,7 @@ import sympy as sp
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reports.hand_written_loop import LIMIT, step_by_hand
 from safe_envs.wrappers import (
     CBF,
@@ -46,7 +47,7 @@ class Case(NamedTuple):
 
 def filter_calls() -> dict[str, Case]:
     """Return calls of a filter with one constraint, over batches of several sizes."""
-    safety_filter = SafetyFilterWrapper(gym.make(ENV_ID), "scbf").safety_filter
+    safety_filter = SafetyFilter.for_problem(make_problem(ENV_ID), "scbf")
     rng = np.random.default_rng(0)
     cases = {}
     for batch in _BATCHES:

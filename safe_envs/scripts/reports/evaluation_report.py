@@ -19,7 +19,9 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.engine_notes import engine_notes
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
+from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.wrappers.conditions.text_parts import names_promise
 
 _COLUMNS = (
     "min h\nmedian",
@@ -190,8 +192,10 @@ def _notes(evaluation: Evaluation) -> list[str]:
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
     notes += [note for row in evaluation.rows for note in (*_of_bound(row), *_of_violations(row))]
     notes += learned_notes(evaluation.rows, evaluation.problem)
-    if any(row.estimated_bound is not None for row in evaluation.rows):
+    bounded = [row.filter for row in evaluation.rows if row.estimated_bound is not None]
+    if not all(map(names_promise, bounded)):
         notes.append(ESTIMATED)
+    notes += computed_notes(bounded)
     for row, speed in zip(evaluation.rows, evaluation.timing.rows, strict=True):
         length = speed.steps / row.episodes  # With repeats both are of all identifications.
         if length < 0.99 * steps:

@@ -28,6 +28,13 @@ LEARNED: dict[str, type[LearnedCondition]] = {
 _BUILT_IN: dict[str, type[Condition]] = {**CONDITIONS, **LEARNED}
 
 
+PROMISE = "promise"
+"""Name of the filter of `safe_envs.wrappers.value`, which is no condition."""
+
+RESERVED = ("none", PROMISE)
+"""Names that no condition can have: "none" stands for the unfiltered env."""
+
+
 def is_built_in(name: str) -> bool:
     """Return whether a name is that of a condition of this project."""
     return name in _BUILT_IN
@@ -36,10 +43,10 @@ def is_built_in(name: str) -> bool:
 def condition_names() -> tuple[str, ...]:
     """Return the names of all conditions: the built-in ones, then those of installed packages.
 
-    A package can take neither a built-in name nor "none", which stands for the unfiltered env.
+    A package can take neither a built-in name nor one of `RESERVED`.
     """
     declared = plugins.plugin_names(plugins.CONDITIONS)
-    return (*_BUILT_IN, *(name for name in declared if name not in (*_BUILT_IN, "none")))
+    return (*_BUILT_IN, *(name for name in declared if name not in (*_BUILT_IN, *RESERVED)))
 
 
 def condition_class(name: str) -> type[Condition]:
@@ -55,6 +62,12 @@ def condition_class(name: str) -> type[Condition]:
         return _BUILT_IN[name]
     if ":" in name:
         return _checked(name, load_object(name))
+    if name == PROMISE:
+        raise ConfigurationError(
+            f'{PROMISE} is no condition but a filter by itself: give it alone, without "+", to'
+            " SafetyFilterWrapper, SafetyFilterVectorWrapper or an evaluation, like"
+            f" {PROMISE}:p=0.99. Whatever else takes conditions needs one, such as scbf or hocbf"
+        )
     if name not in condition_names():
         raise unknown_filter(name)
     return _checked(name, plugins.load_plugin(plugins.CONDITIONS, name))
@@ -74,7 +87,7 @@ def unknown_filter(name: str, *more: str) -> ConfigurationError:
         name: what was given.
         more: names that are allowed besides those of conditions.
     """
-    allowed = (*more, *condition_names(), "FILE.py:NAME")
+    allowed = (*more, *condition_names(), PROMISE, "FILE.py:NAME")
     return ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, allowed)}")
 
 

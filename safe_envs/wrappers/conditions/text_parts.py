@@ -12,6 +12,7 @@ from typing import NamedTuple
 from safe_envs.object_import import resolved
 from safe_envs.plugins import CONDITIONS, module_of
 from safe_envs.wrappers.conditions.registry import (
+    PROMISE,
     condition_class,
     condition_names,
     is_built_in,
@@ -23,6 +24,9 @@ _FILE = r"(?:\.{0,2}/[^:]{0,4096}?|[^+:,/][^+:,]{0,4096}?)\.py:[A-Za-z_]\w*"
 
 _MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
 """MODULE:NAME; a parameter is none, for a "=" follows its name."""
+
+
+_PROMISE_HEAD = re.compile(rf"\s*{PROMISE}\s*(?:[:+]|$)")
 
 
 class ConditionText(NamedTuple):
@@ -39,20 +43,25 @@ def head_pattern(*more: str) -> str:
     Args:
         more: names that are accepted besides those of conditions.
     """
-    names = sorted((*more, *condition_names()), key=len, reverse=True)
+    names = sorted((*more, PROMISE, *condition_names()), key=len, reverse=True)
     return rf"(?:(?:{'|'.join(map(re.escape, names))})(?=\s*(?:[:+,]|$))|{_FILE}|{_MODULE})"
 
 
 def require_known(text: str, *more: str) -> None:
-    """Raise ConfigurationError unless the text of a filter begins with a condition.
+    """Raise ConfigurationError unless the text of a filter begins with the name of one.
 
     Args:
         text: as for `parse_conditions`.
         more: names that the message lists besides those of conditions.
     """
     name = parts_of(text)[0].name
-    if not _is_known(name):
+    if not (_is_known(name) or name == PROMISE):
         raise unknown_filter(name, *more)
+
+
+def names_promise(text: str) -> bool:
+    """Return whether the text of a filter is that of the promise filter."""
+    return _PROMISE_HEAD.match(text) is not None
 
 
 def _is_known(name: str) -> bool:
@@ -103,18 +112,19 @@ def learned_parts(text: str) -> list[tuple[str, str | None]]:
 
 
 def files_of(text: str) -> tuple[Path, ...]:
-    """Return the files that the text of a filter names, of Python or of a learned model.
+    """Return the files that the text of a filter names, of Python, a learned model or a table.
 
     Nothing is run and no file is opened.
     """
     parts = parts_of(text)
     sources = [part.name.rpartition(":")[0] for part in parts]
     settings = [s.partition("=") for part in parts for s in part.settings]
+    names_file = _file_key(text)
     return tuple(
         Path(path)
         for path in (
             *(source for source in sources if source.endswith(".py")),
-            *(value for key, _, value in settings if key == "file"),
+            *(value for key, _, value in settings if key == names_file),
         )
     )
 
@@ -137,11 +147,17 @@ def _module_of(name: str) -> str | None:
 
 def with_absolute_paths(text: str) -> str:
     """Return the text of a filter with the whole paths of its files, as it holds in any folder."""
+    names_file = _file_key(text)
+
+    def absolute(setting: str) -> str:
+        key, _, value = setting.partition("=")
+        return f"{key}={os.path.realpath(value)}" if key == names_file else setting
+
     return "+".join(
-        ":".join([resolved(part.name), *map(_absolute, part.settings)]) for part in parts_of(text)
+        ":".join([resolved(part.name), *map(absolute, part.settings)]) for part in parts_of(text)
     )
 
 
-def _absolute(setting: str) -> str:
-    key, _, value = setting.partition("=")
-    return f"file={os.path.realpath(value)}" if key == "file" else setting
+def _file_key(text: str) -> str:
+    """Return which setting of a filter names a file that it reads."""
+    return "table" if names_promise(text) else "file"

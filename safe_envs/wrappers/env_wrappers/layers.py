@@ -12,10 +12,9 @@ from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import spec_of
-from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice, episode_filter
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-from safe_envs.wrappers.safety_filter import SafetyFilter
+from safe_envs.wrappers.value.promise_memory import PromiseMemory
 
 
 class FilterLayer:
@@ -24,34 +23,72 @@ class FilterLayer:
     def attach(
         self,
         inner: Any,
-        condition: Conditions,
+        condition: FilterChoice,
         knowledge: str,
         objective: str,
         priorities: Sequence[float] | None,
+        observe_promise: bool,
+        num_envs: int = 1,
     ) -> str:
         """Build the filter over the layer of an env that shows its state.
 
         Args:
             inner: layer that shows the state and takes inputs in physical units.
-            condition: one for every barrier, one for each, or their text.
+            condition: see `FilterChoice`.
             knowledge: "model" or "plant".
             objective: "nearest" or "clf".
             priorities: weights of the squared slacks.
+            observe_promise: whether observations hold p_k of the promise filter.
+            num_envs: size of the batch.
 
         Returns:
-            The text of the conditions.
+            The text of the filter.
+
+        Raises:
+            ConfigurationError: What is given is unknown or does not fit the env.
         """
         problem: SafetyProblem = inner.problem
-        self.safety_filter = SafetyFilter.for_problem(
-            problem, condition, knowledge, objective, priorities
+        self._filter = episode_filter(
+            problem, condition, knowledge, objective, priorities, num_envs
         )
-        text = spec_of([each for _, each in self.safety_filter.pairs])
+        self.safety_filter = self._filter.safety_filter
+        if observe_promise and not isinstance(self._filter, PromiseMemory):
+            raise ConfigurationError(
+                f"observe_promise = {observe_promise!r}: the filter {self._filter.text} has no p_k"
+                " to observe; use promise:p=0.99, or leave it out"
+            )
+        self._observes = bool(observe_promise)
+        text = self._filter.text
         if inner.viewer is not None:
             inner.viewer.caption = text
         self._inner = inner
         # Inputs that pass through an env's numbers are rounded, by float32 at worst.
         self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
         return text
+
+    def observation_box(self, space: gym.Space[Any]) -> gym.Space[Any]:
+        """Return the space of one env's observations, given that of the env below.
+
+        Raises:
+            ConfigurationError: p_k is to be observed, and the observations are no vectors.
+        """
+        if not self._observes:
+            return space
+        if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+            raise ConfigurationError(
+                f"observe_promise appends a number to an observation, which is to be a Box of shape"
+                f" (k,); {space} is none"
+            )
+        low, high = np.append(space.low, 0.0), np.append(space.high, 1.0)
+        kind: Any = space.dtype
+        return gym.spaces.Box(low.astype(kind), high.astype(kind), dtype=kind)
+
+    def observed(self, observation: Any) -> Any:
+        """Return the observation of an env or of a batch, with p_k at its end if asked for."""
+        if not self._observes:
+            return observation
+        last = self._filter.report()["promise"].reshape(*np.shape(observation)[:-1], 1)
+        return np.concatenate([observation, last], axis=-1, dtype=observation.dtype)
 
     def execute(self, env: Any, decided: Sequence[Any], directly: bool) -> Any:
         """Return what the step of an env under the decided input returns.

@@ -11,7 +11,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
-from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -37,13 +37,16 @@ class SafetyFilterWrapper(
     Args:
         env: one of this project's envs, possibly wrapped; or any env with a Box action space.
         condition: a `Condition` for every barrier, one for each, or their text, like "scbf",
-            "hocbf:p=2,8" or "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
+            "hocbf:p=2,8" or "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's. Or
+            the promise filter, like "promise:p=0.99".
         knowledge: "model" (what the designer believes) or "plant" (the true system).
         objective: "nearest" to the policy's action; or "clf" for the joint QP with the env's
             goal, in which the policy has no say: `info["nominal_action"]` is what the goal alone
             asks for.
         priorities: of the barriers where not all can be kept: weights of their squared slacks, ones
             by default.
+        observe_promise: append p_k of the promise filter, in [0, 1], to the observation, on which
+            what it will allow depends.
         **view: for a third-party env `model`, `barriers`, `state_fn`, and what else of
             `FilterSpec` is needed.
 
@@ -57,21 +60,29 @@ class SafetyFilterWrapper(
     def __init__(
         self,
         env: gym.Env[np.ndarray, np.ndarray],
-        condition: Conditions,
+        condition: FilterChoice,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
+        observe_promise: bool = False,
         **view: Any,
     ) -> None:
         if view:
             env = SafetyMonitor(env, third_party_spec(env.unwrapped, SafeEnv, view, knowledge))
         inner = state_layer(env, (SafeEnv, SafetyMonitor), vector=False)
-        text = self.attach(inner, condition, knowledge, objective, priorities)
+        text = self.attach(inner, condition, knowledge, objective, priorities, observe_promise)
         # The monitor records the view: an env that is made again from its spec has one already.
         gym.utils.RecordConstructorArgs.__init__(
-            self, condition=text, knowledge=knowledge, objective=objective, priorities=priorities
+            self,
+            condition=text,
+            knowledge=knowledge,
+            objective=objective,
+            priorities=priorities,
+            observe_promise=observe_promise,
         )
         gym.Wrapper.__init__(self, env)
+        if observe_promise:
+            self.observation_space = self.observation_box(env.observation_space)
         self._directly = _only_checks_between(env, inner)
         self._interventions = 0
         self._infeasible = 0
@@ -83,18 +94,21 @@ class SafetyFilterWrapper(
         observation, info = self.env.reset(seed=seed, options=options)
         self._interventions = 0
         self._infeasible = 0
-        return observation, {**info, **rest_info(self._inner.problem)}
+        self._filter.begin(self._inner.components)
+        info = {**info, **rest_info(self._inner.problem), **self._reported()}
+        return self.observed(observation), info
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Info]:
         """Filter the action and hold it for one control period."""
         proposed = self._inner.physical_action(action)
-        decision = self.safety_filter.decide_floats(self._inner.components, proposed)
+        decision = self._filter.decide_floats(self._inner.components, proposed)
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
         if self._inner.viewer is not None:
             self._inner.viewer.announce([nominal], [active], [decision.feasible])
         observation, reward, terminated, truncated, info = self.execute(
             self.env, executed, self._directly
         )
+        self._filter.advance(self._inner.components, terminated or truncated)
         differs = active and executed != nominal
         self._interventions += differs
         self._infeasible += not decision.feasible
@@ -110,9 +124,13 @@ class SafetyFilterWrapper(
                 active_barrier=decision.cause if differs else -1,
                 episode_interventions=self._interventions,
                 episode_infeasible=self._infeasible,
-            )
+            ),
+            **self._reported(),
         )
-        return observation, reward, terminated, truncated, info
+        return self.observed(observation), reward, terminated, truncated, info
+
+    def _reported(self) -> Info:
+        return {key: value.item() for key, value in self._filter.report().items()}
 
 
 def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor) -> bool:

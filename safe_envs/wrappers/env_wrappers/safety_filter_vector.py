@@ -8,11 +8,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
+from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
-from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -21,7 +23,6 @@ from safe_envs.wrappers.env_wrappers.layers import (
 )
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.filter_qp import FilterDecision
-from safe_envs.wrappers.filter_qp.filter_source import filter_source
 
 _TALLIES = ("interventions", "infeasible")
 
@@ -36,8 +37,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     of their compiled function; "auto" leaves those that have no compiled form to NumPy.
 
     Raises:
-        NotCompilableError: the engine of the env is "compiled", and the filter has learned terms
-            without a compiled form.
+        NotCompilableError: the engine of the env is "compiled", and the filter has no compiled
+            form: it has learned terms without one, or is the promise filter.
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
@@ -46,18 +47,24 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        condition: Conditions,
+        condition: FilterChoice,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
+        observe_promise: bool = False,
         **view: Any,
     ) -> None:
         if view:
             spec = third_party_spec(env.unwrapped, SafeVectorEnv, view, knowledge)
             env = SafetyMonitorVector(env, spec)
         inner = readable(env)
-        self.attach(inner, condition, knowledge, objective, priorities)
+        self.attach(
+            inner, condition, knowledge, objective, priorities, observe_promise, env.num_envs
+        )
         gym.vector.VectorWrapper.__init__(self, env)
+        if observe_promise:
+            self.single_observation_space = self.observation_box(env.single_observation_space)
+            self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
         self._stepper = self._compiled() if env is inner else None
@@ -72,16 +79,18 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
+        self._filter.begin(self._inner.components, present)
         at_rest = {
             key: np.full((self.num_envs, *np.shape(value)), value)
             for key, value in self._rest.items()
         }
-        return observation, {**info, **with_masks(at_rest, present)}
+        at_rest |= self._filter.report()
+        return self.observed(observation), {**info, **with_masks(at_rest, present)}
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
         counts = {name: self._counted.tallies[:, j].copy() for j, name in enumerate(_TALLIES)}
-        return {**self._inner.snapshot(), **counts}
+        return {**self._inner.snapshot(), **counts, **self._filter.snapshot()}
 
     def restore(
         self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
@@ -90,13 +99,14 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         self._inner.restore(snapshot, seed)
         counts = [np.asarray(snapshot[name], dtype=np.int64) for name in _TALLIES]
         self._counted.tallies = np.column_stack(counts)
+        self._filter.restore(snapshot)
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
         if self._stepper is not None:
             return self._inner.step_filtered(self._stepper, actions)
         proposed = self._inner.physical_action(actions)
-        decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
+        decision = self._filter.decide_arrays(self._inner.components, proposed)
         active = (
             decision.active[0]
             if len(decision.active) == 1
@@ -109,15 +119,34 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         observation, reward, terminated, truncated, info = self.execute(
             self.env, decision.action, self.env is self._inner
         )
-        added = self._decided(decision, active)
+        self._filter.advance(self._reached(), terminated | truncated)
+        added = self._decided(decision, active) | self._filter.report()
         begun = self._inner.episodes.begun
         if np.count_nonzero(begun):
             if self._mode == AutoresetMode.SAME_STEP:
                 last = {key: value.copy() for key, value in added.items()}
                 info["final_info"].update(with_masks(last, begun))
+                self._observe_last(info, begun)
+            self._filter.begin(self._inner.components, begun)
             self._restart(added, begun)
+            added |= self._filter.report()
         info.update(with_masks(added, info["_cost"]))
-        return observation, reward, terminated, truncated, info
+        return self.observed(observation), reward, terminated, truncated, info
+
+    def _reached(self) -> Components:
+        """Return the components of the states that a step led to, of ended episodes too."""
+        x, episodes = self._inner.components, self._inner.episodes
+        if self._mode != AutoresetMode.SAME_STEP or not np.count_nonzero(episodes.begun):
+            return x
+        last = episodes.last_states.T
+        return tuple([np.where(episodes.begun, old, c) for old, c in zip(last, x, strict=True)])
+
+    def _observe_last(self, info: Info, ended: np.ndarray) -> None:
+        """Append p_k to the last observations of episodes, which their envs have not seen."""
+        if self._observes:
+            last, levels = info["final_obs"], self._filter.report()["promise"]
+            for i in np.flatnonzero(ended).tolist():
+                last[i] = np.append(last[i], levels[i]).astype(last[i].dtype)
 
     def _decided(self, decision: FilterDecision, active: np.ndarray) -> Info:
         """Count, and report what was decided."""
@@ -158,12 +187,12 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         """Return what filters and steps in one compiled function, where the env is compiled."""
         if not isinstance(self._inner, SafeVectorEnv):
             return None
-        qp, rest = self.safety_filter.qp, self._rest
+        rest = self._rest
         at_rest = [rest[key] for key in ("nominal_action", "safe_action", "slack", "slacks")]
         return self._inner.filtered(
             BatchFilter(
-                lambda data: filter_source(qp, data),
-                self.safety_filter.decide_arrays,
+                self._filter.source,
+                self._filter.decide_arrays,
                 np.hstack(at_rest),
             )
         )

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.torch_layer.active_set import ActiveSets, nearest_step
@@ -54,12 +55,14 @@ class TorchFilter(torch.nn.Module):
 
     Raises:
         ConfigurationError: a constraint is not a plain one: uncertain, reciprocal, with a network
-            or a sampling margin of first order; or the filter pursues a goal; or a constraint holds
-            a function that torch does not have.
+            or a sampling margin of first order; or the filter pursues a goal, or is the promise
+            filter; or a constraint holds a function that torch does not have.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
         super().__init__()
+        if not isinstance(safety_filter, SafetyFilter):
+            raise _not_differentiable(type(safety_filter).__name__)
         # The filter keeps its qp to its solvers, which share it.
         qp = safety_filter.qp
         _require_plain(safety_filter, qp)
@@ -76,6 +79,8 @@ class TorchFilter(torch.nn.Module):
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
         """Return the filter for the barriers of a problem; see `SafetyFilter.for_problem`."""
+        if isinstance(conditions, str) and names_promise(conditions):
+            raise _not_differentiable(conditions)
         return cls(SafetyFilter.for_problem(problem, conditions, knowledge, priorities=priorities))
 
     def forward(self, x: torch.Tensor, u: torch.Tensor, return_result: bool = False) -> Any:
@@ -172,6 +177,15 @@ class TorchFilter(torch.nn.Module):
         ).all(dim=1)
         formula = torch.where(agrees[:, None], solution, decided)
         return result.index_copy(0, places, formula), everywhere.index_copy(0, places, agrees)
+
+
+def _not_differentiable(given: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"{shown(given)} is no SafetyFilter, and a torch layer takes no other; the promise filter"
+        " looks its inputs up in a table, so they have no gradient. Take a condition here, such"
+        " as 'scbf' or 'hocbf'; or train an agent behind it, which needs no gradient of it, by"
+        " SafetyFilterVectorWrapper or make_sb3_env(..., filter='promise:p=0.99')"
+    )
 
 
 def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:

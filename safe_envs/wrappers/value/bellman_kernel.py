@@ -18,6 +18,9 @@ import numpy as np
 
 from safe_envs.wrappers.value.expected_value_kernel import expected_value
 
+_LOSS = 0.003
+"""Of the value of a state in a step, for which it does not pay to try all inputs."""
+
 
 def expected_values(  # noqa: PLR0913
     first: int,
@@ -101,12 +104,12 @@ def sweep_lower(  # noqa: PLR0913
     """Maximise the bound of the expected value over some of the inputs.
 
     Any input gives a lower envelope. The best one of the last sweep and, in turn, one next to it or
-    any other find nearly the maximum of all.
+    any other find nearly the maximum of all; where they lose much, all inputs are tried.
 
     Args:
         first: state to begin with.
         last: state to end before.
-        turn: number of the sweep; all inputs are tried where it is 0.
+        turn: number of the sweep.
         images: see `expected_values`, as for all others.
         effects: see there.
         inputs: see there, shape (1, U, m, 2).
@@ -121,7 +124,7 @@ def sweep_lower(  # noqa: PLR0913
         shifts: scratch array of 8 entries.
         best: the best input of the last sweep, which is replaced, shape (B,); -1 where none is
             wanted.
-        found: receives the bounds, shape (B,).
+        found: holds values that are good enough, and receives the bounds, shape (B,).
     """
     several = images.shape[1] > 1
     tried = inputs.shape[1]
@@ -129,16 +132,19 @@ def sweep_lower(  # noqa: PLR0913
         if best[a] < 0:
             continue
         largest, chosen = -inf, int(best[a])
-        number = tried if turn == 0 else 1 + turn % 2
-        for j in range(number):
-            if turn == 0:
-                u = j
+        few = 1 + turn % 2
+        # The number of inputs is small where nothing is lost, and nothing can be won then.
+        for j in range(few + tried):
+            if j == few and largest >= found[a] - _LOSS:
+                break
+            if j >= few:
+                u = j - few
             elif j == 0:
-                u = int(best[a])
+                u = chosen
             elif turn % 8 == 1:
                 u = (7 * a + turn // 8) % tried
             else:
-                u = int(neighbours[best[a], (a + turn // 2) % neighbours.shape[1]])
+                u = int(neighbours[chosen, (a + turn // 2) % neighbours.shape[1]])
             if u >= 0:
                 value = expected_value(
                     a,
@@ -160,6 +166,8 @@ def sweep_lower(  # noqa: PLR0913
                 )
                 if value > largest:
                     largest, chosen = value, u
+                if j >= few and largest >= found[a]:
+                    break
         best[a] = chosen
         found[a] = largest
 

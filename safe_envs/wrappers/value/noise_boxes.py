@@ -49,8 +49,8 @@ def noise_boxes(channels: int) -> NoiseBoxes:
             high.append(edges[np.array(places, dtype=int) + 1])
             weights.append(weight)
     shape = (len(weights), channels)
-    # The weights of all boxes never exceed 1, whatever the rounding.
-    total = np.array(weights) * (1.0 - 1e-15)
+    # The weights of several boxes never exceed 1, whatever the rounding.
+    total = np.array(weights) * (1.0 - 1e-15 if channels else 1.0)
     return NoiseBoxes(
         np.reshape(low, shape).T,
         np.reshape(high, shape).T,

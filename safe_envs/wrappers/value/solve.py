@@ -170,7 +170,8 @@ class _Operator:
         if not self.is_constant:
             self._known[:] = self._rival[:] = 2.0
         here = CellSets(*(each[self._numbers] for each in cells))
-        found = np.zeros(len(self._numbers))
+        # Values do not rise backwards in time: those of the next instant are the best to be had.
+        found = lower[self._numbers].astype(np.float64)
         bounds = np.zeros(len(self._numbers))
         self._sweep_lower(self._around(lower, ahead.inside), found, here)
         self._sweep_upper(self._around(-upper, ahead.touches), bounds)

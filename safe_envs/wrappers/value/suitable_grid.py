@@ -17,7 +17,7 @@ from safe_envs.wrappers.value.step_images import Step
 _CELLS = {1: 4000, 2: 300_000, 3: 500_000, 4: 600_000}
 """Cells of a problem whose noise is not divided into boxes."""
 
-_LESS = 0.75
+_LESS = 0.57
 """How the number of cells falls with that of the boxes of noise."""
 
 _SAMPLES = 512

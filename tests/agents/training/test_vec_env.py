@@ -8,6 +8,7 @@ from types import ModuleType
 import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
 
 from safe_envs import ConfigurationError, InvalidInputError
@@ -15,6 +16,7 @@ from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
 from safe_envs.compiled.program import Program
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
+from tests.wrappers.value.guesses import SCALAR, guess
 
 pytestmark = pytest.mark.slow
 
@@ -395,3 +397,25 @@ def test_engines_give_the_same_steps_to_rounding(condition, monkeypatch):
     )
     shown = assert_same_steps(ours, theirs, drawn_actions(ours, 10))
     assert sum(dones.sum() for dones, _ in shown) >= 3
+
+
+def test_agents_learn_behind_the_promise_filter_and_may_observe_p():
+    env = SafetyFilterVectorWrapper(
+        gym.make_vec(SCALAR, num_envs=4, autoreset_mode="SameStep", horizon=0.06),
+        guess(horizon=0.06),
+        observe_promise=True,
+    )
+    envs = SafeVecEnv(env, intervention_penalty=0.1)
+    assert envs.observation_space.shape == (2,)
+    seen = envs.reset()
+    rng = np.random.default_rng(0)
+    for k in range(13):
+        levels = [info["promise"] for info in envs.reset_infos] if k % 6 == 0 else None
+        if levels is not None:
+            np.testing.assert_array_equal(seen[:, 1], np.float32(levels))
+        seen, _, dones, infos = envs.step(rng.uniform(-1.0, 1.0, (4, 1)).astype(np.float32))
+        for i in np.flatnonzero(dones):
+            assert infos[i]["terminal_observation"][1] == np.float32(infos[i]["promise"])
+    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, device="cpu", seed=0)
+    model.learn(32)
+    assert model.predict(seen)[0].shape == (4, 1)

@@ -150,6 +150,7 @@ def test_a_batch_is_what_its_envs_are(mode):
                     assert np.allclose(
                         infos["final_info"][key][i], value, rtol=1e-12, atol=1e-12
                     ), key
+                assert np.array_equal(batch.env.episodes.last_states[i], env.env.components)
                 alone[i] = env.reset()
         ended = terminated | truncated
     assert batch.num_envs == 3

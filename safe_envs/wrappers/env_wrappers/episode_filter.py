@@ -1,0 +1,170 @@
+"""Filters in the episodes of envs, some of which remember what an episode was so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.program import Source
+from safe_envs.dynamics.codegen import Components
+from safe_envs.envs.info import Info
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.conditions import spec_of
+from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.conditions.text_parts import names_promise
+from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.filter_qp.filter_source import filter_source
+from safe_envs.wrappers.safety_filter import SafetyFilter
+from safe_envs.wrappers.value.promise_filter import PromiseFilter
+from safe_envs.wrappers.value.promise_memory import PromiseMemory
+from safe_envs.wrappers.value.promise_tables import promise_filter_for
+from safe_envs.wrappers.value.promise_text import PromiseSettings
+
+FilterChoice = Conditions | PromiseSettings | PromiseFilter
+"""Conditions or their text; or a promise filter, its settings or their text."""
+
+
+class EpisodeFilter(Protocol):
+    """A filter of a batch of envs, or of one env, which follows their episodes.
+
+    States and inputs are components: floats of one env, or arrays (num_envs,) of a batch.
+
+    Attributes:
+        text: of the filter.
+    """
+
+    text: str
+
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+        """Begin episodes.
+
+        Args:
+            x: n components of the states of all envs.
+            envs: which begin an episode, bool (num_envs,); None for all.
+        """
+        ...
+
+    def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
+        """Decide for one env; see `SafetyFilter.decide_floats`."""
+        ...
+
+    def decide_arrays(self, x: Components, u: Components) -> FilterDecision:
+        """Decide for a batch; see `SafetyFilter.decide_arrays`."""
+        ...
+
+    def advance(self, x: Sequence[Any], ended: Any) -> None:
+        """Go on to the states that the decided inputs led to.
+
+        Args:
+            x: n components of the states, before any of them is replaced by a start.
+            ended: the envs whose episode is over, bool (num_envs,).
+        """
+        ...
+
+    def report(self) -> Info:
+        """Return what the filter adds to the info of the states reached, arrays (num_envs,)."""
+        ...
+
+    def source(self, data: Data) -> Source:
+        """Return the compiled form of the filter, or raise NotCompilableError."""
+        ...
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return what the filter remembers, in arrays with the batch in front."""
+        ...
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Remember what a snapshot holds."""
+        ...
+
+
+class Memoryless:
+    """A filter that decides by state and proposed input alone; see `EpisodeFilter`.
+
+    Args:
+        safety_filter: which decides.
+
+    Attributes:
+        safety_filter: as given.
+        text: of its conditions.
+    """
+
+    def __init__(self, safety_filter: SafetyFilter) -> None:
+        self.safety_filter = safety_filter
+        self.text = spec_of([each for _, each in safety_filter.pairs])
+        self.decide_floats = safety_filter.decide_floats
+        self.decide_arrays = safety_filter.decide_arrays
+
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+        """Do nothing.
+
+        Args:
+            x: not used.
+            envs: not used.
+        """
+
+    def advance(self, x: Sequence[Any], ended: Any) -> None:
+        """Do nothing.
+
+        Args:
+            x: not used.
+            ended: not used.
+        """
+
+    def report(self) -> Info:
+        """Return nothing."""
+        return {}
+
+    def source(self, data: Data) -> Source:
+        """Return the compiled form of the filter."""
+        return filter_source(self.safety_filter.qp, data)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return nothing."""
+        return {}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Do nothing."""
+
+
+def episode_filter(
+    problem: SafetyProblem,
+    given: FilterChoice,
+    knowledge: str,
+    objective: str,
+    priorities: Sequence[float] | None,
+    num_envs: int,
+) -> Memoryless | PromiseMemory:
+    """Return a filter for the episodes of envs.
+
+    Args:
+        problem: of the envs.
+        given: see `FilterChoice`.
+        knowledge: see `SafetyFilter.for_problem`.
+        objective: see there.
+        priorities: see there.
+        num_envs: size of the batch.
+
+    Raises:
+        ConfigurationError: What is given is unknown or does not fit the problem.
+        RelativeDegreeError: A condition does not suit a barrier.
+    """
+    if isinstance(given, str) and names_promise(given):
+        given = PromiseSettings.of_text(given)
+    if isinstance(given, PromiseSettings | PromiseFilter):
+        if priorities is not None:
+            raise ConfigurationError(
+                "priorities are of conditions; the promise filter keeps all barriers together:"
+                " leave them out"
+            )
+        if isinstance(given, PromiseSettings):
+            given.require_fit(problem, objective)
+            given = promise_filter_for(problem, given, knowledge)
+        given.settings.require_fit(problem, objective)
+        given.require_problem(problem)
+        return PromiseMemory(given, num_envs)
+    return Memoryless(SafetyFilter.for_problem(problem, given, knowledge, objective, priorities))

@@ -1,0 +1,161 @@
+"""What a promise filter remembers of episodes: the control instant, and what is still kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.envs.info import Info
+from safe_envs.errors import InvalidInputError, NotCompilableError
+from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.value.promise_filter import PromiseFilter
+
+_ROUNDING = 1e-9
+"""The part of p_k that rounding may cost."""
+
+_NAMES = ("instant", "promise", "promise_ended")
+
+
+class PromiseMemory:
+    """A promise filter in the episodes of a batch of envs, or of one env as a batch of one.
+
+    See `safe_envs.wrappers.env_wrappers.episode_filter` for the methods.
+
+    Args:
+        promise_filter: which decides.
+        num_envs: size of the batch.
+
+    Attributes:
+        safety_filter: the filter.
+        text: of its settings.
+        levels: p_k of each episode, what is still kept; shape (num_envs,).
+        losses: how often p_k had to be lowered by more than rounding, which a right table never
+            makes necessary.
+        largest_loss: by which it was.
+    """
+
+    def __init__(self, promise_filter: PromiseFilter, num_envs: int) -> None:
+        self.safety_filter, self.text = promise_filter, promise_filter.text
+        self._last = promise_filter.look_ahead.steps - 1
+        self._instants = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.zeros(num_envs, dtype=bool)
+        self._expected = np.ones(num_envs)
+        self.levels = np.zeros(num_envs)
+        self.losses, self.largest_loss = 0, 0.0
+        count = len(promise_filter.problem.barriers)
+        self._barriers = count
+        # A constraint on all barriers together has no single one as its cause.
+        self._cause = 0 if count == 1 else -1
+
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+        """Begin episodes.
+
+        Args:
+            x: n components of the states.
+            envs: which begin, bool (num_envs,); None for all.
+        """
+        chosen = slice(None) if envs is None else np.flatnonzero(envs)
+        starts = tuple([c[chosen] for c in _arrays(x)])
+        if len(starts[0]):
+            self._instants[chosen], self._ended[chosen] = 0, False
+            self.levels = self.levels.copy()
+            self.levels[chosen] = self.safety_filter.start(starts)
+
+    def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
+        """Decide for one state; see `SafetyFilter.decide_floats`.
+
+        Args:
+            x: n components of the state.
+            u: m components of the proposed input.
+
+        Returns:
+            The decision in components.
+        """
+        found = self.decide_arrays(_arrays(x), _arrays(u))
+        replaced = found.active[0].item()
+        return FilterDecision(
+            [c.item() for c in found.action] if replaced else list(u),
+            [c.item() for c in found.margin],
+            [replaced],
+            found.feasible.item(),
+            [c.item() for c in found.slack],
+            self._cause,
+            u,
+        )
+
+    def decide_arrays(self, x: Components, u: Components) -> FilterDecision:
+        """Decide for the batch; see `SafetyFilter.decide_arrays`.
+
+        Args:
+            x: n components of the states.
+            u: m components of the proposed inputs.
+
+        Returns:
+            The decisions in components. All barriers share one constraint and its slack.
+        """
+        wanted = np.where(self._ended, 0.0, self.levels)
+        k = np.minimum(self._instants, self._last)
+        action, expected, level, replaced = self.safety_filter.choose(k, wanted, x, u)
+        self._expected, self.levels = expected, level
+        loss = wanted - level
+        if np.count_nonzero(loss):
+            self.losses += int(np.count_nonzero(loss > _ROUNDING * wanted))
+            self.largest_loss = max(self.largest_loss, float(loss.max()))
+        margin, count = expected - level, self._barriers
+        return FilterDecision(
+            action, (margin,) * count, (replaced,), level > 0.0, (loss,) * count, self._cause, u
+        )
+
+    def advance(self, x: Sequence[Any], ended: Any) -> None:
+        """Go on to the states that the decided inputs led to.
+
+        Args:
+            x: n components of the states, before any of them is replaced by a start.
+            ended: the envs whose episode is over, bool (num_envs,).
+        """
+        self._instants = self._instants + 1
+        reached = self.safety_filter.look_ahead.values(
+            np.minimum(self._instants, self._last + 1), _arrays(x)
+        )
+        held = self.levels > 0.0
+        share = self.levels / np.where(held, self._expected, 1.0)
+        self.levels = np.where(held, np.clip(share * reached, 0.0, 1.0), 0.0)
+        self._ended = self._ended | ended
+
+    def report(self) -> Info:
+        """Return p_k of the state that was reached last, by its name in the info."""
+        return {"promise": self.levels.copy()}
+
+    def source(self, data: Any) -> NoReturn:
+        """Raise NotCompilableError: NumPy decides."""
+        raise NotCompilableError(
+            f"the filter {self.text} looks up a table, for which there is no compiled form"
+        )
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return where each episode is, in arrays with the batch in front."""
+        found = (self._instants, self.levels, self._ended)
+        return {name: each.copy() for name, each in zip(_NAMES, found, strict=True)}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Put each episode where a snapshot has it.
+
+        Raises:
+            InvalidInputError: The snapshot is of envs without a promise filter.
+        """
+        missing = [name for name in _NAMES if name not in snapshot]
+        if missing:
+            raise InvalidInputError(
+                f"the snapshot has no {', '.join(missing)}: it is of envs without a promise filter;"
+                " take one of envs with it"
+            )
+        instants, levels, ended = [np.array(snapshot[name]) for name in _NAMES]
+        self._instants, self._ended = instants.astype(np.int64), ended.astype(bool)
+        self.levels = levels.astype(float)
+
+
+def _arrays(components: Sequence[Any]) -> Components:
+    return tuple([np.atleast_1d(np.asarray(c, dtype=float)) for c in components])

@@ -1,0 +1,171 @@
+"""The text of the promise filter: `promise:p=0.99:robust=v:0.8..2.4:leaving=safe:table=FILE`."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.number_text import finite_number, real
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.conditions.registry import PROMISE
+from safe_envs.wrappers.conditions.text_parts import parts_of
+
+LEAVING = ("violation", "safe")
+"""How a left workspace counts: as a violation, or as the end of a safe episode."""
+
+_KEYS = ("p", "robust", "leaving", "table")
+_EXAMPLE = f"{PROMISE}:p=0.99"
+
+# What is robust and the name of a file may hold a colon: one divides before "key=" alone.
+_DIVIDES = re.compile(r":(?=\w+=)")
+_INTERVAL = re.compile(r"\s*(\w+)\s*:(.+?)\.\.(.+)")
+
+Interval = tuple[str, float, float]
+"""Name, lower and upper end of a parameter."""
+
+
+@dataclass(frozen=True)
+class PromiseSettings:
+    """What a promise filter is asked for.
+
+    Attributes:
+        probability: p, between 0 and 1.
+        robust: parameters of which only an interval is known, each once.
+        leaving: "violation" or "safe"; see `LEAVING`.
+        table: file of the table; None for the one of the user's cache, which is computed where it
+            is missing.
+
+    Raises:
+        ConfigurationError: A value is out of range.
+    """
+
+    probability: float
+    robust: tuple[Interval, ...] = ()
+    leaving: str = LEAVING[0]
+    table: str | None = None
+
+    def __post_init__(self) -> None:
+        p = finite_number("p of the promise filter", self.probability)
+        if not 0.0 < p < 1.0:
+            raise ConfigurationError(
+                f"p = {p:g} of the promise filter; give a probability of being safe between 0 and"
+                f" 1, both excluded, like {_EXAMPLE}"
+            )
+        object.__setattr__(self, "probability", p)
+        if self.leaving not in LEAVING:
+            raise ConfigurationError(
+                f"leaving = {shown(self.leaving)} of the promise filter;"
+                f" {nearest(str(self.leaving), LEAVING)}"
+            )
+        names = [name for name, _, _ in self.robust]
+        for name, low, high in self.robust:
+            if names.count(name) > 1:
+                raise ConfigurationError(f"robust of the promise filter names {name} twice")
+            if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+                raise ConfigurationError(
+                    f"robust = {name}:{low:g}..{high:g} of the promise filter; give two finite"
+                    " numbers, the lower one first"
+                )
+
+    @classmethod
+    def of_text(cls, text: str) -> PromiseSettings:
+        """Read the text of a promise filter.
+
+        Args:
+            text: `promise:p=0.99`, and if need be `:robust=v:0.8..2.4` (several parameters with ";"
+                between), `:leaving=safe` and `:table=FILE`.
+
+        Raises:
+            ConfigurationError: It has another form, or a value is out of range.
+        """
+        if len(parts_of(text)) > 1:
+            raise ConfigurationError(
+                f"filter {shown(text)}: the promise filter acts alone, on all barriers together;"
+                f' give it without "+", like {_EXAMPLE}'
+            )
+        head, *parts = _DIVIDES.split(text.strip())
+        given: dict[str, str] = {}
+        for part in parts:
+            key, _, value = part.partition("=")
+            if key not in _KEYS:
+                raise _unknown(text, key)
+            if key in given:
+                raise ConfigurationError(f"filter {shown(text)} names {shown(key)} twice")
+            given[key] = value
+        if head.strip() != PROMISE:
+            raise _unknown(text, head.strip().removeprefix(PROMISE).lstrip(":"))
+        if "p" not in given:
+            raise ConfigurationError(
+                f"filter {shown(text)} names no probability; give one, like {_EXAMPLE}"
+            )
+        table = given.get("table")
+        if table is not None and not table:
+            raise ConfigurationError(f"filter {shown(text)}: table names no file")
+        return cls(
+            finite_number("p of the promise filter", given["p"]),
+            _intervals(text, given["robust"]) if "robust" in given else (),
+            given.get("leaving", LEAVING[0]),
+            table,
+        )
+
+    @property
+    def text(self) -> str:
+        """The text from which `of_text` makes the same settings."""
+        parts = [f"{PROMISE}:p={self.probability!r}"]
+        if self.robust:
+            parts.append("robust=" + ";".join(f"{n}:{a!r}..{b!r}" for n, a, b in self.robust))
+        if self.leaving != LEAVING[0]:
+            parts.append(f"leaving={self.leaving}")
+        if self.table is not None:
+            parts.append(f"table={self.table}")
+        return ":".join(parts)
+
+    @property
+    def intervals(self) -> Mapping[str, tuple[float, float]]:
+        """The intervals by the names of their parameters."""
+        return {name: (low, high) for name, low, high in self.robust}
+
+    def require_fit(self, problem: SafetyProblem, objective: str = "nearest") -> None:
+        """Raise ConfigurationError where the settings do not fit a problem.
+
+        Args:
+            problem: whose parameters are meant.
+            objective: of the filter.
+        """
+        known = problem.model.parameter_values
+        for name, _, _ in self.robust:
+            if name not in known:
+                raise ConfigurationError(
+                    f"robust of the promise filter: {problem.name} has no parameter {shown(name)};"
+                    f" {nearest(name, known)}"
+                )
+        if objective != "nearest":
+            raise ConfigurationError(
+                f"objective = {shown(objective)}: the promise filter takes the input nearest to"
+                " the proposed one; use 'nearest'"
+            )
+
+
+def _unknown(text: str, key: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"filter {shown(text)} has no setting {shown(key)}; {nearest(key, _KEYS)}, as in {_EXAMPLE}"
+    )
+
+
+def _intervals(text: str, given: str) -> tuple[Interval, ...]:
+    """Read "v:0.8..2.4;m:1..2"."""
+    found = []
+    for part in given.split(";"):
+        match = _INTERVAL.fullmatch(part)
+        try:
+            name, low, high = match.groups() if match else ("", "", "")
+            found.append((name, real(low), real(high)))
+        except ValueError as error:
+            raise ConfigurationError(
+                f"filter {shown(text)}: robust = {shown(part)}; give a parameter and two numbers,"
+                ' like v:0.8..2.4, with ";" between several of them'
+            ) from error
+    return tuple(found)
