@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from safe_envs.scripts.benchmark import benchmark
+from safe_envs.scripts.best import best
 from safe_envs.scripts.demo import demo
 from safe_envs.scripts.doctor import doctor
 from safe_envs.scripts.evaluate import evaluate
@@ -23,6 +24,7 @@ app = make_app(
         "identify": identify,
         "train": train,
         "leaderboard": leaderboard,
+        "best": best,
         "verify": verify,
         "render": render,
         "reproduce": reproduce,

@@ -30,6 +30,7 @@ def evaluate(
     confidence: of.Confidence = 0.95,
     refine: of.Refine = False,
     monitoring: of.Monitoring = "discrete",
+    best: of.Best = None,
     rare: of.Rare = False,
     particles: of.Particles = None,
     repetitions: of.Repetitions = None,
@@ -70,6 +71,8 @@ def evaluate(
             "--filter-spec": filter_spec,
             "--refine": refine,
             "--plot": plot,
+            "--best": best,
+            "--policy best": policy == "best",
             "--episodes-out": episodes_out,
             "--repeats": repeats != 1,
             "--jobs": jobs is not None,
@@ -85,7 +88,7 @@ def evaluate(
             " place"
         )
     third_party = filter_spec and env.env_id and not env.system
-    common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs}
+    common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "best": best}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id

@@ -58,6 +58,16 @@ def leaderboard(
         bool,
         typer.Option("--markdown", help="Print the table as Markdown, with a row for each env."),
     ] = False,
+    best: Annotated[
+        bool,
+        typer.Option(
+            "--best",
+            help=(
+                "Compute the best attainable safety of each env; without it the table has it where"
+                " that is in the cache."
+            ),
+        ),
+    ] = False,
     json_file: Json = None,
 ) -> None:
     """Train agents on each env, without and with its filter, and compare them with its controller.
@@ -68,21 +78,35 @@ def leaderboard(
     training of each kind, and another seed gives another agent.
     """
     from safe_envs.agents.jobs.fingerprint import package_versions
-    from safe_envs.agents.training.leaderboard import LeaderboardOptions, leaderboard_rows
+    from safe_envs.agents.training.leaderboard import (
+        LeaderboardOptions,
+        attainable_of,
+        leaderboard_rows,
+    )
     from safe_envs.registry import full_id
-    from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
+    from safe_envs.scripts.reports.leaderboard_report import (
+        leaderboard_markdown,
+        leaderboard_notes,
+        leaderboard_table,
+    )
 
     require_result(json_file)
     ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))
     options = LeaderboardOptions(algo, seed, quick, episodes or (100 if quick else 1000))
     with progress_bar("Leaderboard") as tell:
         rows = leaderboard_rows(ids, options, out, tell or (lambda _: None))
+    with progress_bar("Best attainable safety") as tell:
+        found = attainable_of(ids, best, tell or (lambda _: None))
     if markdown:
-        say(stdout(), leaderboard_markdown(rows))
+        say(stdout(), leaderboard_markdown(rows, found))
     else:
-        stdout().print(leaderboard_table(rows))
+        stdout().print(leaderboard_table(rows, found))
+    for note in leaderboard_notes(found):
+        say(stdout(), f"Note: {note}")
     document = {"settings": asdict(options), "versions": package_versions()}
-    write_result(json_file, lambda: {**document, "rows": [asdict(row) for row in rows]})
+    known = {key: each if isinstance(each, str) else each.as_dict() for key, each in found.items()}
+    document |= {"rows": [asdict(row) for row in rows], "best": known}
+    write_result(json_file, lambda: document)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def test_json_has_the_documented_keys(safe_envs_command):
     )
     assert (status, err) == (0, "")
     document = strictly("out.json")
-    assert list(document) == ["config", "versions", "rows", "comparisons", "timing"]
+    assert list(document) == ["config", "versions", "rows", "comparisons", "timing", "best"]
     assert [list(row) for row in document["rows"]] == [ROW_KEYS, ROW_KEYS]
     assert [row["filter"] for row in document["rows"]] == ["none", "hocbf:p=1,2"]
     assert {row["policy"] for row in document["rows"]} == {"nominal"}

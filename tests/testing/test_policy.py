@@ -7,7 +7,10 @@ import pytest
 
 from safe_envs import InvalidInputError
 from safe_envs.agents import POLICIES, NominalController, Policy
+from safe_envs.agents.policies.best import BestPolicy
+from safe_envs.registry import make_problem
 from safe_envs.testing.policy import check_policy
+from tests.agents.policies.coarse import COARSE, SHORT
 
 
 class Base:
@@ -102,7 +105,7 @@ def test_broken_policies_are_found(policy, name):
             check_policy(made)
 
 
-@pytest.mark.parametrize("policy", [name for name in POLICIES if name != "clf"])
+@pytest.mark.parametrize("policy", [name for name in POLICIES if name not in ("best", "clf")])
 def test_policies_of_this_project_are_sound(policy):
     check_policy(policy, "StochasticDubins-v0")
 
@@ -113,3 +116,8 @@ def test_classes_functions_and_objects_are_sound():
     check_policy(NominalController, "Quadrotor-v0")
     check_policy(lambda observation: np.tanh(observation[:, 0]))
     check_policy("clf", "CubicSDE-v0")
+
+
+def test_the_best_policy_is_sound():
+    problem = make_problem("Scalar-v0", **SHORT)
+    check_policy(BestPolicy(problem, COARSE), problem)

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
@@ -23,6 +24,7 @@ from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, held_against
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
 from safe_envs.wrappers.learning import LearnedModel
@@ -46,6 +48,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     monitoring: str = "discrete",
+    best: bool | None = None,
     jobs: int | None = None,
     progress: Progress | None = None,
     record: bool = False,
@@ -91,6 +94,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned.
         monitoring: where h is checked, "discrete" or "continuous".
+        best: whether to compute how safe any policy can be, see
+            `safe_envs.agents.evaluation.yardstick`; None to tell it if its table is in the cache.
         jobs: number of processes, or of threads of the compiled engine; the result is the same.
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
@@ -120,6 +125,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         bounds=bounds,
         repeats=repeats,
         monitoring=monitoring,
+        best=best,
     )
     settings = RunSettings(num_envs, jobs, record, progress, engine, keep_episodes, episodes_out)
     return run_evaluation(spec, settings)
@@ -141,6 +147,7 @@ class _Runner:
     def __init__(self, resolved: ResolvedEvaluation, settings: RunSettings) -> None:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
         parts = resolved.parts + sum(map(resolved.repeats, resolved.names))
+        parts += resolved.prepares + bool(resolved.spec.best)
         self._work = WorkParts(settings.progress, parts)
         identifications = sum(map(resolved.repeats, resolved.names))
         self._keeps = settings.keeps(self._spec.episodes * identifications)
@@ -151,6 +158,7 @@ class _Runner:
         """Run all filters and compare them."""
         resolved, spec, settings = self._resolved, self._spec, self._settings
         resolved.learn(self._work.part)
+        best = self._best()
         # Made before the first episode: what is wrong with any of them shows at once.
         players = {
             name: [player_of(resolved, conditions, settings) for conditions in each]
@@ -189,7 +197,18 @@ class _Runner:
             resolved.learning.models(),
             resolved.is_deterministic,
             kept and kept.joined(),
+            best and held_against(best, rows),
         )
+
+    def _best(self) -> AttainableSafety | None:
+        """Return how safe any policy can be, if it is asked for or known already."""
+        resolved = self._resolved
+        if self._spec.best:
+            return best_for(resolved.problem, self._work.part())
+        third_party = resolved.target.filter_spec is not None
+        if self._spec.best is False or third_party or self._spec.monitoring == "continuous":
+            return None
+        return best_at_hand(resolved.problem)
 
     def _simulated(
         self,

@@ -132,6 +132,7 @@ def refine(
         "options": None,
         "filters": first.spec.filters or [row.filter for row in first.rows],
         "bounds": False,
+        "best": False,
         "learned": first.learned,
     }
     finer = [

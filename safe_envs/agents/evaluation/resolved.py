@@ -34,6 +34,7 @@ from safe_envs.wrappers.conditions.text_parts import learned_parts, names_promis
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_tables import promise_filter_for
 from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.value.reduction import reduced
 
 FilterParts = tuple[Condition, ...] | PromiseSettings
 """The conditions of a filter, none for the unfiltered env, or the settings of a promise filter."""
@@ -90,18 +91,27 @@ class ResolvedEvaluation:
                 "a filter over a third-party env takes what was learned from a log: NAME:file=FILE"
             )
         self.filters: dict[str, list[FilterParts]] = {}
+        if spec.best:
+            reduced(self.problem, "plant")  # What has no table is known at once.
+
+    @property
+    def prepares(self) -> bool:
+        """Whether the policy has long work to do before it acts."""
+        return isinstance(self.policy, Policy) and type(self.policy).prepare is not Policy.prepare
 
     @property
     def parts(self) -> int:
-        """Of how many parts the work of `learn` is."""
+        """Number of parts of the work of `learn`, without the policy's."""
         return len(self.learning.missing()) + len(self._promises)
 
     def learn(self, part: Callable[[], Progress | None]) -> None:
-        """Learn what is missing, have the tables of promise filters, and read the filters.
+        """Prepare the policy, learn what is missing, have tables computed, and read the filters.
 
         Args:
             part: returns the progress of the next part of the work.
         """
+        if self.prepares:
+            self.policy.prepare(part())
         for method, repeat in self.learning.missing():
             self.learning.learn(method, repeat, part())
         # The envs of the filters find the tables as long as they are in use here.
@@ -239,6 +249,11 @@ def _require_third_party(spec: EvaluationSpec) -> None:
         raise ConfigurationError(
             "monitoring = 'continuous': the path of a third-party env between its steps is"
             " unknown; use 'discrete'"
+        )
+    if spec.best:
+        raise ConfigurationError(
+            "best = True: the best attainable safety needs the step of the env, and of a"
+            " third-party env only a model is known; leave it out"
         )
     if spec.knowledge != "model":
         raise ConfigurationError(

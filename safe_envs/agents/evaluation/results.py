@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.comparison import Comparison
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
@@ -14,6 +15,7 @@ from safe_envs.agents.evaluation.safe_flags import SafeFlags
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.agents.evaluation.yardstick import best_document
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
@@ -76,6 +78,7 @@ class Evaluation:
         learned: models of the first identifications.
         is_deterministic: whether nothing is random, so that all episodes are one and the same.
         episodes_if_kept: see `episodes`; None where they were not kept.
+        best: how safe any policy can be, counted as the rows are; None where it is not known.
     """
 
     problem: SafetyProblem
@@ -90,6 +93,7 @@ class Evaluation:
     learned: list[LearnedModel]
     is_deterministic: bool
     episodes_if_kept: dict[str, list[EpisodeResults]] | None
+    best: AttainableSafety | None = None
 
     @property
     def title(self) -> str:
@@ -130,6 +134,7 @@ class Evaluation:
             "rows": [row.as_dict() for row in self.rows],
             "comparisons": [asdict(comparison) for comparison in self.comparisons],
             "timing": asdict(self.timing),
+            "best": best_document(self.best, self.rows),
         }
 
     def episode_columns(self) -> dict[str, np.ndarray]:

@@ -64,9 +64,11 @@ class EvaluationSpec:
             it; 1 where nothing is.
         monitoring: where h is checked: "discrete" at control instants, "continuous" between them
             too.
+        best: whether to compute how safe any policy can be; None to tell that only where the table
+            for it is in the cache.
 
     Raises:
-        ConfigurationError: A value is out of range.
+        ConfigurationError: A value is out of range, or parts do not go together.
     """
 
     problem: SafetyProblem | str
@@ -84,6 +86,7 @@ class EvaluationSpec:
     bounds: bool = True
     repeats: int = 1
     monitoring: str = "discrete"
+    best: bool | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
@@ -99,6 +102,13 @@ class EvaluationSpec:
                 )
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
+        if not isinstance(self.best, bool | None):
+            raise ConfigurationError(f"best = {shown(self.best)}; give True, False or None")
+        if self.best and self.monitoring == "continuous":
+            raise ConfigurationError(
+                "best = True with monitoring = 'continuous': the best attainable safety is of"
+                " control instants, and not of the time between them; leave one of the two out"
+            )
         if not isinstance(self.options or {}, Mapping):
             raise ConfigurationError(f"options = {shown(self.options)}; give a dictionary")
         filters = listed(self.filters)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,13 @@ class Policy(ABC):
     """
 
     deterministic: bool = True
+
+    def prepare(self, progress: Callable[[float], None] | None = None) -> None:  # noqa: B027
+        """Do what takes long, before the first episode; most policies have no such work.
+
+        Args:
+            progress: called with the part of the work that is done, from 0 to 1.
+        """
 
     def begin(self, episodes: range, seed: int) -> None:  # noqa: B027  (most policies ignore it)
         """Receive the episodes of the rows of the coming batches, before each batch of episodes.

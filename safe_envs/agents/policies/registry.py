@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.policies.base import POLICY_FILE, Policy, Spaces, saved_policy_file
+from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.custom import as_policy
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
@@ -25,6 +26,7 @@ _NAMED: dict[str, Any] = {
     "clf": CLFController,
     "zero": ZeroController,
     "random": RandomPolicy,
+    "best": BestPolicy,
 }
 
 POLICIES = tuple(_NAMED)
@@ -92,6 +94,11 @@ def make_policy(
 
 def _require_third_party(name: str, env_id: str, filter_spec: FilterSpec) -> None:
     """Raise ConfigurationError for the name of a policy that a third-party env cannot have."""
+    if name == "best":
+        raise ConfigurationError(
+            f"the policy best needs the step of the env, and {env_id} is a third-party env, of"
+            " which only a model is known; give --policy nominal, zero, random or a .zip"
+        )
     if name == "nominal" and filter_spec.nominal is None:
         raise ConfigurationError(
             "the filter spec has no nominal controller; give it one, or --policy zero, random or a"

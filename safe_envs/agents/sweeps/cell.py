@@ -10,6 +10,7 @@ from typing import Any
 
 from safe_envs.agents.evaluation.evaluate import run_evaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
+from safe_envs.agents.evaluation.yardstick import best_document
 from safe_envs.agents.jobs.fingerprint import (
     file_checksum,
     json_checksum,
@@ -87,7 +88,7 @@ class Cell:
         )
 
     def compute(self) -> dict[str, Any]:
-        """Return the "row" and the "config" of the evaluation, in any process of this project.
+        """Return the "row", "config" and "best" of the evaluation, in any process of this project.
 
         Raises:
             ConfigurationError: this process has other versions or other files than the one that
@@ -96,7 +97,8 @@ class Cell:
         """
         self._require_same_code()
         found = run_evaluation(self.spec, RunSettings(engine=self.engine))
-        return {"row": found.rows[0].as_dict(), "config": found.config}
+        best = best_document(found.best, found.rows)
+        return {"row": found.rows[0].as_dict(), "config": found.config, "best": best}
 
     def _require_same_code(self) -> None:
         here = versions()

@@ -36,6 +36,7 @@ _STATISTICS = (
     "return_mean",
     "estimated_bound",
 )
+_BEST = ("lower", "upper")
 _ADVICE = "remove it and start the sweep again"
 
 
@@ -91,7 +92,7 @@ class Store:
         if outcome.error is not None and self._is_finished(key):
             self._finished.add(key)
             return
-        result = outcome.result or {"row": None, "config": None}
+        result = outcome.result or {"row": None, "config": None, "best": None}
         content = {**result, "error": outcome.error, "seconds": outcome.seconds}
         try:
             if not self._is_indexed:
@@ -118,9 +119,10 @@ def read(folder: Path | str) -> pa.Table:
 
     Columns: `key`; each setting that is swept or that some cell has, null where a cell leaves it to
     the env; counts and statistics as in the rows of
-    `safe_envs.agents.evaluation.evaluate.evaluate`; `error`, null for cells that did not fail;
-    `seconds`, the only one that depends on the machine; and as JSON the whole row, its
-    configuration, the versions and the checksums of files.
+    `safe_envs.agents.evaluation.evaluate.evaluate`; `best_lower` and `best_upper`, the ends of the
+    best attainable safety of cells with `best: true`, counted as the rates are; `error`, null for
+    cells that did not fail; `seconds`, the only one that depends on the machine; and as JSON the
+    whole row, its configuration, the versions and the checksums of files.
 
     Raises:
         ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is
@@ -191,6 +193,7 @@ def _kinds() -> dict[str, pa.DataType]:
     import pyarrow as pa
 
     kinds = dict.fromkeys(_COUNTS, pa.int64()) | dict.fromkeys(_STATISTICS, pa.float64())
+    kinds |= {f"best_{name}": pa.float64() for name in _BEST}
     kinds |= {"error": pa.string(), "seconds": pa.float64()}
     return kinds | dict.fromkeys(("files", "versions", "config", "row"), pa.string())
 
@@ -201,8 +204,10 @@ def _columns(document: Mapping[str, Any]) -> dict[str, Any]:
     texts = {name: configuration[name] for name in ("files", "versions")}
     texts |= {"config": document["config"], "row": row}
     statistics: Mapping[str, Any] = row or {}
+    best: Mapping[str, Any] = document.get("best") or {}
     return (
         {name: statistics.get(name) for name in (*_COUNTS, *_STATISTICS)}
+        | {f"best_{name}": best.get(name) for name in _BEST}
         | {"error": document["error"], "seconds": document["seconds"]}
         | {name: None if part is None else json.dumps(part) for name, part in texts.items()}
     )

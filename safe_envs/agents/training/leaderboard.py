@@ -7,12 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_type_hints
 
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.trainer import train
+from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.systems import ENV_IDS
 
@@ -112,6 +115,35 @@ def leaderboard_rows(
     return found
 
 
+def attainable_of(
+    env_ids: Sequence[str], compute: bool, progress: Callable[[float], None]
+) -> dict[str, AttainableSafety | str]:
+    """Return the best attainable safety of envs, counted as the rows of the leaderboard are.
+
+    Args:
+        env_ids: full ids.
+        compute: compute what is missing; without it only tables in the cache are read.
+        progress: receives the part of the work that is done, from 0 to 1.
+
+    Returns:
+        By id what is known, or why a table cannot be had.
+    """
+    found: dict[str, AttainableSafety | str] = {}
+    for k, env_id in enumerate(env_ids):
+        problem = make_problem(env_id)
+        try:
+            best = (
+                best_for(problem, lambda part, k=k: progress((k + part) / len(env_ids)))
+                if compute
+                else best_at_hand(problem)
+            )
+        except ConfigurationError as error:
+            best = str(error)
+        if best is not None:
+            found[env_id] = best
+    return found
+
+
 def _key(env_id: str) -> str:
     return env_id.rpartition("/")[2]
 
@@ -176,6 +208,7 @@ def _evaluated(
         seed=options.seed,
         knowledge=options.knowledge,
         bounds=False,
+        best=False,
     )
     for row in found.rows:
         statistics = {key: getattr(row, key) for key in _STATISTICS}

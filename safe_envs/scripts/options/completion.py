@@ -23,7 +23,7 @@ FILTERS = (
 )
 """Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""
 
-POLICIES = ("nominal", "clf", "zero", "random")
+POLICIES = ("nominal", "clf", "zero", "random", "best")
 """Names of policies, as `safe_envs.agents.policies.registry` knows them."""
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3")

@@ -37,8 +37,9 @@ Policy = Annotated[
         metavar="NAME|FOLDER|FILE",
         autocompletion=completion.policies,
         help=(
-            "nominal, clf, zero, random, a policy of your own as FILE.py:NAME, a folder of"
-            " `safe-envs train`, or with --trust a .zip of Stable-Baselines3."
+            "nominal, clf, zero, random, best (as safe as a table shows to be possible), a policy"
+            " of your own as FILE.py:NAME, a folder of `safe-envs train`, or with --trust a .zip of"
+            " Stable-Baselines3."
         ),
     ),
 ]
@@ -81,6 +82,17 @@ Refine = Annotated[
     bool,
     typer.Option(
         "--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged."
+    ),
+]
+Best = Annotated[
+    bool | None,
+    typer.Option(
+        "--best/--no-best",
+        help=(
+            "Compute the best attainable safety, and how many times the unavoidable violations each"
+            " filter has. By default they are shown if a table is in the cache."
+        ),
+        show_default=False,
     ),
 ]
 Monitoring = Annotated[

@@ -17,6 +17,7 @@ from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.best_text import best_line, best_notes, times_column
 from safe_envs.scripts.reports.engine_notes import engine_notes
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.scripts.reports.promise_notes import computed_notes
@@ -49,7 +50,7 @@ _VERDICTS = {
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
-    """Print a heading, a row for each filter, comparisons, and notes on how to read them.
+    """Print a heading, a row for each filter, comparisons, and notes.
 
     Args:
         console: to print on.
@@ -57,12 +58,17 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """
     interval = _interval(evaluation)
     say(console, heading(evaluation))
+    if evaluation.best:
+        say(console, best_line(evaluation.best))
     learned = learned_columns(evaluation.rows)
-    titles = ("filter", f"safe [{interval}]", *learned, "estimated\nbound", *_COLUMNS)
+    times = times_column(evaluation.best, evaluation.rows)
+    extra = [*learned, *["times un-\navoidable"] * bool(times)]
+    titles = ("filter", f"safe [{interval}]", *extra, "estimated\nbound", *_COLUMNS)
     table = make_table("pr", *titles)
-    for row, speed in zip(evaluation.rows, evaluation.timing.rows, strict=True):
+    for i, (row, speed) in enumerate(zip(evaluation.rows, evaluation.timing.rows, strict=True)):
         name, rate, *rest = _cells(row, speed.steps_per_second)
-        table.add_row(Text(name), rate, *[cell(row, speed) for cell in learned.values()], *rest)
+        cells = [*[cell(row, speed) for cell in learned.values()], *times[i : i + 1]]
+        table.add_row(Text(name), rate, *cells, *rest)
     print_whole(console, table)
     compared = (
         []
@@ -191,6 +197,7 @@ def _notes(evaluation: Evaluation) -> list[str]:
     steps = evaluation.problem.steps
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
     notes += [note for row in evaluation.rows for note in (*_of_bound(row), *_of_violations(row))]
+    notes += best_notes(evaluation.best)
     notes += learned_notes(evaluation.rows, evaluation.problem)
     bounded = [row.filter for row in evaluation.rows if row.estimated_bound is not None]
     if not all(map(names_promise, bounded)):

@@ -10,7 +10,9 @@ from rich.text import Text
 
 from safe_envs.agents.evaluation.rate_text import percent, rate_of
 from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.yardstick import times_between
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.best_text import ends_text, times_text
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 _SHOWN = 10
-_TITLES = ("safe [95 % interval]", "min h 5 %", "violations", "intervened", "infeasible", "return")
+_SAFE = "safe [95 % interval]"
+_BEST_TITLES = ("best", "times unavoidable")
+_TITLES = ("min h 5 %", "violations", "intervened", "infeasible", "return")
 _DOCUMENTS = ("row", "config", "versions", "files")
 
 
@@ -40,8 +44,10 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
         f"{len(rows) - len(failed)} of {len(index['cells'])} cells are done, {len(failed)} failed,"
         f" {missing} are missing.",
     )
-    table = make_table("l" * len(names) + "r", *names, *_TITLES, tight=False)
-    for row in _worst(rows, worst):
+    shown = _worst(rows, worst)
+    best = _BEST_TITLES if any(row["best_lower"] is not None for row in shown) else ()
+    table = make_table("l" * len(names) + "r", *names, _SAFE, *best, *_TITLES, tight=False)
+    for row in shown:
         filtered = row["filter"] != UNFILTERED
         rates = [
             row[name] if filtered else None for name in ("intervention_rate", "infeasible_rate")
@@ -49,6 +55,7 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
         table.add_row(
             *(Text(_value(row[name])) for name in names),
             rate_of(row),
+            *_best_cells(row)[: len(best)],
             f"{row['min_h_p05']:.3g}",
             str(row["violations"]),
             *map(percent, rates),
@@ -129,6 +136,13 @@ def _worst(rows: Sequence[Row], count: int) -> list[Row]:
     """Return the cells with the smallest rate, and among equals the smallest h."""
     done = [row for row in rows if row["error"] is None]
     return sorted(done, key=lambda row: (row["safety_rate"], row["min_h_p05"]))[:count]
+
+
+def _best_cells(row: Row) -> tuple[str, str]:
+    """Return the best attainable safety, and how many times the unavoidable violations."""
+    lower, upper = row["best_lower"], row["best_upper"]
+    times = times_between(lower, upper, row["ci_low"], row["ci_high"])
+    return ends_text(lower, upper), times_text(times)
 
 
 def _failed(rows: Sequence[Row]) -> list[Row]:

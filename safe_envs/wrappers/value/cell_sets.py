@@ -92,7 +92,7 @@ class Sets:
         shape = np.shape(q[0])
         inside, ends = np.ones(shape, dtype=bool), np.zeros(shape, dtype=bool)
         for h in values[: self._barriers]:
-            inside &= h.low > 0.0
+            inside &= h.low >= 0.0
         left = np.broadcast_to(values[self._barriers].high > _ROUNDING, shape)
         if self._stays:
             inside &= ~left
@@ -101,6 +101,22 @@ class Sets:
         for goal in values[self._barriers + 1 :]:
             ends |= goal.low >= 0.0
         return inside, ends
+
+    def may_hold(self, k: np.ndarray, q: Sequence[np.ndarray]) -> np.ndarray:
+        """Return whether states are in the safe set, or too close to its edge to tell.
+
+        Args:
+            k: control instants, int array (B,).
+            q: their coordinates, arrays (B,).
+        """
+        known = [values[np.asarray(k) * self._substeps] for values in self._known]
+        values = self._function([*q, *known])
+        found = np.ones(np.shape(q[0]), dtype=bool)
+        for h in values[: self._barriers]:
+            found &= h.high >= 0.0
+        if self._stays:
+            found &= values[self._barriers].low <= 0.0
+        return found
 
     def _classified(
         self, low: Sequence[np.ndarray], high: Sequence[np.ndarray], k: int, halvings: int
@@ -134,8 +150,8 @@ class Sets:
         shape = low[0].shape
         found = CellSets(*(np.full(shape, given) for given in (True, True, False, False)))
         for h in barriers:
-            np.logical_and(found.inside, h.low > 0.0, out=found.inside)
-            np.logical_and(found.touches, h.high > 0.0, out=found.touches)
+            np.logical_and(found.inside, h.low >= 0.0, out=found.inside)
+            np.logical_and(found.touches, h.high >= 0.0, out=found.touches)
         if self._stays:
             np.logical_and(found.inside, outside.high <= _ROUNDING, out=found.inside)
             np.logical_and(found.touches, outside.low <= 0.0, out=found.touches)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -12,10 +13,13 @@ from safe_envs.wrappers.value.grid_arrays import grid_arrays
 from safe_envs.wrappers.value.product_tables import ProductTables
 from safe_envs.wrappers.value.smoothing import Smoothing
 from safe_envs.wrappers.value.step_images import Step
-from safe_envs.wrappers.value.sweeps import bellman_functions
+from safe_envs.wrappers.value.sweeps import bellman_functions, in_parts, threads
 from safe_envs.wrappers.value.table import ValueTable
 
 _AT_ONCE = 2_000_000
+
+_LONG = 100_000
+"""Expected values of single boxes that take longer than to start threads."""
 
 
 class ExpectedBounds:
@@ -39,7 +43,6 @@ class ExpectedBounds:
         self._means = grid_arrays(smoothing.means)
         self._parts: CellSets | None = None
         self._functions = bellman_functions()
-        self._shifts = np.zeros(2 * AXES)
         shape = len(table.lower) * table.states, smoothing.means.cells
         self._ahead = {sign: np.empty(shape, dtype=np.float32) for sign in (1, -1)}
         self._filled = {sign: np.zeros(shape[0], dtype=bool) for sign in (1, -1)}
@@ -98,20 +101,29 @@ class ExpectedBounds:
             self._fill_row(int(row), sign, int(k[instant_ahead]) + 1)
         images, effects = self._step.images(q, q, inputs, instant * self._substeps)
         rest = 0.0 if sign > 0 else self._rest
-        self._functions["expected_values"](
-            0,
-            len(k),
-            images,
-            effects,
-            inputs,
-            self._step.noise.weights,
-            rows,
-            self._ahead[sign],
-            rest,
-            *self._means,
-            self._shifts,
-            found,
-        )
+        expected = self._functions["expected_values"]
+
+        def sweep(first: int, last: int, shifts: np.ndarray) -> None:
+            expected(
+                first,
+                last,
+                images,
+                effects,
+                inputs,
+                self._step.noise.weights,
+                rows,
+                self._ahead[sign],
+                rest,
+                *self._means,
+                shifts,
+                found,
+            )
+
+        if found.size * len(self._step.noise.weights) < _LONG:
+            sweep(0, len(k), np.zeros(2 * AXES))
+        else:
+            with ThreadPoolExecutor(threads()) as pool:
+                in_parts(pool, len(k), sweep)
 
     def _fill_row(self, row: int, sign: int, k: int) -> None:
         if not self._filled[sign][row]:

@@ -81,16 +81,17 @@ class Axis:
         fine = self.edges[:-1, None] + np.diff(self.edges)[:, None] * parts
         return Axis(np.append(fine.ravel(), self.edges[-1]), self.period)
 
-    def widened(self, margin: float) -> Axis:
+    def widened(self, margin: float, coarse: float = 0.0) -> Axis:
         """Return the axis with more cells on both sides; a periodic one needs none.
 
         Args:
             margin: to cover on each side at least.
+            coarse: width of the new cells, unless those of the axis are wider.
         """
         if self.period or not margin:
             return self
         # The outermost cells may be very narrow.
-        width = float(np.median(np.diff(self.edges)))
+        width = max(float(np.median(np.diff(self.edges))), coarse)
         more = width * np.arange(1, int(np.ceil(margin / width)) + 1)
         return Axis(np.concatenate([self.edges[0] - more[::-1], self.edges, self.edges[-1] + more]))
 

@@ -119,7 +119,7 @@ class LookAhead:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the scanned inputs of the largest bound, and these bounds.
 
-        Where several inputs are alike, the upper envelope decides.
+        Where the table says nothing, the upper envelope decides.
 
         Args:
             k: control instants before K, int array (B,).
@@ -130,17 +130,15 @@ class LookAhead:
             Shapes (B, m) and (B,).
         """
         lower = self.scanned(k, x, a)
-        most = lower.max(axis=1)
-        alike = lower >= most[:, None] - _ALIKE
-        unsettled = np.flatnonzero(alike.sum(axis=1) > 1)
-        rank = np.where(alike, lower, -np.inf)
-        if unsettled.size:
-            part = tuple(np.asarray(c)[unsettled] for c in x)
-            own = None if a is None else np.asarray(a)[unsettled]
-            upper = -self._bounds(np.asarray(k)[unsettled], part, self._scanned.ends, -1, own)
-            rank[unsettled] = np.where(alike[unsettled], upper, -np.inf)
-        chosen = rank.argmax(axis=1)
-        return self.inputs[chosen], np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
+        chosen = lower.argmax(axis=1)
+        best = np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
+        silent = np.flatnonzero(best <= 0.0)
+        if silent.size:
+            part = tuple(np.asarray(c)[silent] for c in x)
+            own = None if a is None else np.asarray(a)[silent]
+            upper = -self._bounds(np.asarray(k)[silent], part, self._scanned.ends, -1, own)
+            chosen[silent] = upper.argmax(axis=1)
+        return self.inputs[chosen], best
 
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
@@ -158,7 +156,8 @@ class LookAhead:
         inside, ends = self.sets_at(k, x)
         lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
         upper = np.where(ends, 1.0, self.largest(k, x))
-        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(inside, upper, 0.0).clip(0, 1)
+        near = self._sets.may_hold(k, self._coordinates(x))
+        return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(near, upper, 0.0).clip(0, 1)
 
     def sets_at(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return whether states are in the safe set, and whether the episode ends in them.
@@ -236,7 +235,3 @@ class LookAhead:
             places = self._product.states.place[a[rows]]
             found[rows] = self._tables.bounds(k[rows], [c[rows] for c in q], own, sign, places)
         return found
-
-
-_ALIKE = 1e-9
-"""Bounds that differ by less are alike."""

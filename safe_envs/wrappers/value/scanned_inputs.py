@@ -8,8 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safe_envs.errors import ConfigurationError
+
 _ALONG_EACH = {1: 41, 2: 13, 3: 7}
 _FEW = 5
+_MOST = 100_000
 
 
 class ScannedInputs(NamedTuple):
@@ -34,9 +37,17 @@ def scanned_inputs(box: Sequence[tuple[float, float]], number: int | None) -> Sc
     Args:
         box: (low, high) of each input.
         number: of values along each input; None for one that suits.
+
+    Raises:
+        ConfigurationError: They are too many.
     """
     m = len(box)
     count = number or _ALONG_EACH.get(m, _FEW)
+    if count**m > _MOST:
+        raise ConfigurationError(
+            f"{count} values along each of {m} inputs are {count**m} inputs; at most"
+            f" {_MOST} are scanned"
+        )
     values = _product([np.linspace(low, high, count) for low, high in box])
     cuts = [np.linspace(low, high, count + 1) for low, high in box]
     boxes = np.stack([_product([c[:-1] for c in cuts]), _product([c[1:] for c in cuts])], axis=-1)

@@ -15,10 +15,17 @@ import numpy as np
 
 from safe_envs.wrappers.value.grid import Axis, Grid
 
-_REACH = 5.2
-"""Standard deviations that noise is taken to reach."""
+REACH = 7.0
+"""Standard deviations that noise is taken to reach; beyond is 3e-12."""
 
-_PARTS = 2
+_MOST_TURNS = 2.0
+"""Standard deviation in periods from which noise on a periodic axis is as good as uniform: the
+density differs by exp(-2 (2 pi)^2) of it at most."""
+
+_COARSE = 16
+"""Cells of a standard deviation beyond the grid, at least, where the values are far away."""
+
+_PARTS = 1
 """Of a cell along an axis with noise."""
 
 _AT_ONCE = 96
@@ -71,10 +78,12 @@ class Smoothing:
         self.fine, axes = Grid(tuple(fine)), list(fine)
         for i, size in enumerate(blur):
             if size:
-                axes[i] = fine[i].widened(_REACH * size)
+                if fine[i].period:
+                    size = min(size, _MOST_TURNS * fine[i].period)
+                axes[i] = fine[i].widened(REACH * size, size / _COARSE)
                 self._blurs.append((i, _blocks(axes[i], _unrolled(fine[i], size), size)))
         self.means = Grid(tuple(axes))
-        self.beyond = 2.0 * len(self._blurs) * float(ndtr(-_REACH))
+        self.beyond = 2.0 * len(self._blurs) * float(ndtr(-REACH))
 
     def smoothed(self, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
         """Return lower bounds of the expected values on the grid of means, float32.
@@ -144,8 +153,8 @@ def _blocks(means: Axis, edges: np.ndarray, size: float) -> list[_Block]:
     for first in range(0, means.count, _AT_ONCE):
         part = slice(first, min(first + _AT_ONCE, means.count))
         low, high = means.edges[part], means.edges[part.start + 1 : part.stop + 1]
-        begin = int(np.searchsorted(edges, low[0] - _REACH * size))
-        end = int(np.searchsorted(edges, high[-1] + _REACH * size))
+        begin = int(np.searchsorted(edges, low[0] - REACH * size))
+        end = int(np.searchsorted(edges, high[-1] + REACH * size))
         at_low, at_high = (
             ndtr((ends[:, None] - edges[None, begin:end]) / size) for ends in (low, high)
         )
@@ -177,6 +186,6 @@ def _unrolled(axis: Axis, size: float) -> np.ndarray:
     """Return the edges of an axis, and of copies of a periodic one as far as noise reaches."""
     if not axis.period:
         return axis.edges
-    copies = int(np.ceil(_REACH * size / axis.period))
+    copies = int(np.ceil(REACH * size / axis.period))
     turns = axis.period * np.arange(-copies, copies + 1)
     return np.append((axis.edges[:-1] + turns[:, None]).ravel(), axis.edges[-1] + turns[-1])

@@ -12,12 +12,14 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.intervals import Interval, interval_function
+from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.value.noise_boxes import NoiseBoxes, noise_boxes
 from safe_envs.wrappers.value.reduction import ReducedProblem
 
 _PARTS = {1: 8, 2: 4}
 _FEW_PARTS = 2
 _AT_ONCE = 2_000_000
+_HUGE = 1e200
 
 
 class StepImages(NamedTuple):
@@ -60,6 +62,9 @@ class Step:
     Args:
         reduced: the problem.
 
+    Raises:
+        ConfigurationError: A control period has several sub-steps, which share one input.
+
     Attributes:
         blur: standard deviation of the noise along each coordinate that is left out here.
         noise: boxes of all other noise.
@@ -67,6 +72,11 @@ class Step:
     """
 
     def __init__(self, reduced: ReducedProblem) -> None:
+        if reduced.substeps > 1:
+            raise ConfigurationError(
+                f"{reduced.problem.name} has substeps = {reduced.substeps}: values are computed for"
+                " problems whose control period is one integration step; take substeps = 1"
+            )
         self._reduced = reduced
         self._parts = _parts_of(reduced)
         self.blur, self.is_affine = self._parts.blur, self._parts.is_affine
@@ -163,8 +173,9 @@ class Step:
         flat = [Interval(c.low[:, None], c.high[:, None]) for c in coordinates]
         thin = [Interval(w.low[:, 0], w.high[:, 0]) for w in worlds]
         for i, found in enumerate(effect([*flat, *known, *thin])):
-            effects[:, :, i // m, i % m, 0] = found.low
-            effects[:, :, i // m, i % m, 1] = found.high
+            # An infinite effect of an input that is 0 would be no number.
+            effects[:, :, i // m, i % m, 0] = np.maximum(found.low, -_HUGE)
+            effects[:, :, i // m, i % m, 1] = np.minimum(found.high, _HUGE)
 
 
 def reduced_expressions(parts: _Parts) -> list[sp.Expr]:

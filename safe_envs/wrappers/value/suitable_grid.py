@@ -9,8 +9,10 @@ import numpy as np
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.value.cell_sets import Sets, hull_of, workspace_of
 from safe_envs.wrappers.value.grid import Axis, Grid
+from safe_envs.wrappers.value.margin import with_margin
 from safe_envs.wrappers.value.product_states import ProductStates, keeps_safe
 from safe_envs.wrappers.value.reduction import ReducedProblem
+from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.step_images import Step
 
@@ -54,19 +56,34 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
             f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has {n}"
             f" coordinates ({names}): give a number for each"
         )
-    most = int(settings.memory / 2 / (_BYTES * (small.steps + 1) * states))
+    working = _working(small, settings, step)
+    most = int(settings.memory / 2 / states / (_BYTES * (small.steps + 1) + working))
     counts = settings.cells or _counts(small, ends, step, min(_usual(n, step), most))
-    if math.prod(counts) > most:
+    _require_room(math.prod(counts), most, small, settings)
+    cut = [_cut(edges, count) for edges, count in zip(hull, counts, strict=True)]
+    if settings.leaving == "safe":
+        cut = with_margin(small, cut, step)
+    grid = Grid(
+        tuple(Axis(edges, c.period) for c, edges in zip(small.coordinates, cut, strict=True))
+    )
+    _require_room(grid.cells, 2 * most, small, settings)
+    return grid
+
+
+def _require_room(cells: int, most: int, small: ReducedProblem, settings: ValueSettings) -> None:
+    if cells > most:
         raise ConfigurationError(
-            f"{math.prod(counts)} cells at {small.steps + 1} instants do not fit"
+            f"{cells} cells at {small.steps + 1} instants do not fit"
             f" {settings.memory / 1e9:.3g} GB of memory; take at most {most} cells, or more memory"
         )
-    return Grid(
-        tuple(
-            Axis(_cut(edges, count), c.period)
-            for c, edges, count in zip(small.coordinates, hull, counts, strict=True)
-        )
-    )
+
+
+def _working(small: ReducedProblem, settings: ValueSettings, step: Step) -> int:
+    """Return the bytes for each cell that the computation takes besides the tables."""
+    n, m = len(small.coordinates), len(small.inputs)
+    tried = len(scanned_inputs(small.box, settings.inputs).values)
+    images = 1 if step.is_affine else 2 * tried
+    return 8 * (2 * n * step.scenarios * (images * len(step.noise.weights) + m) + tried)
 
 
 def _cut(hull: np.ndarray, count: int) -> np.ndarray:

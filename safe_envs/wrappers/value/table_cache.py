@@ -82,6 +82,24 @@ def table_for(
     return table
 
 
+def table_at_hand(problem: SafetyProblem, settings: ValueSettings) -> ValueTable | None:
+    """Return the table of a problem if it is kept; nothing is computed.
+
+    Args:
+        problem: whose values are asked for.
+        settings: what is asked for.
+
+    Raises:
+        ConfigurationError: No grid takes the problem.
+    """
+    folder = cache_folder(FOLDER)
+    # The fingerprint takes some time, and most users have no table at all.
+    if folder is None or next(folder.glob("[0-9a-f]" * _DIGITS + ".npz"), None) is None:
+        return None
+    fingerprint = reduced(problem, settings.knowledge, settings.intervals).fingerprint
+    return _kept(folder / f"{_key(fingerprint, settings)}.npz", fingerprint)
+
+
 def forget_old_tables(folder: Path, most: int = MOST_BYTES_KEPT) -> None:
     """Remove the tables that were not used for longest, and what killed processes have left.
 

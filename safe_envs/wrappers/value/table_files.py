@@ -106,7 +106,10 @@ def require_asked(path: Path, table: ValueTable, settings: ValueSettings) -> Non
         ValueFileError: It has other settings.
     """
     asked = settings.as_dict()
-    found = {**table.settings.as_dict(), "cells": list(table.grid.shape)}
+    found = table.settings.as_dict()
+    if asked["cells"] != found["cells"]:
+        # A grid may have a few more cells than it was asked for.
+        found["cells"] = list(table.grid.shape)
     for name, value in asked.items():
         free = name == "memory" or (name in ("cells", "inputs") and value is None)
         if not free and found[name] != value:

@@ -41,6 +41,7 @@ class Evaluated(NamedTuple):
 
     rows: list[Any]
     config: dict[str, Any]
+    best: None = None
 
 
 def test_threads_of_a_worker_compute_one_cell_at_a_time(monkeypatch: pytest.MonkeyPatch):

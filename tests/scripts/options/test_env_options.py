@@ -18,6 +18,7 @@ from tests.scripts.own_system import SYSTEM
 COMMANDS = {
     "evaluate": (),
     "verify": (),
+    "best": ("--episodes", "0"),
     "identify": ("--method", "bayesian", "--out", "out.npz"),
     "train": ("--algo", "ppo", "--out", "run"),
     "render": ("--out", "film.gif"),
@@ -101,7 +102,13 @@ def test_identify_has_no_episodes(safe_envs_command):
 @pytest.mark.parametrize(
     ("command", "option"),
     [(command, "--json") for command in COMMANDS]
-    + [("evaluate", "--plot"), ("verify", "--plot"), ("identify", "--plot"), ("identify", "--out")],
+    + [
+        ("evaluate", "--plot"),
+        ("verify", "--plot"),
+        ("best", "--plot"),
+        ("identify", "--plot"),
+        ("identify", "--out"),
+    ],
 )
 def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, option):
     path = Path("own.py")

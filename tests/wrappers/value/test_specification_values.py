@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs import ConfigurationError
 from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.solve import solve

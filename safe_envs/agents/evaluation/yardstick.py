@@ -1,0 +1,151 @@
+"""How safe the rows of an evaluation are, measured by how safe any policy can be.
+
+Of every policy's episodes at least the share r is violated, where 1 - r is the best attainable
+safety. It is not known exactly, only 1 - upper <= r <= 1 - lower, nor is the share v of violations
+under a filter, only its interval 1 - ci_high <= v <= 1 - ci_low. So v/r is given as an interval,
+
+    (1 - ci_high)/(1 - lower) <= v/r <= (1 - ci_low)/(1 - upper),
+
+whose ends are as sure as those of the rate's interval and of the envelopes together. No policy is
+below 1, where the lower end is cut off. Where upper is 1 no violation is shown to be unavoidable,
+and there is no upper end; where lower is 1 too, none is unavoidable, and the number means nothing.
+
+A violation has to mean the same to both: the table counts leaving the workspace in the safe set as
+the evaluation does, as the end of a safe episode, or the two countings are the same because no
+state outside the workspace is in the safe set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from safe_envs.agents.evaluation.attainable import (
+    AttainableSafety,
+    attainable_safety,
+    contradicted,
+    of_table,
+)
+from safe_envs.agents.evaluation.countings import leaves_safely
+from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.spec import Progress
+from safe_envs.errors import SafeEnvsError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.look_ahead import LookAhead
+from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.table_cache import table_at_hand
+
+
+@dataclass(frozen=True)
+class TimesUnavoidable:
+    """Violations under a filter for each one that no policy can avoid.
+
+    Attributes:
+        low: lower end, at least 1.
+        high: upper end; None where no violation is shown to be unavoidable.
+    """
+
+    low: float
+    high: float | None
+
+
+def times_unavoidable(
+    best: AttainableSafety | None, ci_low: float, ci_high: float
+) -> TimesUnavoidable | None:
+    """Return how many times the unavoidable violations a filter has; see the module.
+
+    Args:
+        best: attainable safety, if it is known.
+        ci_low: lower end of the interval of the filter's safety rate.
+        ci_high: upper end.
+
+    Returns:
+        The interval; None where it would mean nothing.
+    """
+    return None if best is None else times_between(best.lower, best.upper, ci_low, ci_high)
+
+
+def times_between(
+    lower: float | None, upper: float | None, ci_low: float, ci_high: float
+) -> TimesUnavoidable | None:
+    """Return how many times the unavoidable violations a filter has; see the module.
+
+    Args:
+        lower: lower end of the best attainable safety, if it is known.
+        upper: its upper end.
+        ci_low: lower end of the interval of the filter's safety rate.
+        ci_high: upper end.
+
+    Returns:
+        The interval; None where it would mean nothing.
+    """
+    if lower is None or upper is None or lower >= 1.0:
+        return None
+    low = max(1.0, (1.0 - ci_high) / (1.0 - lower))
+    high = (1.0 - ci_low) / (1.0 - upper) if upper < 1.0 else None
+    return TimesUnavoidable(low, None if high is None else max(low, high))
+
+
+def evaluation_settings(problem: SafetyProblem) -> ValueSettings:
+    """Return the settings of a table that counts as `evaluate` does.
+
+    Where the countings are the same it is the one of staying, which other commands need too.
+    """
+    same = not leaves_safely(problem)
+    return ValueSettings(knowledge="plant", leaving="violation" if same else "safe")
+
+
+def best_for(problem: SafetyProblem, progress: Progress | None = None) -> AttainableSafety:
+    """Return the best attainable safety as `evaluate` counts, and compute it if need be.
+
+    Args:
+        problem: with the starts.
+        progress: called with the part of the work that is done, from 0 to 1.
+
+    Raises:
+        ConfigurationError: There is no table of the problem.
+    """
+    return attainable_safety(problem, evaluation_settings(problem), episodes=0, progress=progress)[
+        0
+    ]
+
+
+def best_at_hand(problem: SafetyProblem) -> AttainableSafety | None:
+    """Return the best attainable safety if its table is in the cache; nothing is computed."""
+    try:
+        table = table_at_hand(problem, evaluation_settings(problem))
+        return None if table is None else of_table(problem, table, LookAhead(table, problem))
+    except SafeEnvsError:
+        # A problem without a table, or a file that is damaged: nobody has asked for it.
+        return None
+
+
+def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> AttainableSafety:
+    """Return the best attainable safety, without bounds that the rate of a row exceeds.
+
+    Args:
+        best: to judge.
+        rows: of an evaluation. Those over several identifications do not have independent
+            episodes, and are left out.
+    """
+    judging = [r for r in rows if r.learning is None or r.learning.repeats == 1]
+    return contradicted(best, [(row.filter, row.safe, row.episodes) for row in judging])
+
+
+def best_document(
+    best: AttainableSafety | None, rows: Sequence[EvaluationRow]
+) -> dict[str, Any] | None:
+    """Return the best attainable safety, with the comparison of each row, as JSON-able data.
+
+    Args:
+        best: attainable safety, if it is known.
+        rows: of the evaluation.
+    """
+    if best is None:
+        return None
+    times = {row.filter: times_unavoidable(best, row.ci_low, row.ci_high) for row in rows}
+    return {
+        **best.as_dict(),
+        "times_unavoidable": {name: found and asdict(found) for name, found in times.items()},
+    }

@@ -1,0 +1,90 @@
+"""`safe-envs best`: how safe any policy can be from an env's starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from safe_envs.atomic_io import require_writable
+from safe_envs.errors import require_whole
+from safe_envs.scripts.options import text_options, value_options
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.env_options import EnvOptions, with_env
+
+
+@with_env
+def best(
+    env: EnvOptions,
+    leaving: value_options.Leaving = "violation",
+    knowledge: Annotated[
+        str, typer.Option(metavar="plant|model", help="In whose world: the env's, or the model's.")
+    ] = "plant",
+    cells: value_options.Cells = None,
+    inputs: value_options.Inputs = None,
+    table: value_options.Table = None,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes of the greedy policy's simulation; 0 for none.")
+    ] = 1000,
+    seed: text_options.Seed = 0,
+    json: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help=f"Draw the value over the coordinates of the grid: {text_options.FORMATS}",
+        ),
+    ] = None,
+) -> None:
+    """Print how safe any policy can be from the env's starts, and how safe a greedy policy is.
+
+    The largest probability of a safe episode lies between a lower and an upper end, which dynamic
+    programming of the env's own step gives on a grid: no policy is above the upper end, and one is
+    at least at the lower end. Both hold the error of the grid and are computed in floating point.
+    The greedy policy takes the input of the largest value at each step; it is --policy best of
+    evaluate.
+
+    The table is kept in the user's cache, so that it is computed once.
+    """
+    from safe_envs.agents.evaluation.attainable import attainable_safety
+    from safe_envs.registry import make_problem, title_of
+    from safe_envs.scripts.reports.best_report import BestAnswer, print_best
+    from safe_envs.wrappers.value.settings import ValueSettings
+
+    require_whole("episodes", episodes, 0)
+    require_whole("seed", seed, 0)
+    reads = [*text_options.inputs_of(env.system), *([("--table", table)] if table else [])]
+    text_options.require_outputs(json, plot, inputs=reads)
+    if table is not None:
+        require_writable(table)
+    settings = ValueSettings(
+        knowledge=knowledge,
+        leaving=leaving,
+        cells=value_options.cells_of(cells),
+        inputs=inputs,
+    )
+    known, arguments = env.full_id, env.arguments
+    problem = make_problem(known, **arguments)
+    with progress_bar("Computing") as tell:
+        found, policy = attainable_safety(
+            problem, settings, episodes=episodes, seed=seed, file=table, progress=tell
+        )
+    config = {"env_id": known, "options": arguments, "seed": seed}
+    answer = BestAnswer(title_of(known, arguments), config, problem, found)
+    print_best(stdout(), answer)
+    write_result(json, answer.document)
+    if plot is not None:
+        from safe_envs.scripts.figures.best_figure import draw
+
+        draw(answer, policy.table, plot)
+
+
+if __name__ == "__main__":
+    run_alone("best", best)

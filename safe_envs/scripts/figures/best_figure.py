@@ -1,0 +1,142 @@
+"""The picture of the best attainable safety: the lower envelope over its coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from safe_envs.atomic_io import write_atomically
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
+from safe_envs.scripts.reports.best_report import BestAnswer
+from safe_envs.scripts.reports.best_text import best_text
+from safe_envs.scripts.reports.evaluation_report import describe_system
+from safe_envs.wrappers.value.table import ValueTable
+
+LEVEL = 0.99
+"""Of the set that is marked."""
+
+_LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
+_SHADES = ("#F1F5F9", "#DCE8F2", "#BDD6E8", "#93BEDB", "#5E9FCB", "#2F7FB8", "#0072B2")
+_MARK = "#D55E00"
+
+
+def draw(answer: BestAnswer, table: ValueTable, path: Path) -> None:
+    """Draw the value at the start of an episode, and write the picture whole or not at all.
+
+    One coordinate gives a curve and two a plane. With more the plane of the first two is drawn,
+    with each other coordinate in the middle of its range.
+
+    Args:
+        answer: to draw.
+        table: that was computed for it.
+        path: of the picture; its suffix is the format.
+    """
+    found, problem = answer.found, answer.problem
+    shape, axes = table.grid.shape, table.grid.axes
+    middle = tuple(count // 2 for count in shape[2:])
+    lower, upper = (
+        np.asarray(rows[0], dtype=float).reshape(shape)[(..., *middle)]
+        if middle
+        else np.asarray(rows[0], dtype=float).reshape(shape)
+        for rows in (table.lower, table.upper)
+    )
+    names = [_label(problem, coordinate) for coordinate in found.coordinates]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 5.6))
+        panel = figure.subplots()
+        if len(shape) == 1:
+            handles = _draw_curve(panel, axes[0].edges, lower, upper)
+            panel.set(xlabel=names[0], ylabel="best attainable safety")
+        else:
+            edges = (axes[0].edges, axes[1].edges)
+            handles = _draw_plane(figure, panel, edges, lower, upper)
+            panel.set(xlabel=names[0], ylabel=names[1])
+        held = [
+            f"{name} = {0.5 * (axis.edges[i] + axis.edges[i + 1]):.3g}"
+            for name, axis, i in zip(names[2:], axes[2:], middle, strict=True)
+        ]
+        panel.set_title(
+            "Best attainable safety at the start of an episode"
+            + f"; {', '.join(held)}" * bool(held)
+        )
+        figure.legend(handles=handles, loc="outside lower center", ncols=3)
+        said = f"from the starts {best_text(found)}" if found.lower is not None else "withheld"
+        figure.suptitle(f"{answer.title}: {said}\n{describe_system(problem)}", fontsize=11)
+        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+
+
+def _draw_curve(panel: Axes, edges: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[Any]:
+    """Draw both envelopes over the only coordinate, and the set where the lower one is high."""
+    panel.stairs(upper, edges, baseline=lower, fill=True, color=COLORS[0], alpha=0.25)
+    panel.stairs(lower, edges, baseline=None, color=COLORS[0], linewidth=1.4)
+    panel.stairs(upper, edges, baseline=None, color=COLORS[0], linewidth=0.8, linestyle="--")
+    for start, end in _runs(lower >= LEVEL):
+        panel.axvspan(edges[start], edges[end], color=_MARK, alpha=0.15, linewidth=0)
+    panel.axhline(LEVEL, color=QUIET, linewidth=0.6, linestyle=":")
+    panel.set_ylim(-0.02, 1.02)
+    return [
+        Line2D([], [], color=COLORS[0], linewidth=1.4, label="lower"),
+        Line2D([], [], color=COLORS[0], linewidth=0.8, linestyle="--", label="upper"),
+        Patch(color=_MARK, alpha=0.15, label=f"{100 * LEVEL:g} % can be had (lower)"),
+    ]
+
+
+def _draw_plane(
+    figure: Figure,
+    panel: Axes,
+    edges: tuple[np.ndarray, np.ndarray],
+    lower: np.ndarray,
+    upper: np.ndarray,
+) -> list[Any]:
+    """Draw the lower envelope over a plane with level lines, and the set where it is high.
+
+    Args:
+        figure: with the panel, for the colour bar.
+        panel: to draw on.
+        edges: of the cells along both axes.
+        lower: lower envelope, shape (N, M).
+        upper: upper envelope, of the same shape.
+    """
+    colors = ListedColormap(list(_SHADES))
+    norm = BoundaryNorm(_LEVELS, colors.N)
+    shown = np.ma.masked_where(upper <= 0.0, lower).T
+    image = panel.pcolormesh(*edges, shown, cmap=colors, norm=norm, rasterized=True)
+    panel.set_facecolor(UNSAFE)
+    bar = figure.colorbar(image, ax=panel, shrink=0.9, ticks=_LEVELS, spacing="uniform")
+    bar.ax.set_yticklabels([f"{100 * level:g} %" for level in _LEVELS])
+    middles = [0.5 * (each[1:] + each[:-1]) for each in edges]
+    for values, style, width in ((lower, "solid", 1.6), (upper, "dashed", 1.0)):
+        if values.min() < LEVEL <= values.max() and min(values.shape) > 1:
+            panel.contour(
+                *middles, values.T, levels=[LEVEL], colors=_MARK, linewidths=width, linestyles=style
+            )
+    quiet = [level for level in _LEVELS[1:-1] if lower.min() < level < lower.max()]
+    if quiet and min(lower.shape) > 1:
+        panel.contour(*middles, lower.T, levels=quiet, colors=QUIET, linewidths=0.4)
+    return [
+        Line2D([], [], color=_MARK, linewidth=1.6, label=f"{100 * LEVEL:g} % can be had (lower)"),
+        Line2D([], [], color=_MARK, linewidth=1.0, linestyle="--", label="at most there (upper)"),
+        Patch(color=UNSAFE, label="0 %"),
+    ]
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the one after the last place of each run of True."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
+
+
+def _label(problem: SafetyProblem, coordinate: str) -> str:
+    """Return the label of an axis: the coordinate, with the unit where it is a state."""
+    units = {state.symbol.name: state.unit for state in problem.states}
+    unit = units.get(coordinate, "")
+    return f"{coordinate} ({unit})" if unit else coordinate

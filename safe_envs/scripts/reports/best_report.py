@@ -1,0 +1,93 @@
+"""The answer of `safe-envs best`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.best_text import COMPUTED, outwards
+from safe_envs.scripts.reports.evaluation_report import describe_system
+from safe_envs.scripts.reports.tables import make_table, print_whole
+
+_COUNTED = {
+    "violation": "leaving the workspace in the safe set counts as a violation",
+    "safe": "leaving the workspace in the safe set ends a safe episode, as evaluate counts it",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class BestAnswer:
+    """How safe any policy can be in an env.
+
+    Attributes:
+        title: of the env.
+        config: what was asked for, as JSON.
+        problem: of the env.
+        found: what was computed.
+    """
+
+    title: str
+    config: dict[str, Any]
+    problem: SafetyProblem
+    found: AttainableSafety
+
+    def document(self) -> dict[str, Any]:
+        """Return all as JSON-able data."""
+        return {"config": self.config, "versions": package_versions(), **self.found.as_dict()}
+
+
+def print_best(console: Console, answer: BestAnswer) -> None:
+    """Print the bounds, the greedy policy's rate, and the grid.
+
+    Args:
+        console: to print on.
+        answer: to print.
+    """
+    found, problem = answer.found, answer.problem
+    world = "the env" if found.knowledge == "plant" else "the model"
+    told = (
+        f" | best attainable safety in {world} | start {problem.start}"
+        f"\n{describe_system(problem)}; {_COUNTED[found.leaving]}"
+    )
+    say(console, Text.assemble((answer.title, "bold"), told))
+    table = make_table("lrl", "", "safe", "")
+    if found.lower is None or found.upper is None:
+        ends = ("withheld", "withheld")
+    else:
+        ends = tuple(f"{end} %" for end in outwards(found.lower, found.upper))
+    table.add_row("lower", ends[0], "some policy is at least as safe")
+    s = found.simulated
+    if s is not None:
+        rate = percent_in(s.rate, s.low, s.high)
+        told = f"greedy policy, {s.episodes} episodes, seed {s.seed}, {100 * s.confidence:g} %"
+        table.add_row("simulated", rate, f"{told} interval")
+    table.add_row("upper", ends[1], "no policy is safer")
+    if s is not None:
+        table.add_row("P(leave)", percent(s.leave_rate), "of the greedy policy, while still safe")
+    print_whole(console, table)
+    for line in _grid_lines(found):
+        say(console, line)
+    if found.contradiction:
+        say(console, f"Note: the bounds are withheld: {found.contradiction}")
+    say(console, f"Note: lower and upper are {COMPUTED}. They are not proved.")
+
+
+def _grid_lines(found: AttainableSafety) -> list[str]:
+    count = " x ".join(map(str, found.cells))
+    return [
+        f"Coordinates: {'; '.join(found.coordinates)}",
+        f"Grid: {count} cells, {found.inputs} inputs, {found.steps} steps; computed in"
+        f" {found.seconds:.3g} s, table of {_bytes(found.memory)}",
+    ]
+
+
+def _bytes(count: int) -> str:
+    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"

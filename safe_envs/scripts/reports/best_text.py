@@ -1,0 +1,117 @@
+"""The best attainable safety in the tables of other commands."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.yardstick import TimesUnavoidable, times_unavoidable
+
+COMPUTED = (
+    "computed in floating point by dynamic programming of the env's own step, with the error of the"
+    " grid in both ends"
+)
+"""What the ends of the best attainable safety are."""
+
+_MOST_DIGITS = 9
+
+
+def best_text(best: AttainableSafety | None) -> str:
+    """Return the ends of the best attainable safety, in per cent; "-" where there are none."""
+    return "-" if best is None else ends_text(best.lower, best.upper)
+
+
+def ends_text(lower: float | None, upper: float | None) -> str:
+    """Return two ends in per cent; "-" where there are none.
+
+    Args:
+        lower: the lower one.
+        upper: the upper one.
+    """
+    if lower is None or upper is None:
+        return "-"
+    low, high = outwards(lower, upper)
+    return f"{low} %" if low == high else f"{low}..{high} %"
+
+
+def outwards(lower: float, upper: float) -> tuple[str, str]:
+    """Return bounds in per cent, the lower one rounded down and the upper one rounded up.
+
+    There is a digit after the point, or as many as tell an upper bound below 1 from it.
+
+    Args:
+        lower: the lower one.
+        upper: the upper one.
+
+    Returns:
+        Two texts.
+    """
+    low, high = 100.0 * lower, 100.0 * upper
+    digits = next((d for d in range(1, _MOST_DIGITS) if upper == 1.0 or _up(high, d) < 100.0), 9)
+    return f"{0.0 - _up(-low, digits):.{digits}f}", f"{_up(high, digits):.{digits}f}"
+
+
+def _up(percentage: float, digits: int) -> float:
+    # What is a decimal number but for its last bits stays as it is.
+    return math.ceil(percentage * 10**digits - 1e-6) / 10**digits
+
+
+def times_text(times: TimesUnavoidable | None) -> str:
+    """Return how many times the unavoidable violations, rounded outwards."""
+    if times is None:
+        return "-"
+    low = _rounded(times.low, math.floor)
+    if times.high is None:
+        return f">= {low}"
+    high = _rounded(times.high, math.ceil)
+    return low if low == high else f"{low}..{high}"
+
+
+def times_column(best: AttainableSafety | None, rows: Sequence[EvaluationRow]) -> list[str]:
+    """Return the cells of a column with `times_text`; none at all where nothing is known.
+
+    Args:
+        best: attainable safety, if it is known.
+        rows: of an evaluation.
+    """
+    if best is None or best.lower is None:
+        return []
+    return [times_text(times_unavoidable(best, row.ci_low, row.ci_high)) for row in rows]
+
+
+def best_line(best: AttainableSafety | None) -> str:
+    """Return a line with the best attainable safety and how leaving counts; "" without it."""
+    if best is None:
+        return ""
+    if best.lower is None:
+        return "best attainable safety: withheld"
+    return f"best attainable safety: {best_text(best)}"
+
+
+def best_notes(best: AttainableSafety | None) -> list[str]:
+    """Return what has to be known to read the best attainable safety and the times."""
+    if best is None:
+        return []
+    if best.contradiction:
+        return [f"the best attainable safety is withheld: {best.contradiction}"]
+    counted = (
+        "It counts leaving the workspace as the rates do, as the end of a safe episode, which may"
+        " be all that it takes; `safe-envs best` counts that as a violation."
+        if best.leaving == "safe"
+        else "Nothing outside the workspace is safe, so that leaving it counts as a violation."
+    )
+    return [
+        "no policy is safer than the upper end of the best attainable safety, and some policy is as"
+        f" safe as its lower end: {COMPUTED}, but not proved. {counted}",
+        "times unavoidable: violations of a filter for each one that no policy can avoid, from (1 -"
+        " upper end of the rate)/(1 - lower end of the best), at least 1, to (1 - lower end of the"
+        " rate)/(1 - upper end of the best); only >= where none is shown to be unavoidable.",
+    ]
+
+
+def _rounded(value: float, towards: Callable[[float], int]) -> str:
+    """Return a number from 1 on as text: below 10 with a digit after the point, else without."""
+    scale = 10 if value < 10.0 else 1
+    return f"{towards(value * scale) / scale:.10g}"

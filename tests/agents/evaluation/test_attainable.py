@@ -1,0 +1,196 @@
+"""How safe any policy can be, from the starts of an env, and the yardstick made of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from safe_envs import ConfigurationError
+from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation import attainable, yardstick
+from safe_envs.agents.evaluation.attainable import AttainableSafety, attainable_safety
+from safe_envs.agents.evaluation.countings import leaves_safely
+from safe_envs.agents.evaluation.greedy_episodes import simulate
+from safe_envs.agents.evaluation.yardstick import (
+    TimesUnavoidable,
+    best_at_hand,
+    held_against,
+    times_unavoidable,
+)
+from safe_envs.registry import make_problem
+from safe_envs.wrappers.value import table_cache
+from safe_envs.wrappers.value.settings import ValueSettings
+from tests.agents.policies.coarse import COARSE, SHORT, coarse
+
+NEAR_THE_EDGE = {**SHORT, "start": [0.8], "noise": 1.5}
+
+
+@pytest.fixture
+def empty_cache(monkeypatch, tmp_path):
+    """Tables are kept in an empty folder."""
+    monkeypatch.setattr(table_cache, "cache_folder", lambda name: tmp_path)
+
+
+def made_up(lower, upper) -> AttainableSafety:
+    return AttainableSafety(
+        lower, upper, None, "", "plant", "violation", ("x",), (3,), 2, 10, 1.0, 80
+    )
+
+
+def test_the_greedy_policy_has_a_rate_between_the_ends():
+    found, _ = attainable_safety(make_problem("Scalar-v0", **NEAR_THE_EDGE), COARSE, episodes=2000)
+    s = found.simulated
+    assert s is not None
+    assert found.lower is not None
+    assert found.upper is not None
+    assert 0.5 < found.lower < found.upper < 1.0
+    assert found.lower <= s.high
+    assert s.low <= found.upper
+    assert found.contradiction == ""
+
+
+def test_the_simulation_is_that_of_evaluate():
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
+    found, policy = attainable_safety(problem, coarse(leaving="safe"), episodes=300, num_envs=128)
+    row = evaluate(problem, policy, "none", episodes=300, bounds=False, best=False).rows[0]
+    assert found.simulated is not None
+    assert found.simulated.safe == row.safe < 300
+    assert (found.simulated.low, found.simulated.high) == (row.ci_low, row.ci_high)
+
+
+def test_leaving_is_counted_as_it_was_asked_for():
+    # Below x = -3 the workspace ends, in the safe set.
+    problem = make_problem("Scalar-v0", **{**SHORT, "start": [-2.9], "noise": 2.0})
+    _, policy = attainable_safety(problem, COARSE, episodes=0)
+    staying = simulate(policy, 400, 0, 0.95, 400)
+    policy.settings = coarse(leaving="safe")
+    as_counted = simulate(policy, 400, 0, 0.95, 400)
+    assert staying.leave_rate == as_counted.leave_rate > 0.05
+    assert as_counted.rate == pytest.approx(staying.rate + staying.leave_rate)
+    row = evaluate(problem, policy, "none", episodes=400, bounds=False, best=False).rows[0]
+    assert as_counted.safe == row.safe
+
+
+def test_the_worlds_of_plant_and_model_differ():
+    # The plant cannot be held at this angle, the model can.
+    problem = make_problem("Pendulum-v0", horizon=0.3, start=[0.3, 0.0], plant={"m": 4.0})
+    settings = ValueSettings(knowledge="plant", cells=(60, 60), inputs=3)
+    found = [
+        attainable_safety(each, replace(settings, knowledge=knowledge), episodes=50)[0]
+        for each, knowledge in (
+            (problem, "plant"),
+            (problem, "model"),
+            (replace(problem, plant=problem.model), "plant"),
+        )
+    ]
+    assert found[0].upper != found[1].upper
+    assert found[1].simulated == found[2].simulated
+    assert (found[1].lower, found[1].upper) == (found[2].lower, found[2].upper)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "where"),
+    [(0.7, 0.9, ""), (0.7, 0.75, "above the upper"), (0.85, 0.9, "below the lower")],
+)
+def test_bounds_that_the_greedy_policy_contradicts_are_withheld(lower, upper, where):
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
+    found, _ = attainable_safety(problem, COARSE, episodes=10)
+    assert found.simulated is not None
+    rate = replace(found.simulated, rate=0.8, safe=8000, episodes=10_000)
+    judged = attainable.judged(replace(made_up(lower, upper), simulated=rate))
+    assert where in judged.contradiction
+    assert (judged.lower is None) == (judged.upper is None) == bool(where)
+    assert bool(judged.contradiction) == bool(where)
+
+
+def test_bounds_that_a_row_exceeds_are_withheld():
+    rows = evaluate(
+        "Scalar-v0",
+        "zero",
+        "cbf",
+        options={"horizon": 0.2, "start": [0.0]},
+        episodes=60,
+        bounds=False,
+        best=False,
+    ).rows
+    assert rows[0].safe == 60
+    assert held_against(made_up(0.5, 1.0), rows).upper == 1.0
+    judged = held_against(made_up(0.5, 0.7), rows)
+    assert judged.upper is None
+    assert "cbf is safe in" in judged.contradiction
+    # The interval of these few episodes does not contradict it.
+    assert held_against(made_up(0.5, 0.95), rows).upper == 0.95
+
+
+@pytest.mark.parametrize(
+    ("best", "interval", "times"),
+    [
+        ((0.9, 0.98), (0.8, 0.85), (1.5, 10.0)),
+        ((0.9, 1.0), (0.8, 0.85), (1.5, None)),
+        ((0.9, 0.95), (0.92, 0.99), (1.0, 1.6)),
+        ((0.9, 0.91), (0.95, 0.99), (1.0, 1.0)),
+    ],
+)
+def test_times_unavoidable_is_an_interval(best, interval, times):
+    found = times_unavoidable(made_up(*best), *interval)
+    assert found is not None
+    assert (found.low, found.high) == pytest.approx(times)
+
+
+def test_times_unavoidable_means_nothing_where_none_is():
+    assert times_unavoidable(None, 0.8, 0.9) is None
+    assert times_unavoidable(made_up(None, None), 0.8, 0.9) is None
+    assert times_unavoidable(made_up(1.0, 1.0), 0.8, 0.9) is None
+
+
+def test_the_interval_holds_the_true_ratio():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        avoidable, measured = np.sort(rng.uniform(0.001, 0.5, 2))
+        lower, upper = 1 - avoidable - rng.random() * 0.1, 1 - avoidable * rng.random()
+        ends = 1 - measured - rng.random() * 0.1, 1 - measured * rng.random()
+        found = times_unavoidable(made_up(lower, upper), *ends)
+        assert isinstance(found, TimesUnavoidable)
+        assert found.low <= measured / avoidable <= (found.high or np.inf) * (1 + 1e-12)
+
+
+def test_where_the_countings_are_the_same_is_known():
+    same = {"DubinsDisk-v0", "StochasticDubins-v0", "Pendulum-v0", "CubicSDEDisk-v0"}
+    others = {"Scalar-v0", "ACC-v0", "CubicSDE-v0", "QuadrotorAltitude-v0"}
+    assert [name for name in sorted(same | others) if not leaves_safely(make_problem(name))] == (
+        sorted(same)
+    )
+    # A larger ellipse is not within the workspace.
+    assert leaves_safely(make_problem("Pendulum-v0", barrier={"level": 3.0}))
+
+
+def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache):
+    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    given = {"options": NEAR_THE_EDGE, "filters": ["none"], "episodes": 50, "bounds": False}
+    assert evaluate("Scalar-v0", **given).document()["best"] is None
+    computed = evaluate("Scalar-v0", best=True, **given)
+    best = computed.best
+    assert best is not None
+    assert best.lower is not None
+    shown = computed.document()["best"]
+    assert (shown["lower"], shown["upper"]) == (best.lower, best.upper)
+    times = times_unavoidable(best, computed.rows[0].ci_low, computed.rows[0].ci_high)
+    assert times is not None
+    assert shown["times_unavoidable"] == {"none": {"low": times.low, "high": times.high}}
+    # It is in the cache now.
+    assert evaluate("Scalar-v0", **given).best == best
+    assert evaluate("Scalar-v0", best=False, **given).best is None
+    assert evaluate("Scalar-v0", monitoring="continuous", **given).best is None
+
+
+def test_what_has_no_table_is_an_error_only_if_it_is_asked_for(empty_cache, tmp_path):
+    (tmp_path / f"{'0' * 64}.npz").touch()  # Another table is there.
+    with pytest.raises(ConfigurationError, match="12 coordinates"):
+        evaluate("Quadrotor-v0", best=True)
+    assert best_at_hand(make_problem("Quadrotor-v0")) is None
+    with pytest.raises(ConfigurationError, match="monitoring = 'continuous'"):
+        evaluate("Scalar-v0", best=True, monitoring="continuous")
+    with pytest.raises(ConfigurationError, match="give True, False or None"):
+        evaluate("Scalar-v0", best="yes")  # pyright: ignore[reportArgumentType]

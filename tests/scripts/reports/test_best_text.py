@@ -1,0 +1,49 @@
+"""The best attainable safety as text: bounds are rounded outwards."""
+
+from __future__ import annotations
+
+import pytest
+
+from safe_envs.agents.evaluation.yardstick import TimesUnavoidable
+from safe_envs.scripts.reports.best_text import ends_text, outwards, times_text
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "text"),
+    [
+        (0.9895, 0.9989, "98.9..99.9 %"),
+        (0.98999, 0.99501, "98.9..99.6 %"),
+        (0.9, 0.9, "90.0 %"),
+        (0.9, 0.99951, "90.00..99.96 %"),
+        (0.9, 0.99999, "90.000..99.999 %"),
+        (0.99999, 1.0, "99.9..100.0 %"),
+        (1.0, 1.0, "100.0 %"),
+        (0.0, 0.5, "0.0..50.0 %"),
+        (None, None, "-"),
+    ],
+)
+def test_ends_are_rounded_outwards(lower, upper, text):
+    assert ends_text(lower, upper) == text
+
+
+def test_nothing_below_one_is_called_certain():
+    assert outwards(0.0, 1.0 - 1e-9)[1] < "99.99999995"
+    assert not outwards(0.0, 1.0 - 1e-9)[0].startswith("-")
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (1.0, 1.6001, "1..1.7"),
+        (2.57, 15.2, "2.5..16"),
+        (13.9, None, ">= 13"),
+        (1.0, 1.0, "1"),
+        (141.7, 1000.2, "141..1001"),
+    ],
+)
+def test_times_are_rounded_outwards(low, high, text):
+    assert times_text(TimesUnavoidable(low, high)) == text
+
+
+def test_there_may_be_no_times():
+    assert times_text(None) == "-"

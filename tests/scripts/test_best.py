@@ -1,0 +1,144 @@
+"""`safe-envs best`, and the best attainable safety in other commands, as a person types them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+
+from safe_envs.agents.evaluation import yardstick
+from safe_envs.wrappers.value import table_cache
+from tests.agents.policies.coarse import COARSE
+from tests.scripts.conftest import strictly
+
+SCALAR = ("Scalar-v0", "--horizon", 0.3, "--noise", 1.5, "--start", 0.8)
+COARSELY = ("--cells", 400, "--inputs", 9, "--episodes", 200)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path):
+    """An empty folder for tables, so that a test sees its own only."""
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    monkeypatch.setattr(table_cache, "cache_folder", lambda name: folder)
+    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+
+
+def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, tmp_path):
+    status, out, _ = safe_envs_command("best", *SCALAR, *COARSELY, "--json", "best.json")
+    assert status == 0
+    for text in ("lower", "simulated", "upper", "P(leave)", "no policy is safer", "not proved"):
+        assert text in out
+    assert "Grid: " in out
+    found = strictly("best.json")
+    assert 0.4 < found["lower"] < found["upper"] < 1.0
+    low, high = found["simulated_interval"]
+    assert low < found["simulated"] < high
+    assert low <= found["upper"]
+    assert found["lower"] <= high
+    assert (found["contradiction"], found["leaving"], found["leave_rate"]) == (None, "violation", 0)
+    assert found["coordinates"] == ["x"]
+    assert found["seconds"] > 0
+    assert found["memory"] > 0
+
+
+def test_leaving_and_knowledge_are_as_asked_for(safe_envs_command):
+    asked = ("--leaving", "safe", "--knowledge", "model", "--episodes", 0, "--json", "-")
+    status, out, _ = safe_envs_command("best", *SCALAR, *COARSELY, *asked)
+    assert status == 0
+    found = json.loads(out)
+    assert (found["leaving"], found["knowledge"], found["simulated"]) == ("safe", "model", None)
+
+
+def test_a_table_is_written_and_read_again(safe_envs_command, tmp_path):
+    first = safe_envs_command("best", *SCALAR, *COARSELY, "--table", "mine.npz", "--json", "1.json")
+    assert first[0] == 0
+    for path in (tmp_path / "cache").glob("*.npz"):
+        path.unlink()
+    again = safe_envs_command("best", *SCALAR, *COARSELY, "--table", "mine.npz", "--json", "2.json")
+    assert again[0] == 0
+    assert strictly("1.json") == strictly("2.json")
+    # Of another problem it is refused.
+    other = ("Scalar-v0", "--horizon", 0.2, *COARSELY, "--table", "mine.npz")
+    status, _, err = safe_envs_command("best", *other)
+    assert status == 2
+    assert "mine.npz" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("Quadrotor-v0",), "12 coordinates"),
+        (("Scalar-v0", "--cells", "4x"), "a whole number for each coordinate"),
+        (("Scalar-v0", "--cells", "40x40", "--episodes", 0), "cells"),
+        (("Scalar-v0", "--leaving", "violations"), "did you mean 'violation'"),
+        (("Scalar-v0", "--knowledge", "plants"), "did you mean 'plant'"),
+        (("Scalar-v0", "--inputs", 1), "inputs = 1"),
+        (("Scalar-v0", "--episodes", -1), "episodes = -1"),
+        (("Scalar-v0", "--seed", -1), "seed = -1"),
+        (("Scalar-v0", "--table", "no/where.npz"), "no/where.npz"),
+        (("Scalar-v0", "--plot", "x.txt"), "unknown format 'txt'"),
+        (("Scalar-v1",), "Scalar-v0"),
+    ],
+)
+def test_errors_come_at_once(safe_envs_command, arguments, text):
+    status, _, err = safe_envs_command("best", *arguments)
+    assert status == 2
+    assert text in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (*SCALAR, "--cells", "400"),
+        ("Pendulum-v0", "--horizon", 0.05, "--cells", "30x30"),
+        ("DubinsObstacle-v0", "--horizon", 0.1, "--cells", "8x8x8"),
+    ],
+)
+def test_the_value_is_drawn_over_any_number_of_coordinates(safe_envs_command, tmp_path, arguments):
+    how = ("--inputs", 3, "--episodes", 0, "--plot", "value.svg")
+    assert safe_envs_command("best", *arguments, *how)[0] == 0
+    drawn = (tmp_path / "value.svg").read_text()
+    assert "best attainable safety" in drawn.lower()
+    assert "99 % can be had" in drawn
+
+
+def test_evaluate_shows_it(safe_envs_command):
+    asked = ("--filter", "none", "--filter", "cbf", "--episodes", 60)
+    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked)
+    assert status == 0
+    assert "best attainable safety" not in out
+    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked, "--best", "--json", "e.json")
+    assert status == 0
+    assert "best attainable safety: " in out
+    assert "avoidable" in out
+    assert "times unavoidable: " in out
+    best = strictly("e.json")["best"]
+    assert 0.4 < best["lower"] < best["upper"] < 1.0
+    assert set(best["times_unavoidable"]) == {"none", "cbf"}
+    # Now the table is at hand.
+    assert "best attainable safety: " in safe_envs_command("evaluate", *SCALAR, *asked)[1]
+    assert "best attainable" not in safe_envs_command("evaluate", *SCALAR, *asked, "--no-best")[1]
+    status, _, err = safe_envs_command("evaluate", *SCALAR, "--rare", "--policy", "best")
+    assert status == 2
+    assert "--rare does not go with --policy best" in err
+
+
+def test_a_sweep_has_it_in_its_cells(safe_envs_command, tmp_path):
+    fixed = {"env": "Scalar-v0", "horizon": 0.3, "noise": 1.5, "start": [0.8], "best": True}
+    document = {"fixed": {**fixed, "episodes": 40}, "grid": {"filter": ["none", "cbf"]}}
+    (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
+    status, _, err = safe_envs_command("sweep", "sweep.yaml", "--out", "cells", "--jobs", 1)
+    assert (status, err) == (0, "")
+    status, out, _ = safe_envs_command("sweep-report", "cells", "--json", "r.json")
+    assert status == 0
+    assert "times unavoidable" in out
+    for cell in strictly("r.json")["worst"]:
+        assert 0.4 < cell["best_lower"] < cell["best_upper"] < 1.0
+    (tmp_path / "sweep.yaml").write_text(
+        yaml.safe_dump({"fixed": {**fixed, "env": "Quadrotor-v0"}})
+    )
+    status, _, err = safe_envs_command("sweep", "sweep.yaml", "--out", "others")
+    assert status == 2
