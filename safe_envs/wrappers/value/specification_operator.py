@@ -151,8 +151,12 @@ class SpecificationOperator:
         search, most = self._search(place, tables[1]), self._tables.most
         rest = 0.0 if most else -(self._step.noise.rest + self._smoothing.beyond)
         bounds = search.upper(self._images[1], tables[1], rest, wanted) + most
-        found = ahead[0][place, numbers].astype(np.float64)
-        search.lower(0, self._images[0], tables[0], wanted, found)
+        # A value is good enough that rises as the upper bound does; where sets move, none is.
+        found = np.full(len(numbers), np.inf)
+        if self.is_constant:
+            rise = np.maximum(bounds - ahead[1][place, numbers], 0.0)
+            found = ahead[0][place, numbers] + rise
+        search.lower(self._turn, self._images[0], tables[0], wanted, found)
         chosen = numbers[wanted]
         rows[0][place, chosen] = rounded_down(np.clip(found[wanted], 0.0, 1.0))
         rows[1][place, chosen] = -rounded_down(-np.clip(bounds[wanted], 0.0, 1.0))

@@ -104,5 +104,7 @@ def exact_values(
             found[~WITHIN] = 0.0
         rows = (kernel @ onward).max(axis=0)
         found[WITHIN] = np.where(ended[WITHIN][:, None], accepted[WITHIN], rows)
+        # What is settled before the workspace is left, counts.
+        found[np.ix_(WITHIN, automaton.verdict(k, states) == 1)] = 1.0
         values.insert(0, found)
     return np.array(values)
