@@ -132,5 +132,7 @@ class BestPolicy(Policy):
         x = list(self._read(rows))
         for i, values in self._known:
             x[i] = values[k]
+        if self._automaton is None:
+            return self.look_ahead.best_input(k, tuple(x))[0], a
         a = self.look_ahead.next_states(k, tuple(x), a)
         return self.look_ahead.best_input(k, tuple(x), a)[0], a
