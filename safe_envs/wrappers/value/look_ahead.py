@@ -53,8 +53,14 @@ class LookAhead:
             self._product = ProductTables(small, settings.leaving, smoothing)
             self._most = self._product.most
         self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
+        self._noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
+
+    @property
+    def noise_boxes(self) -> int:
+        """Number of boxes into which the noise of a step is divided."""
+        return self._noise_boxes
 
     def values(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return the lower envelope at states, 0 outside the safe set.
