@@ -21,6 +21,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.cell_sets import CellSets, Sets
@@ -74,7 +75,11 @@ class _Solver:
         begun = time.perf_counter()
         small, grid = self._reduced, self._grid
         smoothing = Smoothing(grid, self._step.blur)
-        with ThreadPoolExecutor(threads(), "safe_envs_values") as pool:
+        # Both envelopes are smoothed side by side: threads of BLAS would be in the way.
+        with (
+            threadpool_limits(1, "blas"),
+            ThreadPoolExecutor(threads(), "safe_envs_values") as pool,
+        ):
             operator = (
                 _Operator(self, smoothing, pool)
                 if small.automaton is None
@@ -179,8 +184,12 @@ class _Operator:
         if self._known.size * len(self._step.noise.weights) < _SMALL:
             found[:] = np.inf  # All inputs are tried.
         bounds = np.zeros(len(self._numbers))
-        self._sweep_lower(self._around(lower, ahead.inside), found, here)
-        self._sweep_upper(self._around(-upper, ahead.touches), bounds)
+        around = [
+            self._pool.submit(self._around, *given)
+            for given in ((lower, ahead.inside), (-upper, ahead.touches))
+        ]
+        self._sweep_lower(around[0].result(), found, here)
+        self._sweep_upper(around[1].result(), bounds)
         self._turn += 1
         new_lower = (cells.touches & cells.ends).astype(np.float32)
         new_upper = (cells.touches & cells.may_end).astype(np.float32)

@@ -16,11 +16,11 @@ from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.step_images import Step
 
-_CELLS = {1: 4000, 2: 300_000, 3: 500_000, 4: 600_000}
+_CELLS = {1: 4000, 2: 1_000_000, 3: 500_000, 4: 600_000}
 """Cells of a problem whose noise is not divided into boxes."""
 
-_LESS = 0.57
-"""How the number of cells falls with that of the boxes of noise."""
+_LESS = 0.95
+"""How the number of cells falls with that of the images of a cell."""
 
 _SAMPLES = 512
 _BYTES = 8
@@ -58,7 +58,7 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
         )
     working = _working(small, settings, step)
     most = int(settings.memory / 2 / states / (_BYTES * (small.steps + 1) + working))
-    counts = settings.cells or _counts(small, ends, step, min(_usual(n, step), most))
+    counts = settings.cells or _counts(small, ends, step, min(_usual(small, step), most))
     _require_room(math.prod(counts), most, small, settings)
     cut = [_cut(edges, count) for edges, count in zip(hull, counts, strict=True)]
     if settings.leaving == "safe":
@@ -97,9 +97,12 @@ def _wide(hull: np.ndarray) -> tuple[float, float]:
     return float(hull[widest]), float(hull[widest + 1])
 
 
-def _usual(n: int, step: Step) -> int:
+def _usual(small: ReducedProblem, step: Step) -> int:
     """Return a number of cells that takes less than a minute or so."""
     boxes = len(step.noise.weights) * step.scenarios
+    if not step.is_affine:
+        boxes *= len(scanned_inputs(small.box, None).values)
+    n = len(small.coordinates)
     return _CELLS[n] if n == 1 else int(_CELLS[n] / boxes**_LESS)
 
 
