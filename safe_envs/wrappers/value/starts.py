@@ -12,11 +12,9 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
 
-_STARTS = 50_000
-_MORE_STARTS = 200_000
-"""Where noise is not divided into many boxes, so that a look ahead is fast."""
-
-_FEW_BOXES = 20
+_STARTS = {1: 600_000, 50: 50_000}
+_FEWEST = 20_000
+"""Starts by the number of boxes of noise up to which a look ahead is fast enough for so many."""
 
 _DOUBT = 1e-4
 """Chance that the mean over all starts lies outside the interval of the drawn ones."""
@@ -54,8 +52,9 @@ def start_values(look_ahead: LookAhead, problem: SafetyProblem, seed: int = 0) -
     Source: A. Maurer, M. Pontil, Empirical Bernstein bounds and sample variance penalization, COLT
         2009, Theorem 4.
     """
-    many = look_ahead.noise_boxes > _FEW_BOXES
-    x = draw_starts(problem, _STARTS if many else _MORE_STARTS, seed)
+    boxes = look_ahead.noise_boxes
+    count = next((n for most, n in _STARTS.items() if boxes <= most), _FEWEST)
+    x = draw_starts(problem, count, seed)
     lower, upper = look_ahead.start_bounds(x)
     below, above = _margin(lower), _margin(upper)
     return StartValues(
