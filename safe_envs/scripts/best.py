@@ -25,6 +25,14 @@ def best(
     cells: value_options.Cells = None,
     inputs: value_options.Inputs = None,
     table: value_options.Table = None,
+    spec: Annotated[
+        str,
+        typer.Option(
+            metavar="TEXT",
+            help='What episodes are to meet in place of staying safe, such as "always safe &'
+            ' eventually goal".',
+        ),
+    ] = "",
     episodes: Annotated[
         int, typer.Option(help="Episodes of the greedy policy's simulation; 0 for none.")
     ] = 1000,
@@ -67,6 +75,7 @@ def best(
     settings = ValueSettings(
         knowledge=knowledge,
         leaving=leaving,
+        specification=spec,
         cells=value_options.cells_of(cells),
         inputs=inputs,
     )

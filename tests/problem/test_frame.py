@@ -99,7 +99,7 @@ def test_barriers_and_goals_that_are_no_functions_of_the_coordinates_are_refused
     ):
         found = reduced(problem)
         assert tuple(map(str, found.symbols)) == ("x", "y")
-        assert "barrier or goal differ" in found.note
+        assert "barrier, goal or a region differ" in found.note
     found = reduced(turning(2.4, goal=x**2 + y**2 - sp.Rational(81, 100)))
     assert found.goal == r**2 - sp.Rational(81, 100)
     assert found.barriers == (1 - r**2,)

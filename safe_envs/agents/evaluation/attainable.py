@@ -46,6 +46,7 @@ class AttainableSafety:
         knowledge: whose step is taken, that of the "plant" or of the "model".
         leaving: how an episode counts that leaves the workspace in the safe set, as a "violation"
             or as "safe".
+        specification: that an episode is to meet; "" for staying safe.
         coordinates: of the grid, expressions of the states.
         cells: of the grid along each coordinate.
         inputs: number of inputs that are scanned.
@@ -60,6 +61,7 @@ class AttainableSafety:
     contradiction: str
     knowledge: str
     leaving: str
+    specification: str
     coordinates: tuple[str, ...]
     cells: tuple[int, ...]
     inputs: int
@@ -143,7 +145,9 @@ def of_table(problem: SafetyProblem, table: ValueTable, look_ahead: LookAhead) -
     """
     settings = table.settings
     values = start_values(look_ahead, problem)
-    coordinates = reduced(problem, settings.knowledge, settings.intervals).coordinates
+    coordinates = reduced(
+        problem, settings.knowledge, settings.intervals, settings.specification
+    ).coordinates
     return AttainableSafety(
         lower=values.lower,
         upper=values.upper,
@@ -151,6 +155,7 @@ def of_table(problem: SafetyProblem, table: ValueTable, look_ahead: LookAhead) -
         contradiction="",
         knowledge=settings.knowledge,
         leaving=settings.leaving,
+        specification=settings.specification,
         coordinates=tuple(str(c.expression) for c in coordinates),
         cells=tuple(table.grid.shape),
         inputs=len(table.inputs),

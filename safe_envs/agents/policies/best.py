@@ -50,7 +50,11 @@ class BestPolicy(Policy):
     ) -> None:
         self.problem, self._file = problem, file
         self.settings = settings or ValueSettings(knowledge="plant")
-        found = reduced(problem, self.settings.knowledge, self.settings.intervals)
+        asked = self.settings
+        found = reduced(problem, asked.knowledge, asked.intervals, asked.specification)
+        # The hidden state is the control instant, and with a specification that of its automaton.
+        self._automaton = found.automaton
+        self._states = 1 if found.automaton is None else found.automaton.size
         symbols = set().union(*(c.expression.free_symbols for c in found.coordinates))
         known = {s: np.asarray(v)[:: found.substeps] for s, v in found.known.items()}
         self._known = [(problem.plant.states.index(s), v) for s, v in known.items()]
@@ -101,26 +105,34 @@ class BestPolicy(Policy):
 
         Returns:
             Actions, shape (m,) or (B, m), and the number of the control instant that comes next,
-            shape (B,), with B = 1 for one observation.
+            shape (B,), with B = 1 for one observation. With a specification that number is
+            multiplied by the number of states of its automaton, and its state is added.
 
         Raises:
             InvalidInputError: The observation has another shape than (k,) or (B, k).
         """
         given = checked_observation(observation, len(self.problem.features))
         rows = np.atleast_2d(given)
-        periods = np.zeros(len(rows), dtype=np.int64)
+        begun = 0 if self._automaton is None else self._automaton.initial
+        hidden = np.full(len(rows), begun, dtype=np.int64)
         if state is not None:
-            periods += state
+            hidden[:] = state
             if episode_start is not None:
-                periods[np.broadcast_to(episode_start, periods.shape)] = 0
-        inputs = self._inputs(periods, rows)
+                hidden[np.broadcast_to(episode_start, hidden.shape)] = begun
+        periods, a = np.divmod(hidden, self._states)
+        inputs, a = self._inputs(periods, rows, a)
         actions = np.clip((inputs - self._center) / self._half, -1.0, 1.0)
-        return actions.reshape(*given.shape[:-1], -1), periods + 1
+        return actions.reshape(*given.shape[:-1], -1), (periods + 1) * self._states + a
 
-    def _inputs(self, periods: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return inputs in physical units (B, m) at control instants (B,)."""
+    def _inputs(
+        self, periods: np.ndarray, rows: np.ndarray, a: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return inputs in physical units (B, m) and the states of the automaton (B,)."""
         k = np.minimum(periods, self.look_ahead.steps - 1)
         x = list(self._read(rows))
         for i, values in self._known:
             x[i] = values[k]
-        return self.look_ahead.best_input(k, tuple(x))[0]
+        if self._automaton is None:
+            return self.look_ahead.best_input(k, tuple(x))[0], a
+        a = self.look_ahead.next_states(k, tuple(x), a)
+        return self.look_ahead.best_input(k, tuple(x), a)[0], a

@@ -57,21 +57,28 @@ def print_best(console: Console, answer: BestAnswer) -> None:
         f" | best attainable safety in {world} | start {problem.start}"
         f"\n{describe_system(problem)}; {_COUNTED[found.leaving]}"
     )
+    if found.specification:
+        told += f"\nmet where {found.specification}"
     say(console, Text.assemble((answer.title, "bold"), told))
-    table = make_table("lrl", "", "safe", "")
+    word = ("met", "some policy meets it as often", "no policy meets it more often")
+    if not found.specification:
+        word = ("safe", "some policy is at least as safe", "no policy is safer")
+    table = make_table("lrl", "", word[0], "")
     if found.lower is None or found.upper is None:
         ends = ("withheld", "withheld")
     else:
         ends = tuple(f"{end} %" for end in outwards(found.lower, found.upper))
-    table.add_row("lower", ends[0], "some policy is at least as safe")
+    table.add_row("lower", ends[0], word[1])
     s = found.simulated
     if s is not None:
         rate = percent_in(s.rate, s.low, s.high)
         told = f"greedy policy, {s.episodes} episodes, seed {s.seed}, {100 * s.confidence:g} %"
         table.add_row("simulated", rate, f"{told} interval")
-    table.add_row("upper", ends[1], "no policy is safer")
+    table.add_row("upper", ends[1], word[2])
     if s is not None:
-        table.add_row("P(leave)", percent(s.leave_rate), "of the greedy policy, while still safe")
+        table.add_row(
+            "P(leave)", percent(s.leave_rate), f"of the greedy policy, while still {word[0]}"
+        )
     print_whole(console, table)
     for line in _grid_lines(found):
         say(console, line)

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from safe_envs.errors import ConfigurationError, shown
+from safe_envs.problem.named_sets import set_expressions, set_names
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.automaton import Automaton
 from safe_envs.wrappers.value.specification import Specification
 
@@ -38,6 +40,24 @@ def automaton_of(specification: Specification) -> Automaton:
         )
     unfolding = _Unfolding(specification)
     return _Reduction(unfolding).automaton(specification)
+
+
+def problem_automaton(problem: SafetyProblem, text: str) -> Automaton:
+    """Return the automaton of a specification over the sets of a problem.
+
+    Args:
+        problem: which has the sets.
+        text: of the specification.
+
+    Raises:
+        ConfigurationError: The text is no specification over these sets, needs too many states, or
+            has a window that ends after the episode.
+    """
+    specification = Specification(text, set_names(problem))
+    specification.require_horizon(problem.steps)
+    for name in specification.atoms:
+        set_expressions(problem, name)
+    return automaton_of(specification)
 
 
 class _Unfolding:

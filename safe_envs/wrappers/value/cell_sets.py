@@ -130,7 +130,7 @@ class Sets:
             return found
         boxes = [a[unclear] for a in low], [b[unclear] for b in high]
         halves = [
-            self._classified(*_half(*boxes, i), k, halvings - 1) for i in range(2 ** len(low))
+            self._classified(*halved(*boxes, i), k, halvings - 1) for i in range(2 ** len(low))
         ]
         for wholly, partly in (("inside", "touches"), ("ends", "may_end")):
             getattr(found, wholly)[unclear] = np.logical_and.reduce(
@@ -167,8 +167,14 @@ class Sets:
         return found
 
 
-def _half(low: Sequence[Any], high: Sequence[Any], number: int) -> tuple[list[Any], list[Any]]:
-    """Return one of the 2**n parts of boxes that are halved along each axis."""
+def halved(low: Sequence[Any], high: Sequence[Any], number: int) -> tuple[list[Any], list[Any]]:
+    """Return one of the 2**n parts of boxes that are halved along each axis.
+
+    Args:
+        low: least coordinates, n arrays.
+        high: largest coordinates.
+        number: of the part.
+    """
     below, above = [], []
     for i, (a, b) in enumerate(zip(low, high, strict=True)):
         middle = 0.5 * (a + b)
@@ -191,7 +197,7 @@ def hull_of(reduced: ReducedProblem, sets: Sets) -> list[np.ndarray]:
     """
     ends = [_range(c) for c in reduced.coordinates]
     if sets.depend_on_time:
-        return [np.array(pair) for pair in ends]
+        return workspace_of(reduced)
     for _ in range(_LOOKS):
         grid = uniform_grid(reduced.coordinates, ends, [_SCAN[len(ends)]] * len(ends))
         touched = sets.of_cells(grid, 0).touches
@@ -208,6 +214,11 @@ def hull_of(reduced: ReducedProblem, sets: Sets) -> list[np.ndarray]:
         np.array(pair) if c.period else _ends_along(i, reduced, sets, ends)
         for i, (c, pair) in enumerate(zip(reduced.coordinates, ends, strict=True))
     ]
+
+
+def workspace_of(reduced: ReducedProblem) -> list[np.ndarray]:
+    """Return the ends of the workspace along each coordinate."""
+    return [np.array(_range(c)) for c in reduced.coordinates]
 
 
 def _ends_along(

@@ -48,6 +48,7 @@ class Chain:
         barriers: what is safe.
         goal: reached where it is >= 0; None without one.
         outside: positive where the workspace is left.
+        regions: that matter, by name, >= 0 inside.
     """
 
     coordinates: tuple[Coordinate, ...]
@@ -55,12 +56,13 @@ class Chain:
     barriers: tuple[sp.Expr, ...]
     goal: sp.Expr | None
     outside: sp.Expr
+    regions: Mapping[str, sp.Expr]
 
     @property
     def expressions(self) -> tuple[sp.Expr, ...]:
         """All of them, those of the step first."""
         goal = () if self.goal is None else (self.goal,)
-        return (*self.step, *self.barriers, *goal, self.outside)
+        return (*self.step, *self.barriers, *goal, self.outside, *self.regions.values())
 
     def with_numbers(self, numbers: Mapping[sp.Symbol, sp.Expr]) -> Chain:
         """Return the chain with numbers in place of states that never change."""
@@ -74,6 +76,7 @@ class Chain:
             tuple(map(put, self.barriers)),
             None if self.goal is None else put(self.goal),
             put(self.outside),
+            {name: put(e) for name, e in self.regions.items()},
         )
 
     def with_periods(self) -> Chain:
@@ -113,6 +116,7 @@ class Derivation:
         noise: symbols of the normals of a sub-step.
         moved: the states after a sub-step.
         known: the states that are known in advance, which are no coordinates.
+        regions: names of those that matter.
     """
 
     problem: SafetyProblem
@@ -121,6 +125,7 @@ class Derivation:
     noise: tuple[sp.Symbol, ...]
     moved: tuple[sp.Expr, ...]
     known: frozenset[sp.Symbol]
+    regions: tuple[str, ...] = ()
 
     @property
     def following(self) -> dict[sp.Symbol, sp.Expr]:
@@ -145,6 +150,7 @@ class Derivation:
             tuple(b.expression for b in problem.barriers),
             problem.goal,
             problem.outside,
+            self._regions,
         )
 
     def in_frame(self, frame: Frame) -> tuple[Chain | None, str]:
@@ -169,7 +175,12 @@ class Derivation:
             tuple(tidied(b.expression.xreplace(section)) for b in problem.barriers),
             None if problem.goal is None else tidied(problem.goal.xreplace(section)),
             outside.xreplace(section),
+            {name: tidied(e.xreplace(section)) for name, e in self._regions.items()},
         ), ""
+
+    @property
+    def _regions(self) -> dict[str, sp.Expr]:
+        return {name: self.problem.regions[name] for name in self.regions}
 
     def _world(self) -> World:
         problem = self.problem
@@ -180,5 +191,6 @@ class Derivation:
             moved=self.moved,
             barriers=tuple(b.expression for b in problem.barriers),
             goal=problem.goal,
+            regions=tuple(self._regions.values()),
             ranges=(*((v.low, v.high) for v in problem.states), *self.uncertain.values()),
         )

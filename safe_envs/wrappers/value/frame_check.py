@@ -47,6 +47,7 @@ class World:
         moved: the states after a sub-step.
         barriers: of the states.
         goal: of the states and the time, or None.
+        regions: further sets that matter, of the states.
         ranges: where a state may be, low and high for each, possibly infinite.
     """
 
@@ -56,6 +57,7 @@ class World:
     moved: tuple[sp.Expr, ...]
     barriers: tuple[sp.Expr, ...]
     goal: sp.Expr | None
+    regions: tuple[sp.Expr, ...]
     ranges: tuple[tuple[float, float], ...]
 
 
@@ -198,12 +200,11 @@ class _Pairs:
         return ""
 
     def flaw_of_readings(self, x: np.ndarray) -> str:
-        """Say where barriers or goal are no functions of the coordinates."""
+        """Say where barriers, goal or regions are no functions of the coordinates."""
         goal = [] if self._world.goal is None else [self._world.goal]
         timed = [e.xreplace({s: sp.Float(1.7) for s in self._times(e)}) for e in goal]
-        return self._difference(
-            "barrier or goal differ at equal", [*self._world.barriers, *timed], x
-        )
+        sets = [*self._world.barriers, *timed, *self._world.regions]
+        return self._difference("barrier, goal or a region differ at equal", sets, x)
 
     def flaw_of_bounds(self, bounds: tuple[Variable, ...], x: np.ndarray) -> str:
         """Say where bounds of the workspace are no functions of the coordinates."""

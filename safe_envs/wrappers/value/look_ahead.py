@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.cell_sets import CellSets, Sets
-from safe_envs.wrappers.value.expected_value_kernel import AXES
-from safe_envs.wrappers.value.grid_arrays import grid_arrays
+from safe_envs.wrappers.value.cell_sets import Sets
+from safe_envs.wrappers.value.expected_bounds import ExpectedBounds
+from safe_envs.wrappers.value.product_tables import ProductTables
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.smoothing import Smoothing
 from safe_envs.wrappers.value.step_images import Step
-from safe_envs.wrappers.value.sweeps import bellman_functions, in_parts, threads
 from safe_envs.wrappers.value.table import ValueTable
 
 
@@ -32,6 +30,7 @@ class LookAhead:
         steps: control periods of the table, K.
         inputs: that the table was computed with, in physical units, shape (U, m).
         box: (low, high) of each input.
+        automaton: of the specification; None for the values of staying safe.
 
     Raises:
         ConfigurationError: The table is of another problem.
@@ -39,82 +38,91 @@ class LookAhead:
 
     def __init__(self, table: ValueTable, problem: SafetyProblem) -> None:
         settings = table.settings
-        small = reduced(problem, settings.knowledge, settings.intervals)
+        small = reduced(problem, settings.knowledge, settings.intervals, settings.specification)
         if small.fingerprint != table.fingerprint:
             raise ConfigurationError(
                 f"the table is of another problem ({table.problem}, or other parameters, bounds or"
                 f" periods) than {problem.name}; compute one for this problem"
             )
         self._table, self._reduced = table, small
-        self._step, self._sets = Step(small), Sets(small, settings.leaving)
-        self._smoothing = Smoothing(table.grid, self._step.blur)
-        self._means = grid_arrays(self._smoothing.means)
-        self._parts: CellSets | None = None
-        self._functions = bellman_functions()
+        step = Step(small)
+        smoothing = Smoothing(table.grid, step.blur)
+        self._sets = Sets(small, settings.leaving)
+        self.automaton, self._product, self._most = small.automaton, None, 0.0
+        if small.automaton is not None:
+            self._product = ProductTables(small, settings.leaving, smoothing)
+            self._most = self._product.most
+        self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
+        self._noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
-        cells = self._smoothing.means.cells
-        self._ahead = {
-            sign: np.empty((len(table.lower), cells), dtype=np.float32) for sign in (1, -1)
-        }
-        self._filled = {sign: np.zeros(len(table.lower), dtype=bool) for sign in (1, -1)}
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
 
     @property
     def noise_boxes(self) -> int:
         """Number of boxes into which the noise of a step is divided."""
-        return len(self._step.noise.weights)
+        return self._noise_boxes
 
-    def values(self, k: np.ndarray, x: Components) -> np.ndarray:
+    def values(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return the lower envelope at states, 0 outside the safe set.
 
         Args:
             k: control instants, int array (B,).
             x: n components of the states, (B,).
+            a: states of the automaton after reading x, int (B,); by default those of starts.
         """
         q = self._coordinates(x)
+        if self._product is not None:
+            return self._product_values(np.asarray(k), q, a)
         cells = self._table.grid.cell_of(q)
         rows = np.maximum(np.asarray(k) - self._table.first, 0)
         inside, _ = self._sets.of_states(k, q)
         return np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
 
-    def expected(self, k: np.ndarray, x: Components, u: np.ndarray) -> np.ndarray:
+    def expected(
+        self, k: np.ndarray, x: Components, u: np.ndarray, a: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return lower bounds of the expected next value of the lower envelope.
 
         Args:
             k: control instants before K, int array (B,).
             x: n components of the states, (B,).
             u: inputs in physical units, shape (B, V, m).
+            a: states of the automaton after reading x, int (B,); by default those of starts.
 
         Returns:
             Shape (B, V).
         """
-        return self._bounds(k, x, np.stack([u, u], axis=-1), 1)
+        return self._bounds(k, x, np.stack([u, u], axis=-1), 1, a)
 
-    def scanned(self, k: np.ndarray, x: Components) -> np.ndarray:
+    def scanned(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return `expected` for all scanned inputs.
 
         Args:
             k: control instants before K, int array (B,).
             x: n components of the states, (B,).
+            a: states of the automaton after reading x, int (B,); by default those of starts.
 
         Returns:
             Shape (B, U).
         """
-        return self._bounds(k, x, self._scanned.ends, 1)
+        return self._bounds(k, x, self._scanned.ends, 1, a)
 
-    def largest(self, k: np.ndarray, x: Components) -> np.ndarray:
+    def largest(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return upper bounds of the expected next value under any input.
 
         Args:
             k: control instants before K, int array (B,).
             x: n components of the states, (B,).
+            a: states of the automaton after reading x, int (B,); by default those of starts.
 
         Returns:
             Shape (B,).
         """
-        return -self._bounds(k, x, self._scanned.boxes, -1).min(axis=1)
+        return self._most - self._bounds(k, x, self._scanned.boxes, -1, a).min(axis=1)
 
-    def best_input(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
+    def best_input(
+        self, k: np.ndarray, x: Components, a: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the scanned inputs of the largest bound, and these bounds.
 
         Where the table says nothing, the upper envelope decides.
@@ -122,17 +130,19 @@ class LookAhead:
         Args:
             k: control instants before K, int array (B,).
             x: n components of the states, (B,).
+            a: states of the automaton after reading x, int (B,); by default those of starts.
 
         Returns:
             Shapes (B, m) and (B,).
         """
-        lower = self.scanned(k, x)
+        lower = self.scanned(k, x, a)
         chosen = lower.argmax(axis=1)
         best = np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
         silent = np.flatnonzero(best <= 0.0)
         if silent.size:
             part = tuple(np.asarray(c)[silent] for c in x)
-            upper = -self._bounds(np.asarray(k)[silent], part, self._scanned.ends, -1)
+            own = None if a is None else np.asarray(a)[silent]
+            upper = -self._bounds(np.asarray(k)[silent], part, self._scanned.ends, -1, own)
             chosen[silent] = upper.argmax(axis=1)
         return self.inputs[chosen], best
 
@@ -146,6 +156,9 @@ class LookAhead:
             Lower and upper bounds, shape (B,).
         """
         k = np.zeros(len(x[0]), dtype=np.int64)
+        if self._product is not None:
+            lower, upper = self.scanned(k, x).max(axis=1), self.largest(k, x)
+            return lower.clip(0.0, 1.0), upper.clip(0.0, 1.0)
         inside, ends = self.sets_at(k, x)
         lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
         upper = np.where(ends, 1.0, self.largest(k, x))
@@ -161,6 +174,41 @@ class LookAhead:
         """
         return self._sets.of_states(k, self._coordinates(x))
 
+    def first_states(self, x: Components) -> np.ndarray:
+        """Return the states of the automaton at starts; zeros without a specification.
+
+        Args:
+            x: n components of the states, (B,).
+        """
+        if self._product is None:
+            return np.zeros(len(x[0]), dtype=np.int64)
+        return self._product.first_states(self._coordinates(x))
+
+    def next_states(self, k: np.ndarray, x: Components, a: np.ndarray) -> np.ndarray:
+        """Return the states of the automaton after one more reading; as they are without one.
+
+        Args:
+            k: control instants of the reading, int array (B,).
+            x: n components of the states at these instants, (B,).
+            a: states of the automaton before, int array (B,).
+        """
+        if self._product is None:
+            return a
+        return self._product.next_states(np.asarray(k), self._coordinates(x), a)
+
+    def _product_values(
+        self, k: np.ndarray, q: Sequence[np.ndarray], a: np.ndarray | None
+    ) -> np.ndarray:
+        """Return `values` of a specification, at coordinates."""
+        assert self._product is not None
+        a = self._product.first_states(q) if a is None else np.asarray(a)
+        found, cells = self._product.settled(k, q, a), self._table.grid.cell_of(q)
+        open_ = np.isnan(found)
+        rows = np.maximum(k - self._table.first, 0)
+        places = self._product.states.place[a] * self._table.grid.cells + cells
+        values = self._table.lower[rows, np.where(open_, places, 0)]
+        return np.where(open_, np.where(cells >= 0, values, 0.0), found)
+
     def _coordinates(self, x: Components) -> list[np.ndarray]:
         found = self._reduced.of_states(x)
         size = np.broadcast_shapes(*(np.shape(c) for c in x))
@@ -169,82 +217,27 @@ class LookAhead:
             for axis, c in zip(self._table.grid.axes, found, strict=True)
         ]
 
-    def _bounds(self, k: np.ndarray, x: Components, inputs: np.ndarray, sign: int) -> np.ndarray:
+    def _bounds(
+        self,
+        k: np.ndarray,
+        x: Components,
+        inputs: np.ndarray,
+        sign: int,
+        a: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Return bounds under inputs (1 or B, V, m, 2).
 
         A positive sign is for the lower table, a negative one for that of the negative upper one.
         """
         k, q = np.asarray(k), self._coordinates(x)
-        found = np.empty((len(k), inputs.shape[1]))
-        size = max(1, _AT_ONCE // len(self._step.noise.weights))
-        if len(k) > size:
-            for first in range(0, len(k), size):
-                part = slice(first, first + size)
-                own = inputs[part] if len(inputs) > 1 else inputs
-                found[part] = self._bounds(
-                    k[part], tuple(np.asarray(c)[part] for c in x), own, sign
-                )
-            return found
-        if self._step.depends_on_time:
-            for instant in np.unique(k):
-                rows = np.flatnonzero(k == instant)
-                own = inputs[rows] if len(inputs) > 1 else inputs
-                part = np.empty((len(rows), inputs.shape[1]))
-                self._fill(k[rows], [c[rows] for c in q], own, sign, int(instant), part)
-                found[rows] = part
-        elif len(k):
-            self._fill(k, q, inputs, sign, 0, found)
+        if self._product is None:
+            return self._tables.bounds(k, q, inputs, sign, np.zeros(len(k), dtype=np.int64))
+        a = self._product.first_states(q) if a is None else np.asarray(a)
+        known = self._product.settled(k, q, a)
+        found = np.repeat((known if sign > 0 else self._most - known)[:, None], inputs.shape[1], 1)
+        rows = np.flatnonzero(np.isnan(known))
+        if rows.size:
+            own = inputs[rows] if len(inputs) > 1 else inputs
+            places = self._product.states.place[a[rows]]
+            found[rows] = self._tables.bounds(k[rows], [c[rows] for c in q], own, sign, places)
         return found
-
-    def _fill(
-        self,
-        k: np.ndarray,
-        q: Sequence[np.ndarray],
-        inputs: np.ndarray,
-        sign: int,
-        instant: int,
-        found: np.ndarray,
-    ) -> None:
-        rows = np.maximum(k + 1 - self._table.first, 0)
-        for row, instant_ahead in zip(*np.unique(rows, return_index=True), strict=True):
-            self._fill_row(int(row), sign, int(k[instant_ahead]) + 1)
-        images, effects = self._step.images(q, q, inputs, instant * self._reduced.substeps)
-        rest = 0.0 if sign > 0 else -(self._step.noise.rest + self._smoothing.beyond)
-        expected = self._functions["expected_values"]
-
-        def sweep(first: int, last: int, shifts: np.ndarray) -> None:
-            expected(
-                first,
-                last,
-                images,
-                effects,
-                inputs,
-                self._step.noise.weights,
-                rows,
-                self._ahead[sign],
-                rest,
-                *self._means,
-                shifts,
-                found,
-            )
-
-        if found.size * len(self._step.noise.weights) < _LONG:
-            sweep(0, len(k), np.zeros(2 * AXES))
-        else:
-            with ThreadPoolExecutor(threads()) as pool:
-                in_parts(pool, len(k), sweep)
-
-    def _fill_row(self, row: int, sign: int, k: int) -> None:
-        if not self._filled[sign][row]:
-            table = self._table.lower[row] if sign > 0 else -self._table.upper[row]
-            if self._parts is None or self._sets.depend_on_time:
-                self._parts = self._sets.of_cells(self._smoothing.fine, k)
-            counts = self._parts.inside if sign > 0 else self._parts.touches
-            self._ahead[sign][row] = self._smoothing.smoothed(table, counts)
-            self._filled[sign][row] = True
-
-
-_AT_ONCE = 2_000_000
-
-_LONG = 100_000
-"""Expected values of single boxes that take longer than to start threads."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
 
@@ -20,9 +20,12 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components, compile_function
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.automaton import Automaton
+from safe_envs.wrappers.value.automaton_building import problem_automaton
 from safe_envs.wrappers.value.chain import Coordinate, Derivation
 from safe_envs.wrappers.value.known_states import known_states, known_values
 from safe_envs.wrappers.value.one_step import Intervals, sub_step, with_intervals
+from safe_envs.wrappers.value.product_states import keeps_safe
 
 MOST_COORDINATES = 4
 """Axes of a grid that fits into memory."""
@@ -50,6 +53,9 @@ class ReducedProblem:
         steps: control periods of an episode.
         substeps: of a control period.
         box: (low, high) of each input.
+        specification: that an episode is to meet; "" for that of staying safe.
+        automaton: of the specification; None without one.
+        regions: that the specification names, of coordinates and known symbols, >= 0 inside.
         note: why a declared frame is not used, if so.
     """
 
@@ -66,6 +72,9 @@ class ReducedProblem:
     steps: int
     substeps: int
     box: tuple[tuple[float, float], ...]
+    specification: str = ""
+    automaton: Automaton | None = None
+    regions: Mapping[str, sp.Expr] = field(default_factory=dict)
     note: str = ""
 
     @property
@@ -101,7 +110,9 @@ class ReducedProblem:
             sp.srepr(s): hashlib.sha256(v.astype("<f8").tobytes()).hexdigest()
             for s, v in self.known.items()
         }
+        named = [(name, sp.srepr(e)) for name, e in self.regions.items()]
         described = (
+            *([self.specification, named] if self.specification else []),
             [(sp.srepr(c.symbol), c.low, c.high, c.period) for c in self.coordinates],
             [sp.srepr(c.expression) for c in self.coordinates],
             [sp.srepr(s) for s in (*self.problem.plant.states, *self.inputs, *self.noise)],
@@ -118,6 +129,7 @@ def reduced(
     problem: SafetyProblem,
     knowledge: str = "plant",
     intervals: Mapping[str, tuple[float, float]] = _NONE,
+    specification: str = "",
 ) -> ReducedProblem:
     """Reduce a problem to the coordinates that decide what happens.
 
@@ -125,26 +137,33 @@ def reduced(
         problem: with the start, noise and bounds in use.
         knowledge: whose step is taken, that of the "plant" or of the "model".
         intervals: (low, high) of parameters that are uncertain, by name. They stay symbols.
+        specification: that an episode is to meet; "" for that of staying safe.
 
     Returns:
         The chain of a simulation in these coordinates.
 
     Raises:
         ConfigurationError: there are too many coordinates for a grid, or one that has neither
-            bounds nor a period; or an argument is not allowed.
+            bounds nor a period; or an argument is not allowed; or the text is no specification
+            over the problem's sets.
     """
     worlds = {"plant": problem.plant, "model": problem.model}
     if knowledge not in worlds:
         raise ConfigurationError(f"knowledge = {shown(knowledge)}; {nearest(knowledge, worlds)}")
+    automaton = problem_automaton(problem, specification) if specification else None
+    regions = () if automaton is None else tuple(a for a in automaton.atoms if a in problem.regions)
     system, uncertain = with_intervals(worlds[knowledge], intervals)
     foreknown = known_states(problem, system)
     free = [s for s in problem.plant.states if s not in foreknown]
     if problem.frame is None:
         _require_few(problem, free)
     noise, moved = sub_step(system, problem.dt / problem.substeps)
-    derivation = Derivation(problem, system, uncertain, noise, moved, frozenset(foreknown))
+    derivation = Derivation(problem, system, uncertain, noise, moved, frozenset(foreknown), regions)
     chain, note = derivation.in_states(), ""
-    if problem.frame is not None:
+    if problem.frame is not None and automaton is not None and not keeps_safe(automaton):
+        # Frames are checked at safe states only.
+        note = f"the frame of {problem.name} is not used: the specification allows unsafe states"
+    elif problem.frame is not None:
         framed, note = derivation.in_frame(problem.frame)
         chain = framed or chain
     _require_few(problem, [c.symbol for c in chain.coordinates], note)
@@ -165,6 +184,9 @@ def reduced(
         steps=problem.steps,
         substeps=problem.substeps,
         box=problem.box,
+        specification=specification,
+        automaton=automaton,
+        regions=chain.regions,
         note=note,
     )
 

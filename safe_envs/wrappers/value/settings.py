@@ -22,6 +22,8 @@ class ValueSettings:
             or as "safe", which is how `evaluate` counts it.
         intervals: of parameters that are uncertain; values hold for the worst ones, which may
             change at every step.
+        specification: that an episode is to meet, over the sets that the problem names, such as
+            "always safe & eventually goal"; "" for that of staying safe.
         cells: number along each coordinate; None for numbers that suit the problem.
         inputs: number of inputs that are scanned along each input; None for one that suits.
         memory: in bytes, which the tables must not exceed.
@@ -33,6 +35,7 @@ class ValueSettings:
     knowledge: str = "model"
     leaving: str = "violation"
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    specification: str = ""
     cells: tuple[int, ...] | None = None
     inputs: int | None = None
     memory: float = 4e9
@@ -42,6 +45,11 @@ class ValueSettings:
             given = getattr(self, name)
             if given not in allowed:
                 raise ConfigurationError(f"{name} = {shown(given)}; {nearest(str(given), allowed)}")
+        if not isinstance(self.specification, str):
+            raise ConfigurationError(
+                f"specification = {shown(self.specification)}; give text, such as"
+                ' "always safe & eventually goal"'
+            )
         if self.cells is not None:
             object.__setattr__(self, "cells", tuple(self.cells))
             for count in self.cells:
@@ -58,6 +66,7 @@ class ValueSettings:
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able data."""
         return {
+            "specification": self.specification,
             "knowledge": self.knowledge,
             "leaving": self.leaving,
             "intervals": {name: list(pair) for name, pair in self.intervals.items()},

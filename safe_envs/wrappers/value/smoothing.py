@@ -92,11 +92,27 @@ class Smoothing:
             values: on the cells of the grid, shape (cells,), float32; 0 is outside.
             counts: which parts of cells count, shape (cells of `fine`,).
         """
+        return self.blurred(np.where(counts, self.on_parts(values), np.float32(0.0)))
+
+    def on_parts(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the cells for each of their parts, shape (cells of `fine`,).
+
+        Args:
+            values: on the cells of the grid, shape (cells,).
+        """
         found = values.reshape(self._shape)
         for i, cut in enumerate(self.parts):
             if cut > 1:
                 found = np.repeat(found, cut, axis=i)
-        found = np.where(counts.reshape(found.shape), found, np.float32(0.0))
+        return found.reshape(-1)
+
+    def blurred(self, values: np.ndarray) -> np.ndarray:
+        """Return lower bounds of the expected values on the grid of means, float32.
+
+        Args:
+            values: on the parts of the cells, shape (cells of `fine`,), float32; 0 is outside.
+        """
+        found = values.reshape(self.fine.shape)
         if not self._blurs:
             return found.reshape(-1)
         for i, blocks in self._blurs:

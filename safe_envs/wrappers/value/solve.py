@@ -29,6 +29,7 @@ from safe_envs.wrappers.value.reduction import ReducedProblem, reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.smoothing import Smoothing, rounded_down
+from safe_envs.wrappers.value.specification_operator import SpecificationOperator
 from safe_envs.wrappers.value.step_images import Step, StepImages
 from safe_envs.wrappers.value.suitable_grid import suitable_grid
 from safe_envs.wrappers.value.sweeps import bellman_functions, in_parts, threads
@@ -43,7 +44,7 @@ _SMALL = 1_000_000
 def solve(
     problem: SafetyProblem, settings: ValueSettings | None = None, progress: Progress | None = None
 ) -> ValueTable:
-    """Compute envelopes of the largest probability to stay safe.
+    """Compute envelopes of the largest probability to stay safe, or to meet a specification.
 
     Args:
         problem: whose plant or model is taken.
@@ -55,10 +56,10 @@ def solve(
 
     Raises:
         ConfigurationError: The problem has too many coordinates, or unbounded ones, or the tables
-            do not fit the memory.
+            do not fit the memory; or what is specified is no specification over its sets.
     """
     settings = settings or ValueSettings()
-    small = reduced(problem, settings.knowledge, settings.intervals)
+    small = reduced(problem, settings.knowledge, settings.intervals, settings.specification)
     return _Solver(small, settings).run(progress)
 
 
@@ -74,7 +75,14 @@ class _Solver:
         small, grid = self._reduced, self._grid
         smoothing = Smoothing(grid, self._step.blur)
         with ThreadPoolExecutor(threads(), "safe_envs_values") as pool:
-            rows = self._rows(_Operator(self, smoothing, pool), progress)
+            operator = (
+                _Operator(self, smoothing, pool)
+                if small.automaton is None
+                else SpecificationOperator(
+                    small, self._settings.leaving, grid, self._step, self._scanned, pool
+                )
+            )
+            rows = self._rows(operator, progress)
         lower, upper = (np.stack(each[::-1]) for each in zip(*rows, strict=True))
         return ValueTable(
             small.problem.name,
@@ -89,15 +97,15 @@ class _Solver:
         )
 
     def _rows(
-        self, operator: _Operator, progress: Progress | None
+        self, operator: _Operator | SpecificationOperator, progress: Progress | None
     ) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return both envelopes at the instants K, K - 1, ..., down to where they stop changing."""
         steps = self._reduced.steps
-        last = operator.cells(steps).touches.astype(np.float32)
-        rows = [(last, last)]
+        rows = [operator.last()]
         for k in range(steps - 1, -1, -1):
             rows.append(operator.applied(*rows[-1], k))
-            if operator.is_constant and all(map(np.array_equal, rows[-1], rows[-2])):
+            same = all(map(np.array_equal, rows[-1], rows[-2]))
+            if same and not operator.changes_before(k):
                 rows.pop()
                 break
             if progress:
@@ -125,6 +133,16 @@ class _Operator:
         self._leader = np.zeros(len(self._numbers), dtype=np.int64)
         self._rival = np.full(len(self._numbers), 2.0)
         self._turn = 0
+
+    def last(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return both envelopes at the instant K."""
+        found = self.cells(self._reduced.steps).touches.astype(np.float32)
+        return found, found
+
+    def changes_before(self, k: int) -> bool:
+        """Return whether steps to instants before k are others than that to k."""
+        del k
+        return not self.is_constant
 
     def cells(self, k: int) -> CellSets:
         """Return what the cells lie in at a control instant."""

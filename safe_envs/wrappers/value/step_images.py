@@ -93,6 +93,11 @@ class Step:
         self.noise: NoiseBoxes = noise_boxes(self._intervals())
 
     @property
+    def substeps(self) -> int:
+        """Sub-steps of a control period."""
+        return self._reduced.substeps
+
+    @property
     def scenarios(self) -> int:
         """Number of boxes of the uncertain parameters."""
         return len(self._scenarios)

@@ -7,9 +7,10 @@ import math
 import numpy as np
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.value.cell_sets import Sets, hull_of
+from safe_envs.wrappers.value.cell_sets import Sets, hull_of, workspace_of
 from safe_envs.wrappers.value.grid import Axis, Grid
 from safe_envs.wrappers.value.margin import with_margin
+from safe_envs.wrappers.value.product_states import ProductStates, keeps_safe
 from safe_envs.wrappers.value.reduction import ReducedProblem
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.settings import ValueSettings
@@ -27,7 +28,7 @@ _BYTES = 8
 
 
 def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, step: Step) -> Grid:
-    """Return a grid over the safe part of the workspace.
+    """Return a grid over the safe part of the workspace, or all of it where that counts.
 
     Coordinates that a step changes little get narrow cells, since a cell's width acts like a
     disturbance of the step.
@@ -42,7 +43,12 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
         ConfigurationError: The numbers of cells do not fit the problem or the memory.
     """
     n = len(small.coordinates)
-    hull = hull_of(small, sets)
+    states, everywhere = 1, False
+    if small.automaton is not None:
+        states = len(ProductStates(small.automaton).live)
+        # What lies outside of the grid is lost, or else the grid has to cover the workspace.
+        everywhere = settings.leaving != "violation" or not keeps_safe(small.automaton)
+    hull = workspace_of(small) if everywhere else hull_of(small, sets)
     ends = [(float(edges[0]), float(edges[-1])) for edges in hull]
     if settings.cells is not None and len(settings.cells) != n:
         names = ", ".join(str(c.symbol) for c in small.coordinates)
@@ -50,7 +56,8 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
             f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has {n}"
             f" coordinates ({names}): give a number for each"
         )
-    most = int(settings.memory / 2 / (_BYTES * (small.steps + 1) + _working(small, settings, step)))
+    working = _working(small, settings, step)
+    most = int(settings.memory / 2 / states / (_BYTES * (small.steps + 1) + working))
     counts = settings.cells or _counts(small, ends, step, min(_usual(n, step), most))
     _require_room(math.prod(counts), most, small, settings)
     cut = [_cut(edges, count) for edges, count in zip(hull, counts, strict=True)]

@@ -25,6 +25,8 @@ class ValueTable:
         inputs: that were scanned, in physical units, shape (U, m).
         first: control instant of the first one.
         lower: lower envelope, shape (K + 1 - first, cells), float32 in [0, 1]; 0 outside the grid.
+            With a specification shape (K + 1 - first, states cells): the cells of each of the
+            states of the automaton that are not settled, one state after the other.
         upper: upper envelope, of the same shape.
         seconds: that the computation took.
     """
@@ -43,6 +45,11 @@ class ValueTable:
     def steps(self) -> int:
         """Control periods of an episode, K."""
         return self.first + len(self.lower) - 1
+
+    @property
+    def states(self) -> int:
+        """States of the automaton that the tables hold values of; 1 without a specification."""
+        return self.lower.shape[1] // self.grid.cells
 
     @property
     def memory(self) -> int:

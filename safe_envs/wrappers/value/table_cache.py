@@ -65,7 +65,9 @@ def table_for(
     folder = cache_folder(FOLDER)
     if folder is None:
         return solve(problem, settings, progress)
-    fingerprint = reduced(problem, settings.knowledge, settings.intervals).fingerprint
+    fingerprint = reduced(
+        problem, settings.knowledge, settings.intervals, settings.specification
+    ).fingerprint
     place = folder / f"{_key(fingerprint, settings)}.npz"
     table = _kept(place, fingerprint)
     if table is not None:

@@ -13,6 +13,7 @@ from safe_envs.array_files import checksum, reading, write_arrays
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT
 from safe_envs.errors import ConfigurationError, shortened, shown
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.automaton_building import MOST_STATES
 from safe_envs.wrappers.value.grid import Axis, Grid
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
@@ -121,7 +122,9 @@ def require_asked(path: Path, table: ValueTable, settings: ValueSettings) -> Non
 def _require_problem(path: Path, table: ValueTable, problem: SafetyProblem) -> None:
     settings = table.settings
     try:
-        expected = reduced(problem, settings.knowledge, settings.intervals).fingerprint
+        expected = reduced(
+            problem, settings.knowledge, settings.intervals, settings.specification
+        ).fingerprint
     except ConfigurationError:  # It has no such parameters, or other coordinates.
         expected = ""
     if table.fingerprint != expected:
@@ -207,7 +210,10 @@ def _require_values(table: ValueTable) -> None:
         raise ValueError("the inputs are no table of numbers")
     if not axes or not inputs.size or not np.isfinite(table.seconds) or table.seconds < 0:
         raise ValueError("it has no axis, no input, or no time")
-    shape = (len(table.lower), table.grid.cells)
+    states = table.states if table.lower.ndim == 2 else 1
+    if not (states == 1 or (table.settings.specification and 1 <= states <= MOST_STATES)):
+        raise ValueError("it holds values of states that no specification has")
+    shape = (len(table.lower), states * table.grid.cells)
     for values in (table.lower, table.upper):
         if values.dtype != np.float32 or values.shape != shape or not values.size:
             raise ValueError(f"an envelope is no table of {shape} values")

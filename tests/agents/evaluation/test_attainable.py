@@ -35,7 +35,7 @@ def empty_cache(monkeypatch, tmp_path):
 
 def made_up(lower, upper) -> AttainableSafety:
     return AttainableSafety(
-        lower, upper, None, "", "plant", "violation", ("x",), (3,), 2, 10, 1.0, 80
+        lower, upper, None, "", "plant", "violation", "", ("x",), (3,), 2, 10, 1.0, 80
     )
 
 
