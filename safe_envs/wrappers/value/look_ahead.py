@@ -24,6 +24,9 @@ from safe_envs.wrappers.value.table import ValueTable
 class LookAhead:
     """Reads a table at states of the plant, in batches.
 
+    Where states that are known in advance are not what the table assumes of them, as after another
+    start, lower bounds are 0 and upper ones 1.
+
     Args:
         table: of the problem.
         problem: the problem.
@@ -52,6 +55,12 @@ class LookAhead:
         self._parts: CellSets | None = None
         self._functions = bellman_functions()
         self._scanned = scanned_inputs(small.box, settings.inputs)
+        if not np.array_equal(self._scanned.values, table.inputs):
+            # Then the largest of the scanned bounds might be below the table.
+            raise ConfigurationError(
+                f"the table of {table.problem} was computed with other inputs than are scanned now;"
+                " compute it again"
+            )
         cells = self._smoothing.means.cells
         self._ahead = {
             sign: np.empty((len(table.lower), cells), dtype=np.float32) for sign in (1, -1)
@@ -75,7 +84,8 @@ class LookAhead:
         cells = self._table.grid.cell_of(q)
         rows = np.maximum(np.asarray(k) - self._table.first, 0)
         inside, _ = self._sets.of_states(k, q)
-        return np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
+        found = np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
+        return self._where_assumed(k, x, found)
 
     def expected(self, k: np.ndarray, x: Components, u: np.ndarray) -> np.ndarray:
         """Return lower bounds of the expected next value of the lower envelope.
@@ -88,7 +98,7 @@ class LookAhead:
         Returns:
             Shape (B, V).
         """
-        return self._bounds(k, x, np.stack([u, u], axis=-1), 1)
+        return self._where_assumed(k, x, self._bounds(k, x, np.stack([u, u], axis=-1), 1))
 
     def scanned(self, k: np.ndarray, x: Components) -> np.ndarray:
         """Return `expected` for all scanned inputs.
@@ -100,7 +110,7 @@ class LookAhead:
         Returns:
             Shape (B, U).
         """
-        return self._bounds(k, x, self._scanned.ends, 1)
+        return self._where_assumed(k, x, self._bounds(k, x, self._scanned.ends, 1))
 
     def largest(self, k: np.ndarray, x: Components) -> np.ndarray:
         """Return upper bounds of the expected next value under any input.
@@ -112,7 +122,8 @@ class LookAhead:
         Returns:
             Shape (B,).
         """
-        return -self._bounds(k, x, self._scanned.boxes, -1).min(axis=1)
+        found = -self._bounds(k, x, self._scanned.boxes, -1).min(axis=1)
+        return self._where_assumed(k, x, found, 1.0)
 
     def best_input(self, k: np.ndarray, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return the scanned inputs of the largest bound, and these bounds.
@@ -126,7 +137,7 @@ class LookAhead:
         Returns:
             Shapes (B, m) and (B,).
         """
-        lower = self.scanned(k, x)
+        lower = self._bounds(k, x, self._scanned.ends, 1)
         chosen = lower.argmax(axis=1)
         best = np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
         silent = np.flatnonzero(best <= 0.0)
@@ -134,10 +145,12 @@ class LookAhead:
             part = tuple(np.asarray(c)[silent] for c in x)
             upper = -self._bounds(np.asarray(k)[silent], part, self._scanned.ends, -1)
             chosen[silent] = upper.argmax(axis=1)
-        return self.inputs[chosen], best
+        return self.inputs[chosen], self._where_assumed(k, x, best)
 
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
+
+        An episode does not end at its start: from a start in the goal it takes a step too.
 
         Args:
             x: n components of the states, (B,).
@@ -146,9 +159,8 @@ class LookAhead:
             Lower and upper bounds, shape (B,).
         """
         k = np.zeros(len(x[0]), dtype=np.int64)
-        inside, ends = self.sets_at(k, x)
-        lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
-        upper = np.where(ends, 1.0, self.largest(k, x))
+        inside, _ = self.sets_at(k, x)
+        lower, upper = self.scanned(k, x).max(axis=1), self.largest(k, x)
         near = self._sets.may_hold(k, self._coordinates(x))
         return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(near, upper, 0.0).clip(0, 1)
 
@@ -160,6 +172,15 @@ class LookAhead:
             x: n components of the states, (B,).
         """
         return self._sets.of_states(k, self._coordinates(x))
+
+    def _where_assumed(
+        self, k: np.ndarray, x: Components, found: np.ndarray, otherwise: float = 0.0
+    ) -> np.ndarray:
+        """Return what was found where known states are as the table assumes."""
+        if not self._reduced.assumed:
+            return found
+        assumed = self._reduced.is_assumed(np.asarray(k), x)
+        return np.where(assumed.reshape(-1, *[1] * (found.ndim - 1)), found, otherwise)
 
     def _coordinates(self, x: Components) -> list[np.ndarray]:
         found = self._reduced.of_states(x)

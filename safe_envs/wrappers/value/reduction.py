@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -20,12 +21,15 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components, compile_function
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.chain import Coordinate, Derivation
+from safe_envs.wrappers.value.chain import Chain, Coordinate, Derivation
 from safe_envs.wrappers.value.known_states import known_states, known_values
 from safe_envs.wrappers.value.one_step import Intervals, sub_step, with_intervals
 
 MOST_COORDINATES = 4
 """Axes of a grid that fits into memory."""
+
+_ROUNDING = 1e-6
+"""By which known states may differ from what they are to be: that of single precision."""
 
 _NONE: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
@@ -51,6 +55,8 @@ class ReducedProblem:
         substeps: of a control period.
         box: (low, high) of each input.
         note: why a declared frame is not used, if so.
+        assumed: what the known states are at each control instant, by their index in the plant's
+            states, shape (steps + 1,), also those that never change; all that the chain depends on.
     """
 
     problem: SafetyProblem
@@ -67,6 +73,26 @@ class ReducedProblem:
     substeps: int
     box: tuple[tuple[float, float], ...]
     note: str = ""
+    assumed: Mapping[int, np.ndarray] = field(default_factory=dict)
+
+    def is_assumed(self, k: np.ndarray, x: Components) -> np.ndarray:
+        """Return whether the known states of states are those of the chain.
+
+        They are in all episodes from the problem's own start, and need not be in those that begin
+        elsewhere, to which nothing here applies then.
+
+        Args:
+            k: control instants, int array (B,).
+            x: arrays (B,) of the plant's states.
+
+        Returns:
+            Shape (B,).
+        """
+        found = np.ones(len(k), dtype=bool)
+        for i, values in self.assumed.items():
+            expected = values[k]
+            found &= np.abs(x[i] - expected) <= _ROUNDING * (1.0 + np.abs(expected))
+        return found
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:
@@ -149,6 +175,7 @@ def reduced(
         chain = framed or chain
     _require_few(problem, [c.symbol for c in chain.coordinates], note)
     known, constant = known_values(problem, foreknown, derivation.following)
+    assumed = _assumed(problem, chain, derivation.following, {**known, **constant})
     chain = chain.with_numbers(constant).with_periods()
     used = set().union(*(e.free_symbols for e in chain.expressions))
     return ReducedProblem(
@@ -166,7 +193,30 @@ def reduced(
         substeps=problem.substeps,
         box=problem.box,
         note=note,
+        assumed=assumed,
     )
+
+
+def _assumed(
+    problem: SafetyProblem,
+    chain: Chain,
+    following: Mapping[sp.Symbol, Any],
+    values: Mapping[sp.Symbol, Any],
+) -> Mapping[int, np.ndarray]:
+    """Return the values of the known states on which a chain depends, also through others."""
+    used: set[Any] = set()
+    found: set[Any] = set().union(*(e.free_symbols for e in chain.expressions))
+    while found - used:
+        used |= found
+        found = set().union(*(following[s].free_symbols for s in used if s in following))
+        found &= values.keys()
+    return {
+        i: np.broadcast_to(
+            np.asarray(values[s], dtype=float), problem.steps * problem.substeps + 1
+        )[:: problem.substeps]
+        for i, s in enumerate(problem.plant.states)
+        if s in used and s in values
+    }
 
 
 def _require_few(problem: SafetyProblem, coordinates: Sequence[sp.Symbol], note: str = "") -> None:
