@@ -95,7 +95,7 @@ class Sets:
         shape = np.shape(q[0])
         inside, ends = np.ones(shape, dtype=bool), np.zeros(shape, dtype=bool)
         for h in values[: self._barriers]:
-            inside &= h.low >= 0.0
+            inside &= h.low > 0.0
         outside = values[self._barriers]
         if self._stays:
             inside &= outside.high <= _TINY
@@ -153,7 +153,7 @@ class Sets:
         shape = low[0].shape
         found = CellSets(*(np.full(shape, given) for given in (True, True, False, False)))
         for h in barriers:
-            np.logical_and(found.inside, h.low >= 0.0, out=found.inside)
+            np.logical_and(found.inside, h.low > 0.0, out=found.inside)
             np.logical_and(found.touches, h.high >= 0.0, out=found.touches)
         if self._stays:
             np.logical_and(found.inside, outside.high <= _ROUNDING, out=found.inside)

@@ -10,8 +10,13 @@ import numpy as np
 from safe_envs.wrappers.value.expected_value_kernel import AXES
 from safe_envs.wrappers.value.grid import Grid
 
-_SLACK = 1e-13
-"""Of the extent of an axis: how far rounding may carry a sum of a few numbers."""
+POINT_SLACK = 4e-7
+"""Of the largest number of an axis: how far a state and an input may be off that pass through
+single precision, as observations and actions do."""
+
+CELL_SLACK = 1e-6
+"""The same for cells: a state that is read off an observation may lie next to its cell by the
+slack of a point, and goes as far as that from there."""
 
 
 class GridArrays(NamedTuple):
@@ -24,7 +29,7 @@ class GridArrays(NamedTuple):
         places: of all axes, see `Axis.places`, int32.
         edges: of all axes.
         scales: for each axis the first edge, the entries of `places` for a unit, the period, and
-            how far sums may be rounded; shape (AXES, 4).
+            by how much intervals are widened; shape (AXES, 4).
     """
 
     counts: np.ndarray
@@ -33,11 +38,14 @@ class GridArrays(NamedTuple):
     scales: np.ndarray
 
 
-def grid_arrays(grid: Grid, blocks: Sequence[int] | None = None) -> GridArrays:
+def grid_arrays(
+    grid: Grid, slack: float = POINT_SLACK, blocks: Sequence[int] | None = None
+) -> GridArrays:
     """Return a grid as arrays.
 
     Args:
         grid: to describe.
+        slack: by which intervals are widened, of the largest number of an axis.
         blocks: cells along each axis for which an entry of the tables stands; None for one.
     """
     counts = np.zeros((5, AXES), dtype=np.int64)
@@ -51,7 +59,7 @@ def grid_arrays(grid: Grid, blocks: Sequence[int] | None = None) -> GridArrays:
         extent = axis.edges[-1] - axis.edges[0]
         counts[:4, i] = axis.count, first_edge, first_place, len(axis.places)
         size = max(abs(axis.edges[0]), abs(axis.edges[-1]))
-        scales[i] = axis.edges[0], len(axis.places) / extent, axis.period, _SLACK * size
+        scales[i] = axis.edges[0], len(axis.places) / extent, axis.period, slack * size
         first_edge += axis.count + 1
         first_place += len(axis.places)
     return GridArrays(counts.ravel(), places, edges, scales)

@@ -87,8 +87,8 @@ class ImageWriter:
             raise NotCompilableError(f"there is no kernel for the power {exponent}")
         if exponent % 2:
             rest = self.value(base) if exponent == 1 else self.value(sp.Pow(base, exponent - 1))
-            return rest if exponent == 1 else self._call(
-                kernels.ends_product, rest, self.value(base)
+            return (
+                rest if exponent == 1 else self._call(kernels.ends_product, rest, self.value(base))
             )
         half = self.value(base if exponent == 2 else sp.Pow(base, exponent / 2))
         return self._call(kernels.ends_square, half)
@@ -137,7 +137,9 @@ def image_source(
     }
     writer = ImageWriter(arguments)
     moved = [writer.value(e)[1] for e in rest]
-    effects = [(i, j, writer.value(e)[1]) for i, row in enumerate(effect) for j, e in enumerate(row)]
+    effects = [
+        (i, j, writer.value(e)[1]) for i, row in enumerate(effect) for j, e in enumerate(row)
+    ]
     lines = writer.lines
     for i, j, name in effects:
         # An infinite effect of an input that is 0 would be no number.

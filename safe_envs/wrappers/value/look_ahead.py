@@ -22,6 +22,9 @@ from safe_envs.wrappers.value.table import ValueTable
 class LookAhead:
     """Reads a table at states of the plant, in batches.
 
+    Where states that are known in advance are not what the table assumes of them, as after another
+    start, lower bounds are 0 and upper ones 1.
+
     Args:
         table: of the problem.
         problem: the problem.
@@ -55,6 +58,12 @@ class LookAhead:
         self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
         self._noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
+        if not np.array_equal(self._scanned.values, table.inputs):
+            # Then the largest of the scanned bounds might be below the table.
+            raise ConfigurationError(
+                f"the table of {table.problem} was computed with other inputs than are scanned now;"
+                " compute it again"
+            )
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
 
     @property
@@ -76,7 +85,8 @@ class LookAhead:
         cells = self._table.grid.cell_of(q)
         rows = np.maximum(np.asarray(k) - self._table.first, 0)
         inside, _ = self._sets.of_states(k, q)
-        return np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
+        found = np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
+        return self._where_assumed(k, x, found)
 
     def expected(
         self, k: np.ndarray, x: Components, u: np.ndarray, a: np.ndarray | None = None
@@ -92,7 +102,7 @@ class LookAhead:
         Returns:
             Shape (B, V).
         """
-        return self._bounds(k, x, np.stack([u, u], axis=-1), 1, a)
+        return self._where_assumed(k, x, self._bounds(k, x, np.stack([u, u], axis=-1), 1, a))
 
     def scanned(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return `expected` for all scanned inputs.
@@ -105,7 +115,7 @@ class LookAhead:
         Returns:
             Shape (B, U).
         """
-        return self._bounds(k, x, self._scanned.ends, 1, a)
+        return self._where_assumed(k, x, self._bounds(k, x, self._scanned.ends, 1, a))
 
     def largest(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return upper bounds of the expected next value under any input.
@@ -118,7 +128,8 @@ class LookAhead:
         Returns:
             Shape (B,).
         """
-        return self._most - self._bounds(k, x, self._scanned.boxes, -1, a).min(axis=1)
+        found = self._most - self._bounds(k, x, self._scanned.boxes, -1, a).min(axis=1)
+        return self._where_assumed(k, x, found, 1.0)
 
     def best_input(
         self, k: np.ndarray, x: Components, a: np.ndarray | None = None
@@ -135,7 +146,7 @@ class LookAhead:
         Returns:
             Shapes (B, m) and (B,).
         """
-        lower = self.scanned(k, x, a)
+        lower = self._bounds(k, x, self._scanned.ends, 1, a)
         chosen = lower.argmax(axis=1)
         best = np.take_along_axis(lower, chosen[:, None], axis=1)[:, 0]
         silent = np.flatnonzero(best <= 0.0)
@@ -144,7 +155,7 @@ class LookAhead:
             own = None if a is None else np.asarray(a)[silent]
             upper = -self._bounds(np.asarray(k)[silent], part, self._scanned.ends, -1, own)
             chosen[silent] = upper.argmax(axis=1)
-        return self.inputs[chosen], best
+        return self.inputs[chosen], self._where_assumed(k, x, best)
 
     def caps(
         self,
@@ -173,11 +184,15 @@ class LookAhead:
         found = np.full(len(k), np.inf)
         rows = np.flatnonzero(np.isnan(self._product.settled(k, q, a)))
         places = self._product.states.place[a[rows]]
-        found[rows] = self._tables.caps(k[rows], [c[rows] for c in q], u[rows], levels[rows], places)
+        found[rows] = self._tables.caps(
+            k[rows], [c[rows] for c in q], u[rows], levels[rows], places
+        )
         return found
 
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
+
+        An episode does not end at its start: from a start in the goal it takes a step too.
 
         Args:
             x: n components of the states, (B,).
@@ -189,9 +204,8 @@ class LookAhead:
         if self._product is not None:
             lower, upper = self.scanned(k, x).max(axis=1), self.largest(k, x)
             return lower.clip(0.0, 1.0), upper.clip(0.0, 1.0)
-        inside, ends = self.sets_at(k, x)
-        lower = np.where(ends, 1.0, self.scanned(k, x).max(axis=1))
-        upper = np.where(ends, 1.0, self.largest(k, x))
+        inside, _ = self.sets_at(k, x)
+        lower, upper = self.scanned(k, x).max(axis=1), self.largest(k, x)
         near = self._sets.may_hold(k, self._coordinates(x))
         return np.where(inside, lower, 0.0).clip(0.0, 1.0), np.where(near, upper, 0.0).clip(0, 1)
 
@@ -238,6 +252,15 @@ class LookAhead:
         places = self._product.states.place[a] * self._table.grid.cells + cells
         values = self._table.lower[rows, np.where(open_, places, 0)]
         return np.where(open_, np.where(cells >= 0, values, 0.0), found)
+
+    def _where_assumed(
+        self, k: np.ndarray, x: Components, found: np.ndarray, otherwise: float = 0.0
+    ) -> np.ndarray:
+        """Return what was found where known states are as the table assumes."""
+        if not self._reduced.assumed:
+            return found
+        assumed = self._reduced.is_assumed(np.asarray(k), x)
+        return np.where(assumed.reshape(-1, *[1] * (found.ndim - 1)), found, otherwise)
 
     def _coordinates(self, x: Components) -> list[np.ndarray]:
         found = self._reduced.of_states(x)

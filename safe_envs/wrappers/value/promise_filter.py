@@ -20,7 +20,8 @@ stops p at a value of at most 1.
 *What the guarantee is of.* The table's chain: that of the model, with knowledge = "plant" that of
 the plant. Where the two differ, E L_{k+1} is another number under the plant, and nothing is
 guaranteed; a filter that is robust over intervals of parameters covers the plants within them. It
-covers control instants, not what lies between them, up to step K.
+covers control instants, not what lies between them, up to step K. Beyond K p_k is 0: it is not
+renewed.
 
 *Without a guarantee*, outside C, after the end of an episode, or where the table is 0, p_k is 0,
 the filter says that it is infeasible, and it executes the input of the largest table value.

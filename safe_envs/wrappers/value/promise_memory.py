@@ -96,7 +96,8 @@ class PromiseMemory:
         Returns:
             The decisions in components. All barriers share one constraint and its slack.
         """
-        wanted = np.where(self._ended, 0.0, self.levels)
+        # Beyond the last instant of the table nothing is kept.
+        wanted = np.where(self._ended | (self._instants > self._last), 0.0, self.levels)
         k = np.minimum(self._instants, self._last)
         action, expected, level, replaced = self.safety_filter.choose(k, wanted, x, u)
         self._expected, self.levels = expected, level
@@ -144,7 +145,7 @@ class PromiseMemory:
         """Put each episode where a snapshot has it.
 
         Raises:
-            InvalidInputError: The snapshot is of envs without a promise filter.
+            InvalidInputError: The snapshot is of envs without a promise filter, or of none.
         """
         missing = [name for name in _NAMES if name not in snapshot]
         if missing:
@@ -153,8 +154,19 @@ class PromiseMemory:
                 " take one of envs with it"
             )
         instants, levels, ended = [np.array(snapshot[name]) for name in _NAMES]
+        levels, shape = levels.astype(float), self.levels.shape
+        if not (
+            instants.shape == levels.shape == ended.shape == shape
+            and instants.min() >= 0
+            and levels.min() >= 0.0
+            and levels.max() <= 1.0
+        ):
+            raise InvalidInputError(
+                f"the snapshot has no instant and no promise in [0, 1] for each of {shape[0]} envs;"
+                " take one of envs with a promise filter"
+            )
         self._instants, self._ended = instants.astype(np.int64), ended.astype(bool)
-        self.levels = levels.astype(float)
+        self.levels = levels
 
 
 def _arrays(components: Sequence[Any]) -> Components:

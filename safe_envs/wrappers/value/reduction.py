@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -22,13 +23,16 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.automaton import Automaton
 from safe_envs.wrappers.value.automaton_building import problem_automaton
-from safe_envs.wrappers.value.chain import Coordinate, Derivation
+from safe_envs.wrappers.value.chain import Chain, Coordinate, Derivation
 from safe_envs.wrappers.value.known_states import known_states, known_values
 from safe_envs.wrappers.value.one_step import Intervals, sub_step, with_intervals
 from safe_envs.wrappers.value.product_states import keeps_safe
 
 MOST_COORDINATES = 4
 """Axes of a grid that fits into memory."""
+
+_ROUNDING = 1e-6
+"""By which known states may differ from what they are to be: that of single precision."""
 
 _NONE: Mapping[str, tuple[float, float]] = MappingProxyType({})
 
@@ -57,6 +61,8 @@ class ReducedProblem:
         automaton: of the specification; None without one.
         regions: that the specification names, of coordinates and known symbols, >= 0 inside.
         note: why a declared frame is not used, if so.
+        assumed: what the known states are at each control instant, by their index in the plant's
+            states, shape (steps + 1,), also those that never change; all that the chain depends on.
     """
 
     problem: SafetyProblem
@@ -76,6 +82,26 @@ class ReducedProblem:
     automaton: Automaton | None = None
     regions: Mapping[str, sp.Expr] = field(default_factory=dict)
     note: str = ""
+    assumed: Mapping[int, np.ndarray] = field(default_factory=dict)
+
+    def is_assumed(self, k: np.ndarray, x: Components) -> np.ndarray:
+        """Return whether the known states of states are those of the chain.
+
+        They are in all episodes from the problem's own start, and need not be in those that begin
+        elsewhere, to which nothing here applies then.
+
+        Args:
+            k: control instants, int array (B,).
+            x: arrays (B,) of the plant's states.
+
+        Returns:
+            Shape (B,).
+        """
+        found = np.ones(len(k), dtype=bool)
+        for i, values in self.assumed.items():
+            expected = values[k]
+            found &= np.abs(x[i] - expected) <= _ROUNDING * (1.0 + np.abs(expected))
+        return found
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:
@@ -168,6 +194,7 @@ def reduced(
         chain = framed or chain
     _require_few(problem, [c.symbol for c in chain.coordinates], note)
     known, constant = known_values(problem, foreknown, derivation.following)
+    assumed = _assumed(problem, chain, derivation.following, {**known, **constant})
     chain = chain.with_numbers(constant).with_periods()
     used = set().union(*(e.free_symbols for e in chain.expressions))
     return ReducedProblem(
@@ -188,7 +215,30 @@ def reduced(
         automaton=automaton,
         regions=chain.regions,
         note=note,
+        assumed=assumed,
     )
+
+
+def _assumed(
+    problem: SafetyProblem,
+    chain: Chain,
+    following: Mapping[sp.Symbol, Any],
+    values: Mapping[sp.Symbol, Any],
+) -> Mapping[int, np.ndarray]:
+    """Return the values of the known states on which a chain depends, also through others."""
+    used: set[Any] = set()
+    found: set[Any] = set().union(*(e.free_symbols for e in chain.expressions))
+    while found - used:
+        used |= found
+        found = set().union(*(following[s].free_symbols for s in used if s in following))
+        found &= values.keys()
+    return {
+        i: np.broadcast_to(
+            np.asarray(values[s], dtype=float), problem.steps * problem.substeps + 1
+        )[:: problem.substeps]
+        for i, s in enumerate(problem.plant.states)
+        if s in used and s in values
+    }
 
 
 def _require_few(problem: SafetyProblem, coordinates: Sequence[sp.Symbol], note: str = "") -> None:

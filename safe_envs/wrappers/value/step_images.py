@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.intervals import Interval, interval_function
 from safe_envs.compiled.program import Program, is_available
+from safe_envs.dynamics.intervals import Interval, interval_function
 from safe_envs.errors import ConfigurationError, NotCompilableError
 from safe_envs.wrappers.value.image_kernel import point_images
 from safe_envs.wrappers.value.image_source import image_source

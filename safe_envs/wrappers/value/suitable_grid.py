@@ -22,6 +22,9 @@ _CELLS = {1: 4000, 2: 1_000_000, 3: 500_000, 4: 600_000}
 _LESS = 0.95
 """How the number of cells falls with that of the images of a cell."""
 
+_FILLED = 0.95
+"""Of the memory, since narrow cells are added at the ends of the axes."""
+
 _SAMPLES = 512
 _BYTES = 8
 """Of both tables for a cell and an instant."""
@@ -58,7 +61,9 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
         )
     working = _working(small, settings, step)
     most = int(settings.memory / 2 / states / (_BYTES * (small.steps + 1) + working))
-    counts = settings.cells or _counts(small, ends, step, min(_usual(small, step), most))
+    counts = settings.cells or _counts(
+        small, ends, step, min(_usual(small, step), int(_FILLED * most))
+    )
     _require_room(math.prod(counts), most, small, settings)
     cut = [_cut(edges, count) for edges, count in zip(hull, counts, strict=True)]
     if settings.leaving == "safe":

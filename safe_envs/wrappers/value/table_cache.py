@@ -69,13 +69,13 @@ def table_for(
         problem, settings.knowledge, settings.intervals, settings.specification
     ).fingerprint
     place = folder / f"{_key(fingerprint, settings)}.npz"
-    table = _kept(place, fingerprint)
+    table = _kept(place, fingerprint, settings)
     if table is not None:
         return table
     with ExitStack() as stack:
         with suppress(ConfigurationError):  # The disk may be full.
             stack.enter_context(locked(place.with_suffix(".lock"), "", lambda: _tell(problem)))
-        table = _kept(place, fingerprint)
+        table = _kept(place, fingerprint, settings)
         if table is None:
             table = solve(problem, settings, progress)
             _keep(table, place)
@@ -97,7 +97,7 @@ def table_at_hand(problem: SafetyProblem, settings: ValueSettings) -> ValueTable
     if folder is None or next(folder.glob("[0-9a-f]" * _DIGITS + ".npz"), None) is None:
         return None
     fingerprint = reduced(problem, settings.knowledge, settings.intervals).fingerprint
-    return _kept(folder / f"{_key(fingerprint, settings)}.npz", fingerprint)
+    return _kept(folder / f"{_key(fingerprint, settings)}.npz", fingerprint, settings)
 
 
 def forget_old_tables(folder: Path, most: int = MOST_BYTES_KEPT) -> None:
@@ -146,12 +146,13 @@ def _key(fingerprint: str, settings: ValueSettings) -> str:
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
-def _kept(place: Path, fingerprint: str) -> ValueTable | None:
+def _kept(place: Path, fingerprint: str, settings: ValueSettings) -> ValueTable | None:
     """Return the table of a file, marked as used; None where there is none, or none to rely on."""
     if not place.is_file():
         return None
     try:
         table = load_table(place)
+        require_asked(place, table, settings)
     except ValueFileError as error:
         _LOG.warning("%s; it is computed again", error)
         return None

@@ -22,7 +22,10 @@ from safe_envs.wrappers.value.table import ValueTable
 MOST_BYTES_OF_TABLE = 8_000_000_000
 """Of a file with a table."""
 
-FORMAT = 1
+FORMAT = 3
+"""To be raised whenever the same problem and settings give other values, or values that are looked
+up in another way: what is kept in caches is of the same version of the package often."""
+
 WRITER = "safe-envs best"
 
 _KIND = "values"

@@ -49,7 +49,7 @@ class Case:
         self.tables = rng.random((2, self.grid.cells)).astype(np.float32)
         self.layers = rng.integers(0, 2, states)
         blocks = [int(b) for b in rng.integers(1, 3, n)]
-        self.arrays = grid_arrays(self.grid, blocks)
+        self.arrays = grid_arrays(self.grid, blocks=blocks)
 
     def expected(self, run, inputs):
         found = np.empty((self.count, inputs.shape[1]))

@@ -7,11 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import sympy as sp
+from scipy.special import ndtr
 
 from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.agents.evaluation.statistics import wilson_interval
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.wrappers.value.look_ahead import LookAhead
+from safe_envs.wrappers.value.promise_filter import PromiseFilter
+from safe_envs.wrappers.value.promise_memory import PromiseMemory
+from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.value.reduction import reduced
 from tests.wrappers.value.systems import (
     random_states,
     require_promised,
@@ -20,6 +25,7 @@ from tests.wrappers.value.systems import (
     scalar,
     solved,
     u,
+    v,
     x,
     y,
 )
@@ -89,16 +95,20 @@ def case(request):
     return problem, table, LookAhead(table, problem)
 
 
-def states_of(problem, q):
-    """Return states with these coordinates; known states matter not."""
-    return (*q, *[np.zeros(len(q[0]))] * (problem.plant.n - len(q)))
+def states_of(problem, q, k=None):
+    """Return states with these coordinates, and known states as they are at instants k."""
+    known = reduced(problem).assumed
+    k = np.zeros(len(q[0]), dtype=int) if k is None else k
+    rest = iter(q)
+    return tuple(known[i][k] if i in known else next(rest) for i in range(problem.plant.n))
 
 
 def test_the_look_ahead_is_not_below_the_table(case):
     problem, table, ahead = case
     q = random_states(table, 400)
     q[0][:100] = table.grid.axes[0].edges[:-1][:100]
-    at, k = states_of(problem, q), np.arange(400) % table.steps
+    k = np.arange(400) % table.steps
+    at = states_of(problem, q, k)
     lower, scanned = ahead.values(k, at), ahead.scanned(k, at)
     _, ends = ahead.sets_at(k, at)
     assert (lower <= np.where(ends, 1.0, scanned.max(axis=1)) + 1e-7).all()
@@ -112,7 +122,8 @@ def test_the_look_ahead_is_not_below_the_table(case):
 def test_mixed_instants_equal_single_ones(case):
     problem, table, ahead = case
     q = random_states(table, 12, seed=1)
-    at, k = states_of(problem, q), np.arange(12) % table.steps
+    k = np.arange(12) % table.steps
+    at = states_of(problem, q, k)
     together = ahead.scanned(k, at)
     fresh = LookAhead(table, problem)
     for i in reversed(range(12)):
@@ -172,3 +183,63 @@ def test_starts_at_the_ends_of_cells_and_of_the_safe_set():
     assert (high[safe] <= upper[safe] + 1e-6).all()
     assert (high[around == 0] > 0).all()
     require_promised(problem, table)
+
+
+def test_nothing_is_said_of_other_known_states_than_the_table_assumes():
+    problem = pursued()
+    ahead = LookAhead(solved(problem, 100), problem)
+    # The pursuer does not begin where the table has it, but next to the start.
+    k, at = np.array([0, 0, 3]), (np.full(3, 0.6), np.array([-0.8, 0.3, -0.8]))
+    assert (ahead.values(k, at) > 0.0).tolist() == [True, False, False]
+    assert (ahead.scanned(k, at).max(axis=1) > 0.0).tolist() == [True, False, False]
+    assert (ahead.expected(k, at, np.zeros((3, 1, 1)))[:, 0] > 0.0).tolist() == [True, False, False]
+    assert ahead.largest(k, at)[1:].tolist() == [1.0, 1.0]
+    memory = PromiseMemory(PromiseFilter(ahead, PromiseSettings(0.5), problem), 3)
+    memory.begin(at)
+    assert (memory.levels > 0.0).tolist() == [True, False, True]
+    assert memory.decide_arrays(at, (np.zeros(3),)).feasible.tolist() == [True, False, True]
+    # Nor is the pursuer where the table has it after a step.
+    memory.advance(at, False)
+    assert memory.levels.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_known_states_count_through_others_too():
+    system = ControlAffineSDE(
+        states=[x, y, v],
+        inputs=[u],
+        drift=[0, v, 0],
+        input_matrix=[[1], [0], [0]],
+        diffusion=[[s], [0], [0]],
+        parameters={s: 0.3},
+    )
+    problem = state_problem(
+        system,
+        (x - y) ** 2 - sp.Rational(1, 25),
+        box=(-1.0, 1.0),
+        start=(0.6, -0.8, 0.1),
+        dt=0.1,
+        horizon=0.5,
+        workspace={x: (-1.0, 1.5)},
+        name="slow",
+        filter="scbf",
+    )
+    found = reduced(problem)
+    at = (np.full(2, 0.6), np.full(2, -0.8), np.array([0.1, 2.0]))
+    assert found.is_assumed(np.zeros(2, dtype=int), at).tolist() == [True, False]
+
+
+def test_a_start_in_the_goal_is_left_by_a_step_as_in_the_env():
+    problem = replace(scalar(start=(0.05,), s=1.0), goal=x + 1)
+    ahead = LookAhead(solved(problem, 100), problem)
+    low, high = (float(each[0]) for each in ahead.start_bounds((np.array([0.05]),)))
+    # The env tells of the goal after a step, which noise takes out of the safe set.
+    best = ndtr((0.05 + 0.1) / (1.0 * np.sqrt(0.1)))
+    assert low <= best <= high
+    assert high - low < 0.03
+
+
+def test_a_table_of_other_inputs_is_refused():
+    problem = scalar()
+    table = solved(problem, 10)
+    with pytest.raises(ConfigurationError, match="other inputs"):
+        LookAhead(replace(table, inputs=table.inputs[:-1]), problem)

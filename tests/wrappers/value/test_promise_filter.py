@@ -9,6 +9,7 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE
+from safe_envs.errors import InvalidInputError
 from safe_envs.problem.builder import state_problem
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_memory import PromiseMemory
@@ -183,6 +184,36 @@ def test_episodes_longer_than_the_table_are_refused():
     with pytest.raises(ConfigurationError, match=r"have 41 steps, and the table.*only 40"):
         PromiseFilter(EXACT, PromiseSettings(0.9), chain_problem(STEPS + 1))
     PromiseFilter(EXACT, PromiseSettings(0.9), chain_problem(STEPS - 1))
+
+
+def test_beyond_the_table_nothing_is_promised():
+    memory, x = memory_of(0.9, 1), np.array([15.0])
+    memory.begin((x,))
+    for _ in range(STEPS):
+        assert memory.decide_arrays((x,), (np.zeros(1),)).feasible.all()
+        memory.advance((x,), False)
+    assert memory.levels[0] > 0.0
+    assert not memory.decide_arrays((x,), (np.zeros(1),)).feasible.any()
+    memory.advance((x,), False)
+    assert (memory.levels.tolist(), memory.losses) == ([0.0], 0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"promise": np.array([0.5, np.nan])},
+        {"promise": np.array([0.5, 1.5])},
+        {"promise": np.array([0.5])},
+        {"instant": np.array([0, -1])},
+        {"promise_ended": np.zeros(3, dtype=bool)},
+    ],
+)
+def test_a_snapshot_of_no_promise_is_refused(change):
+    memory = memory_of(0.9, 2)
+    memory.begin((np.array([15.0, 15.0]),))
+    with pytest.raises(InvalidInputError, match="for each of 2 envs"):
+        memory.restore({**memory.snapshot(), **change})
+    assert memory.levels.tolist() == [0.9, 0.9]
 
 
 def test_a_copy_shares_the_table():

@@ -85,6 +85,14 @@ def test_a_table_of_another_problem_under_the_name_is_not_taken(folder, computed
     assert len(computed) == 2
 
 
+def test_a_table_of_other_settings_under_the_name_is_not_taken(folder, computed):
+    table_for(PROBLEM)
+    (place,) = folder.iterdir()
+    save_table(table_of(settings=ValueSettings(leaving="safe")), place)
+    assert table_for(PROBLEM).settings.leaving == "violation"
+    assert len(computed) == 2
+
+
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ConfigurationError, MemoryError])
 def test_an_interrupted_computation_leaves_nothing(folder, computed, monkeypatch, error):
     def interrupted(*_):

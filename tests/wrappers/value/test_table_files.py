@@ -19,6 +19,7 @@ from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.table import ValueTable
 from safe_envs.wrappers.value.table_files import (
+    FORMAT,
     ValueFileError,
     load_table,
     require_asked,
@@ -205,7 +206,7 @@ def test_a_table_that_would_not_be_read_is_not_written(tmp_path, monkeypatch):
 
 def test_another_format_is_named(file):
     rewritten(file, _set_header("format", 99))
-    with pytest.raises(ValueFileError, match="has the format 99; this version reads 1"):
+    with pytest.raises(ValueFileError, match=f"has the format 99; this version reads {FORMAT}"):
         load_table(file)
 
 
