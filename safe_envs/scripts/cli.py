@@ -7,6 +7,7 @@ from safe_envs.scripts.best import best
 from safe_envs.scripts.demo import demo
 from safe_envs.scripts.doctor import doctor
 from safe_envs.scripts.evaluate import evaluate
+from safe_envs.scripts.frontier import frontier
 from safe_envs.scripts.identify import identify
 from safe_envs.scripts.leaderboard import leaderboard
 from safe_envs.scripts.listing import list_envs
@@ -26,6 +27,7 @@ app = make_app(
         "leaderboard": leaderboard,
         "best": best,
         "verify": verify,
+        "frontier": frontier,
         "render": render,
         "reproduce": reproduce,
         "sweep": sweep,

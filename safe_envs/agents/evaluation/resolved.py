@@ -78,9 +78,7 @@ class ResolvedEvaluation:
             if not isinstance(each, str)
         }
         texts = [name for name in self.names if name not in self._given]
-        self._promises = {
-            name: PromiseSettings.of_text(name) for name in texts if names_promise(name)
-        }
+        self._promises = {t: PromiseSettings.of_text(t) for t in texts if names_promise(t)}
         for settings in self._promises.values():
             settings.require_fit(self.problem, spec.objective)
         self._tables: list[PromiseFilter] = []

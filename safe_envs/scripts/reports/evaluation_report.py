@@ -36,8 +36,7 @@ _COLUMNS = (
 )
 ESTIMATED = (
     "a bound is estimated: a theorem, with a supremum and a shortfall from a search of the safe"
-    " set, and as far as these episodes do not contradict it. It counts leaving the workspace as an"
-    " end, not as a violation."
+    " set, as far as these episodes do not contradict it; leaving the workspace is no violation."
 )
 """What an estimated bound is."""
 

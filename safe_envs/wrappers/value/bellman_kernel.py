@@ -18,7 +18,7 @@ import numpy as np
 
 from safe_envs.wrappers.value.expected_value_kernel import expected_value
 
-_LOSS = 0.003
+_LOSS = 0.0001
 """Of the value of a state in a step, for which it does not pay to try all inputs."""
 
 

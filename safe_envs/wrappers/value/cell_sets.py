@@ -28,6 +28,9 @@ _AT_ONCE = 1_000_000
 _ROUNDING = 1e-12
 """Of the distance to the edge of the workspace, on which edges of cells lie."""
 
+_TINY = 1e-300
+"""Farther out of the workspace is no rounding of an exact difference."""
+
 
 class CellSets(NamedTuple):
     """For each cell of a grid, what it lies in; boolean arrays (cells,).
@@ -93,11 +96,11 @@ class Sets:
         inside, ends = np.ones(shape, dtype=bool), np.zeros(shape, dtype=bool)
         for h in values[: self._barriers]:
             inside &= h.low >= 0.0
-        left = np.broadcast_to(values[self._barriers].high > _ROUNDING, shape)
+        outside = values[self._barriers]
         if self._stays:
-            inside &= ~left
+            inside &= outside.high <= _TINY
         else:
-            ends |= left
+            ends |= outside.low > 0.0
         for goal in values[self._barriers + 1 :]:
             ends |= goal.low >= 0.0
         return inside, ends

@@ -149,9 +149,9 @@ def _blocks(means: Axis, edges: np.ndarray, size: float) -> list[_Block]:
 def _passed(blocks: list[_Block], values: np.ndarray) -> np.ndarray:
     """Return lower bounds of the expected values of the columns of values."""
     edges = max(block.edges.stop for block in blocks)
-    copies = max(1, -(-(edges - 1) // len(values)))
-    if copies > 1:
-        values = np.tile(values, (copies, 1))
+    if edges > len(values) + 1:
+        # A copy more than edges need: behind the last edge there is the next turn, not nothing.
+        values = np.tile(values, (edges // len(values) + 1, 1))
     nothing = np.zeros((1, values.shape[1]))
     steps = np.diff(values.astype(np.float64), axis=0, prepend=nothing, append=nothing)
     rising, falling = np.maximum(steps, 0.0), np.minimum(steps, 0.0)

@@ -36,6 +36,9 @@ from safe_envs.wrappers.value.table import ValueTable
 
 Progress = Callable[[float], None]
 
+_SMALL = 1_000_000
+"""States, inputs and boxes of noise of a sweep for which it takes no time to try all inputs."""
+
 
 def solve(
     problem: SafetyProblem, settings: ValueSettings | None = None, progress: Progress | None = None
@@ -153,7 +156,10 @@ class _Operator:
             self._known[:] = self._rival[:] = 2.0
         here = CellSets(*(each[self._numbers] for each in cells))
         # Values do not rise backwards in time: those of the next instant are the best to be had.
-        found = lower[self._numbers].astype(np.float64)
+        ahead_of = lower if self.is_constant else np.where(lower > 0.0, lower, 1.0)
+        found = ahead_of[self._numbers].astype(np.float64)
+        if self._known.size * len(self._step.noise.weights) < _SMALL:
+            found[:] = np.inf  # All inputs are tried.
         bounds = np.zeros(len(self._numbers))
         self._sweep_lower(self._around(lower, ahead.inside), found, here)
         self._sweep_upper(self._around(-upper, ahead.touches), bounds)
@@ -163,7 +169,7 @@ class _Operator:
         going = here.touches & ~here.ends
         new_lower[self._numbers[going]] = rounded_down(np.clip(found[going], 0.0, 1.0))
         going = here.touches & ~here.may_end
-        new_upper[self._numbers[going]] = -rounded_down(-np.clip(bounds[going], 0.0, 1.0))
+        new_upper[self._numbers[going]] = 0.0 - rounded_down(-np.clip(bounds[going], 0.0, 1.0))
         return new_lower, new_upper
 
     def _imaged(self, k: int) -> tuple[StepImages, StepImages]:

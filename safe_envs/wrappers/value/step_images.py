@@ -21,6 +21,15 @@ _FEW_PARTS = 2
 _AT_ONCE = 2_000_000
 _HUGE = 1e200
 
+_ALONE = 20
+"""Intervals of a normal that is the only one to be divided."""
+
+_TOGETHER = 200
+_FEWEST, _MOST = 4, 40
+"""Intervals of each of several normals; their boxes are so many together, about."""
+
+_SAMPLES = 256
+
 
 class StepImages(NamedTuple):
     """Where a step takes some states; see `bellman_kernel`.
@@ -80,8 +89,8 @@ class Step:
         self._reduced = reduced
         self._parts = _parts_of(reduced)
         self.blur, self.is_affine = self._parts.blur, self._parts.is_affine
-        self.noise: NoiseBoxes = noise_boxes(len(self._parts.boxed))
         self._scenarios = _scenarios(reduced.intervals)
+        self.noise: NoiseBoxes = noise_boxes(self._intervals())
 
     @property
     def scenarios(self) -> int:
@@ -107,6 +116,40 @@ class Step:
             interval_function((*symbols, *parts.boxed, *reduced.inputs), parts.rest),
             interval_function(symbols, effects),
         )
+
+    def _intervals(self) -> list[int]:
+        """Return numbers of intervals of the boxed normals.
+
+        The more one of them moves the coordinates, as parts of their ranges, the more it has.
+        """
+        reduced, channels = self._reduced, len(self._parts.boxed)
+        if channels < 2:
+            return [_ALONE] * channels
+        rng = np.random.default_rng(0)
+        extents = [c.period or c.high - c.low for c in reduced.coordinates]
+        points = [
+            (0.0 if c.period else c.low) + extent * rng.random(_SAMPLES)
+            for c, extent in zip(reduced.coordinates, extents, strict=True)
+        ]
+        known = [float(values[0]) for values in reduced.known.values()]
+        world = [0.5 * (low + high) for low, high in reduced.intervals.values()]
+        middle = [0.5 * (low + high) for low, high in reduced.box]
+        sizes = np.zeros(channels)
+        for j in range(channels):
+            up, down = (
+                self._functions[0](
+                    [*points, *known, *world, *(sign * (i == j) for i in range(channels)), *middle]
+                )
+                for sign in (1.0, -1.0)
+            )
+            moved = [
+                np.mean(np.minimum(np.abs(a.high - b.low), extent)) / extent
+                for a, b, extent in zip(up, down, extents, strict=True)
+            ]
+            sizes[j] = max(moved)
+        shares = np.maximum(sizes, 1e-3 * sizes.max()) / np.maximum(sizes.max(), 1e-300)
+        scale = (_TOGETHER / np.prod(shares)) ** (1.0 / channels)
+        return [int(min(max(round(scale * share), _FEWEST), _MOST)) for share in shares]
 
     def images(
         self,

@@ -1,0 +1,93 @@
+"""The picture of a frontier: what a filter costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+
+from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
+from safe_envs.agents.evaluation.rate_text import percent
+from safe_envs.atomic_io import write_atomically
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
+from safe_envs.scripts.reports.evaluation_report import describe_system
+
+_NOMINAL_COLOR = "#D55E00"
+_MARKERS = {"policy": "o", "filter": "s", "best": "*"}
+
+
+def draw(found: Frontier, title: str, path: Path) -> None:
+    """Draw the curve and the points, and write the picture whole or not at all.
+
+    Args:
+        found: the curve and the points.
+        title: of the env.
+        path: of the picture; its suffix is the format.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(8.5, 5.8))
+        axes = figure.add_subplot()
+        _draw_curve(axes, found)
+        others = 0
+        for point in found.points:
+            nominal = point.name == "nominal"
+            color = _NOMINAL_COLOR if nominal else COLORS[others % len(COLORS)]
+            others += not nominal
+            _draw_point(axes, point, color, _MARKERS.get(point.kind, "o"), point.name)
+        for i, point in enumerate(found.attained):
+            label = None if i else "policies of the curve, simulated"
+            _draw_point(axes, point, QUIET, ".", label)
+        _scale(axes, found)
+        axes.set(xlabel="episodes with a violation", ylabel="mean return")
+        axes.grid(alpha=0.25, linewidth=0.6)
+        add_legend(figure, axes.get_legend_handles_labels()[0])
+        figure.suptitle(
+            f"{title}: what safety costs\n{describe_system(found.problem)}", fontsize=11
+        )
+        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+
+
+def _draw_curve(axes: Axes, found: Frontier) -> None:
+    chances, returns = found.curve()
+    axes.plot(chances, returns, color="black", linewidth=1.8, label="largest return, computed")
+    bottom = min([p.return_low for p in (*found.points, *found.attained)] + [returns.min()])
+    axes.fill_between(chances, bottom, returns, color="#56B4E9", alpha=0.08, linewidth=0)
+
+
+def _draw_point(
+    axes: Axes, point: FrontierPoint, color: str, marker: str, label: str | None
+) -> None:
+    axes.errorbar(
+        point.violation_rate,
+        point.return_mean,
+        xerr=[
+            [max(point.violation_rate - point.violation_low, 0.0)],
+            [max(point.violation_high - point.violation_rate, 0.0)],
+        ],
+        yerr=[
+            [point.return_mean - point.return_low],
+            [point.return_high - point.return_mean],
+        ],
+        color=color,
+        marker=marker,
+        markersize=13 if marker == "*" else 7,
+        elinewidth=1.2,
+        linestyle="none",
+        label=label,
+    )
+
+
+def _scale(axes: Axes, found: Frontier) -> None:
+    """Show chances of all sizes, and 0."""
+    points = (*found.points, *found.attained)
+    small = [p.violation_high for p in points] + [max(found.values.least_violations, 1e-6)]
+    threshold = max(min(small), 1e-6)
+    axes.set_xscale("symlog", linthresh=threshold)
+    axes.set_xlim(-0.1 * threshold, 1.1)
+    ticks = [10.0**k for k in range(-6, 1) if 10.0**k >= threshold]
+    axes.set_xticks([0.0, *ticks])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: percent(value)))
+    axes.xaxis.set_minor_locator(NullLocator())

@@ -1,0 +1,67 @@
+"""Points next to a curve."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from safe_envs.agents.evaluation.frontier import FrontierSpec, frontier
+from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
+from safe_envs.errors import ConfigurationError
+from safe_envs.registry import make_problem
+from safe_envs.wrappers.value.priced_values import FrontierSettings
+
+PRICES = np.array([0.0, 10.0, 100.0])
+VALUES = (50.0, 47.0, 40.0)
+
+
+def _point(rate, mean, half=1.0):
+    ends = (max(rate - 0.01, 0.0), rate + 0.01, mean, mean - half, mean + half)
+    return FrontierPoint("a", "filter", 100, round(100 * rate), 0, rate, *ends, VALUES)
+
+
+def _frontier(*points):
+    values = SimpleNamespace(prices=PRICES, values=np.array(VALUES))
+    return Frontier(None, values, (), points, {}, 0.95)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_cost_is_the_distance_to_the_least_line():
+    below, on = _point(0.05, 30.0), _point(0.4, 50.0)
+    found = _frontier(below, on)
+    assert found.cost(below) == pytest.approx(15.0)
+    assert found.cost(on) == pytest.approx(0.0)
+    assert found.excess == 0.0
+
+
+def test_the_least_risk_of_a_return_is_where_the_curve_has_it():
+    found = _frontier(_point(0.5, 47.5))
+    assert found.needed(found.points[0]) == pytest.approx(0.075)
+    assert found.needed(_point(0.5, 30.0)) == 0.0
+
+
+def test_points_beyond_their_intervals_show_the_error_of_the_grid():
+    assert _frontier(_point(0.05, 48.0)).excess == pytest.approx(47.0 - 46.0)
+
+
+def test_what_does_not_suit_is_an_error_unless_it_may_be_missing():
+    problem = make_problem("Scalar-v0", horizon=0.05)
+    settings = FrontierSettings(2, 0, (51,))
+    spec = {"policies": {"nominal": "nominal"}, "filters": ("wrong",), "episodes": 4}
+    with pytest.raises(ConfigurationError, match="wrong"):
+        frontier(problem, FrontierSpec(**spec), settings)
+    found = frontier(problem, FrontierSpec(**spec, may_miss=("wrong",)), settings)
+    assert [point.name for point in found.points] == ["nominal"]
+    assert "unknown filter" in found.left_out["wrong"]
+
+
+def test_leaving_the_workspace_counts_as_asked():
+    """The nominal controller is pulled down from the lowest safe state."""
+    problem = make_problem("Scalar-v0", horizon=0.5, start=[-2.999], noise=0.5)
+    spec = FrontierSpec({"zero": "zero"}, episodes=50)
+    rates = []
+    for leaving in ("violation", "safe"):
+        found = frontier(problem, spec, FrontierSettings(2, 0, (51,), leaving))
+        rates.append(found.points[0].violation_rate)
+    assert rates == [1.0, 0.0]
