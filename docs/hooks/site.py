@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
+from attainable import attainable_table
 from commands import command_line_page
 from contract import info_page
 from environments import env_pages
@@ -17,6 +18,7 @@ from pictures import pictures
 from runs import with_output
 
 _TABLE = "<!-- table of envs -->"
+_ATTAINABLE = "<!-- table of attainable safety -->"
 
 _made: dict[str, str | bytes] = {}
 
@@ -45,9 +47,12 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Run the examples of a page, and insert the table of envs."""
+    """Run the examples of a page, and insert the tables of envs."""
     try:
-        return with_output(markdown.replace(_TABLE, str(_made["envs/table.md"])))
+        markdown = markdown.replace(_TABLE, str(_made["envs/table.md"]))
+        if _ATTAINABLE in markdown:
+            markdown = markdown.replace(_ATTAINABLE, attainable_table())
+        return with_output(markdown)
     except Exception as error:
         raise PluginError(
             f"{page.file.src_uri}: an example does not run: {type(error).__name__}: {error}"

@@ -205,3 +205,37 @@ def test_what_an_example_prints_follows_it(hook: Any):
     assert "```console\n$ safe-envs evaluate safe_envs/Nothing-v0\n```\n\n```text\nError: " in shown
     with pytest.raises(RuntimeError, match="status 2"):
         runs.with_output(page.replace(" fails", ""))
+
+
+def test_table_of_attainable_safety_says_what_commands_wrote(hook: Any, tmp_path: Path):
+    table, folder, kept = hook("attainable"), tmp_path / "found", tmp_path / "kept.json"
+    folder.mkdir()
+    best = {"lower": 0.9, "upper": 0.95, "simulated": 0.93, "simulated_interval": [0.91, 0.94]}
+    best |= {"contradiction": None, "coordinates": ["x"], "cells": [40], "steps": 5}
+    best |= {"seconds": 2.0, "memory": 3e6}
+    rows = [
+        {"filter": "none", "safety_rate": 0.1, "ci_low": 0.0, "ci_high": 0.2},
+        {"filter": "scbf", "safety_rate": 0.5, "ci_low": 0.4, "ci_high": 0.6},
+    ]
+    written = {
+        "Close": best,
+        "Coarse": best | {"lower": 0.0, "upper": 1.0},
+        "Doubtful": best | {"contradiction": "too high", "lower": None, "upper": None},
+        "Large": {"rows": rows},
+    }
+    for name, document in written.items():
+        (folder / f"{name}.json").write_text(json.dumps(document))
+    table.taken_over(folder, kept)
+    lines = table.attainable_table(kept).splitlines()[2:]
+    assert (
+        "| 90.00 % | 95.00 % | 93.0 % [91.0, 94.0] | best | `x` | 40 | 5 | 2 s | 3 MB |" in lines[0]
+    )
+    assert "| 0 (grid too coarse) | 1 (grid too coarse) |" in lines[1]
+    assert "| withheld | withheld |" in lines[2]
+    assert "| no grid | no grid | 50.0 % [40.0, 60.0] | `scbf` |" in lines[3]
+    assert {line.count("|") for line in table.attainable_table(kept).splitlines()} == {11}
+
+
+def test_attainable_safety_is_that_of_envs_of_this_project(hook: Any):
+    entries = json.loads(hook("attainable").KEPT.read_text())
+    assert {f"safe_envs/{name}-v0" for name in entries} <= set(ENV_IDS)
