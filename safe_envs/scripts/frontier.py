@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from safe_envs.errors import ConfigurationError, require_whole, shown
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.errors import require_whole
+from safe_envs.scripts.options import completion, text_options, value_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -56,22 +56,16 @@ def frontier(
     ] = 0,
     trust: text_options.Trust = False,
     knowledge: text_options.Knowledge = "model",
-    leaving: Annotated[
-        str,
-        typer.Option(
-            metavar="violation|safe",
-            help=(
-                "How an episode counts that leaves the workspace in the safe set; evaluate counts"
-                " it as safe."
-            ),
-        ),
-    ] = "violation",
+    leaving: value_options.Leaving = "violation",
     prices: Annotated[
         int, typer.Option(help="Prices of a violation for which returns are computed.")
     ] = 12,
     cells: Annotated[
         str | None,
-        typer.Option(metavar="NxM", help="Nodes along each coordinate of the safe set."),
+        typer.Option(
+            metavar="N|NxM|NxMxL",
+            help="Nodes along each coordinate of the safe set; by default as many as suit the env.",
+        ),
     ] = None,
     episodes: Annotated[int, typer.Option(help="Episodes of each policy and filter.")] = 1000,
     attained: Annotated[
@@ -113,7 +107,10 @@ def frontier(
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     settings = FrontierSettings(
-        prices=prices, policies=6 if attained else 0, cells=_cells(cells), leaving=leaving
+        prices=prices,
+        policies=6 if attained else 0,
+        cells=value_options.cells_of(cells, "120x80"),
+        leaving=leaving,
     )
     rewarded(problem)  # Raises where there is no curve, before an agent is trained.
     own = [name for name in (problem.filter, *PROMISES) if name not in given]
@@ -140,17 +137,6 @@ def frontier(
         from safe_envs.scripts.figures.frontier_figure import draw
 
         draw(found, title, plot)
-
-
-def _cells(text: str | None) -> tuple[int, ...] | None:
-    if text is None:
-        return None
-    parts = text.lower().split("x")
-    if not all(part.isascii() and part.isdigit() and len(part) < 7 for part in parts):
-        raise ConfigurationError(
-            f"--cells {shown(text)}; give a whole number for each coordinate, such as 120x80"
-        )
-    return tuple(map(int, parts))
 
 
 def _trained(env: EnvOptions, problem: SafetyProblem, steps: int, seed: int) -> Any:

@@ -11,6 +11,9 @@ import numpy as np
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.priced_values import PricedValues
 
+_FURTHER = 50
+"""Points of the line of the largest price."""
+
 
 @dataclass(frozen=True)
 class FrontierPoint:
@@ -86,19 +89,25 @@ class Frontier:
         values, prices = np.array(point.start_values)[1:], self.values.prices[1:]
         return float(np.clip(((point.return_mean - values) / prices).max(), 0.0, 1.0))
 
-    def curve(self, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
-        """Return chances of a violation and the largest mean return at them, shape (count,).
+    def curve(self, count: int = 400, bottom: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return chances of a violation and the largest mean return at them, arrays of one shape.
 
-        The corners of the curve are among them.
+        The corners of the curve are among them. It begins at the least chance that the prices lead
+        to; at smaller ones the largest price alone bounds the return.
 
         Args:
             count: number of points, at least.
+            bottom: return from which that last line is wanted too; None for none of it.
         """
         v, prices = self.values.values, self.values.prices
         corners = np.clip((v[:-1] - v[1:]) / np.diff(prices), 0.0, 1.0)
         least = max(self.values.least_violations, 1e-9)
         spread = np.geomspace(least, 1.0, count) if least < 1.0 else np.ones(1)
         chances = np.unique(np.concatenate([corners[corners >= least], spread]))
+        if bottom is not None:
+            first = max((bottom - v[-1]) / prices[-1], 0.0)
+            further = np.linspace(first, least, _FURTHER, endpoint=False)
+            chances = np.concatenate([further[further < least], chances])
         return chances, self.values.largest_return(chances)
 
     def document(self) -> dict[str, Any]:

@@ -51,9 +51,10 @@ def draw(found: Frontier, title: str, path: Path) -> None:
 
 
 def _draw_curve(axes: Axes, found: Frontier) -> None:
-    chances, returns = found.curve()
+    lows = [p.return_low for p in (*found.points, *found.attained)]
+    bottom = min([*lows, found.curve()[1].min()])
+    chances, returns = found.curve(bottom=bottom)
     axes.plot(chances, returns, color="black", linewidth=1.8, label="largest return, computed")
-    bottom = min([p.return_low for p in (*found.points, *found.attained)] + [returns.min()])
     axes.fill_between(chances, bottom, returns, color="#56B4E9", alpha=0.08, linewidth=0)
 
 

@@ -44,17 +44,25 @@ Table = Annotated[
 ]
 
 
-def cells_of(text: str | None) -> tuple[int, ...] | None:
+_MOST_DIGITS = 9
+
+
+def cells_of(text: str | None, example: str = "400x100") -> tuple[int, ...] | None:
     """Return the numbers of cells of a text such as 400x100; None for none.
+
+    Args:
+        text: as given.
+        example: of such a text, for messages.
 
     Raises:
         ConfigurationError: It is no such text.
     """
     if text is None:
         return None
-    parts = text.split("x")
-    if not all(part.isascii() and part.isdigit() and len(part) < 10 for part in parts):
+    parts = text.lower().split("x")
+    if not all(part.isascii() and part.isdigit() and len(part) <= _MOST_DIGITS for part in parts):
         raise ConfigurationError(
-            f"--cells {shown(text)}; give a whole number for each coordinate, such as 400x100"
+            f"--cells {shown(text)}; give a whole number for each coordinate, of at most"
+            f" {_MOST_DIGITS} digits, such as {example}"
         )
     return tuple(int(part) for part in parts)

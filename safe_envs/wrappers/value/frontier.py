@@ -18,6 +18,7 @@ makes values too small.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -48,7 +49,10 @@ _ENTRIES = 3_000_000
 """Of points that are looked at at once."""
 
 _BYTES = 1e9
-"""Of the tables that policies need, at most."""
+"""Of the tables that policies need, unless cells are asked for."""
+
+_MOST_BYTES = 4e9
+"""Of the same tables, whatever is asked for."""
 
 _STARTS = 20_000
 
@@ -71,7 +75,8 @@ def price_violations(
         The values, and what their policies need.
 
     Raises:
-        ConfigurationError: There are too many coordinates, or what happens depends on time.
+        ConfigurationError: There are too many coordinates, what happens depends on time, or the
+            tables do not fit the memory.
     """
     return _Frontier(problem, settings or FrontierSettings()).run(progress)
 
@@ -107,13 +112,19 @@ class _Frontier:
         if settings.cells is not None and len(settings.cells) != n:
             names = ", ".join(map(str, small.symbols))
             raise ConfigurationError(
-                f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has {n}"
-                f" coordinates ({names}): give a number for each"
+                f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has the"
+                f" coordinates {names}: give a number for each"
             )
         counts = np.array(settings.cells or _NODES[n])
-        share = _BYTES / (4.0 * float(np.prod(counts)) * small.steps * max(settings.policies, 1))
-        if share < 1.0 and settings.cells is None:
-            counts = np.maximum((counts * share ** (1 / n)).astype(int), 8)
+        needed = 4.0 * math.prod(counts.tolist()) * small.steps * max(settings.policies, 1)
+        if settings.cells is None and needed > _BYTES:
+            counts = np.maximum((counts * (_BYTES / needed) ** (1 / n)).astype(int), 8)
+        elif needed > _MOST_BYTES:
+            raise ConfigurationError(
+                f"cells = {'x'.join(map(str, settings.cells or ()))} take"
+                f" {needed / 1e9:.3g} GB at {small.steps} steps; give fewer: at most"
+                f" {_MOST_BYTES / 1e9:g} GB are taken"
+            )
         whole = [
             (-0.5 * c.period, 0.5 * c.period) if c.period else (c.low, c.high)
             for c in small.coordinates
@@ -258,18 +269,10 @@ def _pieces(count: int, size: int) -> list[slice]:
 
 def _around(grid: NodeGrid, step: PricedStep) -> np.ndarray:
     """Return the nodes that are safe, and those next to them."""
-    from scipy.ndimage import binary_dilation
-
-    safe = step.is_safe(grid.points(np.arange(grid.size))).reshape(grid.counts)
+    safe = step.is_safe(grid.points(np.arange(grid.size)))
     if not safe.any():
         raise ConfigurationError(
             "no node of the grid of returns is safe: the safe set is too small or too narrow for"
             " it; give more cells"
         )
-    wide = np.pad(safe, [(1, 1)] * safe.ndim)
-    for axis, turns in enumerate(grid.periodic):
-        if turns:
-            wide = np.pad(safe, [(1, 1) if i == axis else (0, 0) for i in range(safe.ndim)], "wrap")
-            wide = np.pad(wide, [(0, 0) if i == axis else (1, 1) for i in range(safe.ndim)])
-    grown = binary_dilation(wide, np.ones((3,) * safe.ndim))
-    return np.flatnonzero(grown[(slice(1, -1),) * safe.ndim])
+    return np.flatnonzero(grid.around_marked(safe))

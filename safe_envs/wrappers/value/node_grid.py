@@ -156,5 +156,21 @@ class NodeGrid:
             axis=0,
         )
 
+    def around_marked(self, marked: np.ndarray) -> np.ndarray:
+        """Return which nodes are marked or next to one that is, also across a corner.
+
+        Args:
+            marked: of all nodes, bool (nodes,).
+
+        Returns:
+            Of the same shape.
+        """
+        found = marked.reshape(self.counts)
+        for axis, turns in enumerate(self.periodic):
+            sides = [(1, 1) if i == axis else (0, 0) for i in range(found.ndim)]
+            wide = np.moveaxis(np.pad(found, sides, "wrap" if turns else "constant"), axis, 0)
+            found = np.moveaxis(wide[:-2] | wide[1:-1] | wide[2:], 0, axis)
+        return found.ravel()
+
     def _axes(self, q: Sequence[np.ndarray]) -> zip[tuple[np.ndarray, float, float, int, bool]]:
         return zip(q, self.low, self.step, self.counts, self.periodic, strict=True)

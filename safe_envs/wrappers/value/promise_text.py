@@ -12,9 +12,7 @@ from safe_envs.number_text import finite_number, real
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.registry import PROMISE
 from safe_envs.wrappers.conditions.text_parts import parts_of
-
-LEAVING = ("violation", "safe")
-"""How a left workspace counts: as a violation, or as the end of a safe episode."""
+from safe_envs.wrappers.value.settings import LEAVING
 
 _KEYS = ("p", "robust", "leaving", "table")
 _EXAMPLE = f"{PROMISE}:p=0.99"
@@ -34,7 +32,8 @@ class PromiseSettings:
     Attributes:
         probability: p, between 0 and 1.
         robust: parameters of which only an interval is known, each once.
-        leaving: "violation" or "safe"; see `LEAVING`.
+        leaving: how an episode counts that leaves the workspace in the safe set: as a
+            "violation", or as "safe".
         table: file of the table; None for the one of the user's cache, which is computed where it
             is missing.
 
@@ -150,6 +149,10 @@ class PromiseSettings:
 
 
 def _unknown(text: str, key: str) -> ConfigurationError:
+    if key in _KEYS:
+        return ConfigurationError(
+            f"filter {shown(text)} gives {key} no value; settings are key=value, as in {_EXAMPLE}"
+        )
     return ConfigurationError(
         f"filter {shown(text)} has no setting {shown(key)}; {nearest(key, _KEYS)}, as in {_EXAMPLE}"
     )

@@ -45,8 +45,8 @@ def scanned_inputs(box: Sequence[tuple[float, float]], number: int | None) -> Sc
     count = number or _ALONG_EACH.get(m, _FEW)
     if count**m > _MOST:
         raise ConfigurationError(
-            f"{count} values along each of {m} inputs are {count**m} inputs; at most"
-            f" {_MOST} are scanned"
+            f"inputs = {count}: so many values along each of the problem's inputs make {count**m};"
+            f" at most {_MOST} are scanned"
         )
     values = _product([np.linspace(low, high, count) for low, high in box])
     cuts = [np.linspace(low, high, count + 1) for low, high in box]

@@ -56,8 +56,8 @@ def suitable_grid(small: ReducedProblem, settings: ValueSettings, sets: Sets, st
     if settings.cells is not None and len(settings.cells) != n:
         names = ", ".join(str(c.symbol) for c in small.coordinates)
         raise ConfigurationError(
-            f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has {n}"
-            f" coordinates ({names}): give a number for each"
+            f"cells = {'x'.join(map(str, settings.cells))}; {small.problem.name} has the"
+            f" coordinates {names}: give a number for each"
         )
     working = _working(small, settings, step)
     most = int(settings.memory / 2 / states / (_BYTES * (small.steps + 1) + working))

@@ -23,7 +23,8 @@ def _point(rate, mean, half=1.0):
 
 
 def _frontier(*points):
-    values = SimpleNamespace(prices=PRICES, values=np.array(VALUES))
+    values = SimpleNamespace(prices=PRICES, values=np.array(VALUES), least_violations=7 / 90)
+    values.largest_return = lambda v: (np.array(VALUES) + v[:, None] * PRICES).min(axis=1)
     return Frontier(None, values, (), points, {}, 0.95)  # pyright: ignore[reportArgumentType]
 
 
@@ -65,3 +66,14 @@ def test_leaving_the_workspace_counts_as_asked():
         found = frontier(problem, spec, FrontierSettings(2, 0, (51,), leaving))
         rates.append(found.points[0].violation_rate)
     assert rates == [1.0, 0.0]
+
+
+def test_below_the_least_chance_of_a_violation_the_curve_is_the_line_of_the_largest_price():
+    found = _frontier()
+    plain, (chances, returns) = found.curve(), found.curve(bottom=30.0)
+    assert plain[0][0] == pytest.approx(7 / 90)
+    assert (chances[0], returns[0]) == (0.0, 40.0)
+    assert found.curve(bottom=42.0)[0][0] == pytest.approx(0.02)
+    assert (np.diff(chances) > 0).all()
+    assert (np.diff(returns) >= 0).all()
+    np.testing.assert_array_equal(chances[-len(plain[0]) :], plain[0])

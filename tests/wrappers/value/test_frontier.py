@@ -184,3 +184,18 @@ def test_rules_have_the_moments_of_normals(normals):
         assert rule.weights.sum() == pytest.approx(1.0)
         np.testing.assert_allclose(rule.nodes @ rule.weights, 0.0, atol=1e-9)
         np.testing.assert_allclose(rule.nodes**2 @ rule.weights, 1.0, atol=1e-4)
+
+
+def test_nodes_next_to_marked_ones_are_found_across_the_ends_of_every_periodic_axis():
+    ends = [(0.0, 1.0)] * 3
+    grid = NodeGrid.over(ends, (5, 6, 4), (True, True, False))
+    marked = np.zeros(grid.counts, dtype=bool)
+    marked[0, 5, 0] = True
+    found = grid.around_marked(marked.ravel()).reshape(grid.counts)
+    expected = {(i, j, k) for i in (4, 0, 1) for j in (4, 5, 0) for k in (0, 1)}
+    assert set(zip(*map(np.ndarray.tolist, np.nonzero(found)), strict=True)) == expected
+
+
+def test_more_memory_than_there_may_be_is_refused():
+    with pytest.raises(ConfigurationError, match=r"cells = 90000000 take .* GB at 6 steps"):
+        price_violations(_walk(), FrontierSettings(prices=2, cells=(90_000_000,)))

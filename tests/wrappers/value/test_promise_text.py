@@ -40,6 +40,7 @@ def test_settings_hold_what_was_written():
     ("text", "says"),
     [
         ("promise", "names no probability; give one, like promise:p=0.99"),
+        ("promise:p", "gives p no value; settings are key=value, as in promise:p=0.99"),
         ("promise:q=3:p=.9", "no setting 'q'; allowed: p, robust, leaving, table"),
         ("promise:robst=v:1..2:p=.9", "did you mean 'robust'"),
         ("promise:0.99", "no setting '0.99'"),

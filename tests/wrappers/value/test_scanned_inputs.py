@@ -27,5 +27,5 @@ def test_inputs_and_boxes(m):
 
 
 def test_too_many_inputs_are_refused():
-    with pytest.raises(ConfigurationError, match="100 values along each of 3 inputs"):
+    with pytest.raises(ConfigurationError, match="inputs = 100: so many values"):
         scanned_inputs([(-1, 1)] * 3, 100)
