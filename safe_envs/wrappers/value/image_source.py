@@ -10,6 +10,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.program import Program, is_available
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers.value import image_kernel as kernels
 
@@ -159,6 +160,29 @@ def image_source(
         code.append("    " * max(level, 1) + loop)
         code += ["    " * (level + 1) + line for line in own]
     return Source("\n".join(code) + "\n", tuple(writer.uses))
+
+
+def image_function(
+    symbols: Mapping[str, Sequence[sp.Symbol]],
+    rest: Sequence[sp.Expr],
+    effect: Sequence[Sequence[sp.Expr]],
+) -> Callable[..., None] | None:
+    """Return `point_images` of a step; None without Numba, or without a kernel for an operation.
+
+    Args:
+        symbols: see `image_source`, as for all others.
+        rest: see there.
+        effect: see there.
+    """
+    if not is_available():
+        return None
+    try:
+        program = Program(
+            "steps of states", (kernels.point_images,), image_source(symbols, rest, effect)
+        )
+        return program.compiled()["point_images"]
+    except NotCompilableError:
+        return None
 
 
 def _enclosure(number: Any) -> tuple[float, float]:

@@ -43,6 +43,7 @@ class PromiseMemory:
         self._instants = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
         self._expected = np.ones(num_envs)
+        self._caps = np.full(num_envs, np.inf)
         self.levels = np.zeros(num_envs)
         self.losses, self.largest_loss = 0, 0.0
         count = len(promise_filter.problem.barriers)
@@ -99,7 +100,7 @@ class PromiseMemory:
         # Beyond the last instant of the table nothing is kept.
         wanted = np.where(self._ended | (self._instants > self._last), 0.0, self.levels)
         k = np.minimum(self._instants, self._last)
-        action, expected, level, replaced = self.safety_filter.choose(k, wanted, x, u)
+        action, expected, level, replaced, self._caps = self.safety_filter.choose(k, wanted, x, u)
         self._expected, self.levels = expected, level
         loss = wanted - level
         if np.count_nonzero(loss):
@@ -123,7 +124,9 @@ class PromiseMemory:
         )
         held = self.levels > 0.0
         share = self.levels / np.where(held, self._expected, 1.0)
-        self.levels = np.where(held, np.clip(share * reached, 0.0, 1.0), 0.0)
+        # Without a cap, in proportion to the value that was reached.
+        wanted = np.where(self._caps < np.inf, self._caps, share * reached)
+        self.levels = np.where(held, np.minimum(np.maximum(wanted, 0.0), reached), 0.0)
         self._ended = self._ended | ended
 
     def report(self) -> Info:
