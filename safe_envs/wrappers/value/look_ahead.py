@@ -258,9 +258,12 @@ class LookAhead:
     def _fill_row(self, row: int, sign: int, k: int) -> None:
         if not self._filled[sign][row]:
             table = self._table.lower[row] if sign > 0 else -self._table.upper[row]
-            if self._parts is None or self._sets.depend_on_time:
-                self._parts = self._sets.of_cells(self._smoothing.fine, k)
-            counts = self._parts.inside if sign > 0 else self._parts.touches
+            parts = self._parts
+            if parts is None:
+                parts = self._sets.of_cells(self._smoothing.fine, k)
+            if not self._sets.depend_on_time:
+                self._parts = parts
+            counts = parts.inside if sign > 0 else parts.touches
             self._ahead[sign][row] = self._smoothing.smoothed(table, counts)
             self._filled[sign][row] = True
 
