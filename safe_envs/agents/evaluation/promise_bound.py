@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from safe_envs.agents.evaluation.contradiction import COMPUTED
+from safe_envs.agents.evaluation.contradiction import COMPUTED, withheld
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager
 from safe_envs.agents.evaluation.resolved import FilterParts
 from safe_envs.agents.evaluation.rows import BoundSummary
@@ -15,6 +15,7 @@ from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.evaluation.statistics import share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.promise_memory import ROUNDING
 from safe_envs.wrappers.value.promise_tables import promise_filter_for, why_not_of_plant
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 
@@ -66,12 +67,19 @@ class PromiseAverager:
     def summary(self, visited: VisitedStates) -> BoundSummary:
         """Return the mean of p_0, or why there is none.
 
+        It is withheld where p_k had to be lowered in an episode, which a right table never makes
+        necessary.
+
         Args:
-            visited: not used.
+            visited: states of the episodes; their slack is by how much p_k was lowered.
         """
         mean = share(self._total.total, self._count)
         if self._why_none or not mean:
             return BoundSummary(bound_note=self._why_none or "no start is in the table's safe set")
+        lost = float(visited.slack.max(initial=0.0))
+        if lost > ROUNDING:
+            reason = f"no input kept p_k in a step, which fell by {lost:.2g}: the table is wrong"
+            return withheld(BoundSummary(), reason)
         return BoundSummary(estimated_bound=mean, bound_note=COMPUTED)
 
 

@@ -56,7 +56,9 @@ class BestPolicy(Policy):
         self._automaton = found.automaton
         self._states = 1 if found.automaton is None else found.automaton.size
         symbols = set().union(*(c.expression.free_symbols for c in found.coordinates))
-        known = {s: np.asarray(v)[:: found.substeps] for s, v in found.known.items()}
+        # The time, on which a goal may depend, is known and no state.
+        states = set(problem.plant.states)
+        known = {s: np.asarray(v)[:: found.substeps] for s, v in found.known.items() if s in states}
         self._known = [(problem.plant.states.index(s), v) for s, v in known.items()]
         self._read = ObservedState(problem, symbols - known.keys())
         self._center, self._half = (np.array(part) for part in center_and_half_width(problem))

@@ -69,6 +69,7 @@ def kept_values(first: int, last: int, *arguments: Any) -> None:
         values = _box_values(*given, tables, GridArrays(*grid))
         expected[part] = (values @ weights).min(axis=1)
         wanted, caps = levels[part, None], np.repeat(levels[part, None], images.shape[2], axis=1)
+        open_ = np.ones(caps.shape, dtype=bool)
         for _ in range(_ROUNDS):
             bound = np.minimum(values, caps[..., None]) @ weights
             slope = (values > caps[..., None]) @ weights

@@ -207,9 +207,11 @@ class ExpectedBounds:
                 values = table.reshape(self._table.states, -1)
                 found = self._sets.ahead(k, state, values, sign)
             else:
-                if self._parts is None or self._sets.depend_on_time:
-                    self._parts = self._sets.of_cells(self._smoothing.fine, k)
-                counts = self._parts.inside if sign > 0 else self._parts.touches
+                # Threads may fill several instants at once.
+                parts = self._parts or self._sets.of_cells(self._smoothing.fine, k)
+                if not self._sets.depend_on_time:
+                    self._parts = parts
+                counts = parts.inside if sign > 0 else parts.touches
                 found = self._smoothing.smoothed(table if sign > 0 else -table, counts)
             self._ahead[sign][row] = found
             self._filled[sign][row] = True

@@ -13,7 +13,7 @@ from safe_envs.errors import InvalidInputError, NotCompilableError
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 
-_ROUNDING = 1e-9
+ROUNDING = 1e-9
 """The part of p_k that rounding may cost."""
 
 _NAMES = ("instant", "promise", "promise_ended")
@@ -104,7 +104,7 @@ class PromiseMemory:
         self._expected, self.levels = expected, level
         loss = wanted - level
         if np.count_nonzero(loss):
-            self.losses += int(np.count_nonzero(loss > _ROUNDING * wanted))
+            self.losses += int(np.count_nonzero(loss > ROUNDING * wanted))
             self.largest_loss = max(self.largest_loss, float(loss.max()))
         margin, count = expected - level, self._barriers
         return FilterDecision(

@@ -6,6 +6,7 @@ import gc
 import importlib.util
 import json
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,6 +26,9 @@ from safe_envs.wrappers.value.promise_tables import (
     why_not_of_plant,
 )
 from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.solve import solve
+from safe_envs.wrappers.value.table_files import save_table
 from tests.conftest import problem_of
 
 SCALAR, SHORT = "safe_envs/Scalar-v0", {"horizon": 0.3}
@@ -163,6 +167,24 @@ def test_the_guarantee_is_of_the_plant_where_the_table_covers_it():
             problem, missing, knowledge
         )
     assert why_not_of_plant(problem_of(SCALAR), plain, "model") == ""
+
+
+def test_a_bound_is_withheld_where_the_table_lets_p_k_fall(tmp_path):
+    # The wrong one says 1 everywhere in C, under a checksum that fits.
+    problem = problem_of(SCALAR, horizon=0.3, noise=4.0)
+    settings = ValueSettings(knowledge="plant", cells=(100,))
+    right = solve(problem, settings)
+    wrong = replace(right, lower=(right.upper > 0.0).astype(np.float32), upper=right.upper * 0 + 1)
+    notes = []
+    for name, table in (("right", right), ("wrong", wrong)):
+        save_table(table, tmp_path / name)
+        text = f"promise:p=0.95:table={tmp_path / name}"
+        options = {"horizon": 0.3, "noise": 4.0}
+        (row,) = evaluate(SCALAR, "nominal", [text], options=options, episodes=300).rows
+        notes.append((row.estimated_bound is None, row.withheld))
+    assert notes[0] == (False, None)
+    assert notes[1][0]
+    assert "the table is wrong" in notes[1][1]
 
 
 def test_a_bound_that_the_rate_contradicts_is_withheld():

@@ -16,8 +16,10 @@ from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.agents.policies.observed_state import ObservedState
 from safe_envs.errors import InvalidInputError, NotCompilableError
 from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.signals import TIME
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import FilterSpec
+from safe_envs.wrappers.value.settings import ValueSettings
 from tests.agents.policies.coarse import COARSE, SHORT
 
 DISK = "StochasticDubins-v0"
@@ -167,3 +169,12 @@ def test_a_third_party_env_has_no_table():
     spaces = SafeVectorEnv(problem, 1).single_observation_space, None
     with pytest.raises(ConfigurationError, match="only a model is known"):
         make_policy("best", problem, spaces=spaces, filter_spec=FilterSpec.__new__(FilterSpec))  # pyright: ignore[reportArgumentType]
+
+
+def test_a_goal_may_depend_on_the_time():
+    problem = make_problem("safe_envs/Scalar-v0", horizon=0.05)
+    x = problem.plant.states[0]
+    timed = replace(problem, goal=TIME - 0.04 + 0 * x)
+    settings = ValueSettings(knowledge="plant", cells=(20,))
+    action, _ = BestPolicy(timed, settings).predict(np.zeros(1))
+    assert -1.0 <= action.item() <= 1.0

@@ -17,7 +17,8 @@ from safe_envs.user_cache import VARIABLE
 from safe_envs.wrappers.value import table_cache
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.table_cache import forget_old_tables, table_for
-from safe_envs.wrappers.value.table_files import ValueFileError, load_table, save_table
+from safe_envs.wrappers.value.table_files import FORMAT, ValueFileError, load_table, save_table
+from tests.wrappers.value.systems import scalar, solved, x
 from tests.wrappers.value.test_table_files import PROBLEM, table_of
 
 
@@ -198,3 +199,20 @@ def test_a_file_that_cannot_be_written_is_named_before_the_work(folder, computed
     with pytest.raises(ConfigurationError, match="is a folder"):
         table_for(PROBLEM, file=tmp_path)
     assert not computed
+
+
+@pytest.mark.parametrize(
+    ("problem", "means"),
+    [
+        (scalar(), (0.96320188, 0.98909324)),
+        (scalar(-x, 0.2 + 0.3 * x), (0.97694087, 0.99563587)),
+    ],
+)
+def test_other_values_are_of_another_format(problem, means):
+    """Whoever changes how values are computed raises FORMAT, and then these numbers.
+
+    Else the tables in caches, which an earlier way has computed, are taken for the new ones.
+    """
+    table = solved(problem, 60, inputs=9)
+    assert FORMAT == 2
+    assert (table.lower.mean(), table.upper.mean()) == pytest.approx(means, abs=2e-6)
