@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
+from safe_envs.number_text import finite_number
 
 KNOWLEDGE = ("model", "plant")
 LEAVING = ("violation", "safe")
@@ -51,16 +52,19 @@ class ValueSettings:
                 ' "always safe & eventually goal"'
             )
         if self.cells is not None:
+            if isinstance(self.cells, str) or not isinstance(self.cells, Iterable):
+                raise ConfigurationError(
+                    f"cells = {shown(self.cells)}; give a whole number for each coordinate, such as"
+                    " (400, 100)"
+                )
             object.__setattr__(self, "cells", tuple(self.cells))
             for count in self.cells:
                 require_whole("cells", count, 2)
         if self.inputs is not None:
             require_whole("inputs", self.inputs, 2)
-        if not 0 < self.memory < float("inf"):
+        if not finite_number("memory", self.memory) > 0:
             raise ConfigurationError(f"memory = {shown(self.memory)}; give a number of bytes")
-        intervals = {
-            str(name): (float(low), float(high)) for name, (low, high) in self.intervals.items()
-        }
+        intervals = {str(name): _interval(name, given) for name, given in self.intervals.items()}
         object.__setattr__(self, "intervals", intervals)
 
     def as_dict(self) -> dict[str, Any]:
@@ -74,3 +78,14 @@ class ValueSettings:
             "inputs": self.inputs,
             "memory": self.memory,
         }
+
+
+def _interval(name: str, given: Any) -> tuple[float, float]:
+    try:
+        low, high = given
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"interval of {name} = {shown(given)}; give two numbers, the lower one first"
+        ) from error
+    ends = tuple(finite_number(f"interval of {name}", end) for end in (low, high))
+    return ends[0], ends[1]

@@ -164,10 +164,9 @@ class _Reader:
         allowed = (*self._names, "always", "eventually")
         if kind == "word" and written not in OPERATORS:
             self._refuse(place, f"{shown(written)} is no set", nearest(written, allowed))
-        return self._refuse(
-            place, f"{written if kind == 'end' else shown(written)} is no beginning of a formula",
-            f"allowed: {', '.join(allowed)}, ! and (",
-        )  # fmt: skip
+        missing = "the text ends where a formula has to begin"
+        wrong = missing if kind == "end" else f"no formula begins with {shown(written)}"
+        return self._refuse(place, wrong, f"allowed: {', '.join(allowed)}, ! and (")
 
     def _window(self) -> tuple[int, int] | None:
         place = self._tokens[self._next][2]

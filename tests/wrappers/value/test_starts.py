@@ -34,6 +34,9 @@ def test_the_mean_over_random_starts():
     assert values.starts > 1000
     assert values.lower <= mean <= values.upper
     assert 0 < max(values.margin) < 0.02
+    lower, upper = ahead.start_bounds(draw_starts(problem, values.starts, 0))
+    assert values.lower == pytest.approx(lower.mean() - values.margin[0], abs=1e-12)
+    assert values.upper == pytest.approx(min(1.0, upper.mean() + values.margin[1]), abs=1e-12)
     assert start_values(ahead, problem) == values
 
 
