@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import Components, compile_function
+from safe_envs.dynamics.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.cell_sets import Sets
@@ -15,6 +14,7 @@ from safe_envs.wrappers.value.expected_bounds import ExpectedBounds
 from safe_envs.wrappers.value.product_tables import ProductTables
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
+from safe_envs.wrappers.value.seen_sets import SeenSets
 from safe_envs.wrappers.value.smoothing import Smoothing
 from safe_envs.wrappers.value.step_images import Step
 from safe_envs.wrappers.value.table import ValueTable
@@ -56,15 +56,7 @@ class LookAhead:
         if small.automaton is not None:
             self._product = ProductTables(small, settings.leaving, smoothing)
             self._most = self._product.most
-        self._barriers: Any = compile_function(
-            problem.plant.states,
-            [problem.plant.numeric(barrier.expression) for barrier in problem.barriers],
-            "arrays",
-        )
-        self._leaves: Any = None
-        if settings.leaving == "violation" and small.outside.free_symbols:
-            symbols = (*small.symbols, *small.known)
-            self._leaves = compile_function(symbols, (small.outside,), "arrays")
+        self._seen = SeenSets(problem, small, settings.leaving)
         self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
         self._noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
@@ -92,14 +84,7 @@ class LookAhead:
         k, q = np.asarray(k), self._coordinates(x)
         if self._product is not None:
             return self._product_values(k, q, a)
-        values = self._values_of_cells(k, q)
-        with np.errstate(all="ignore"):
-            # The signs that the env sees: in exact arithmetic they might be others.
-            for h in self._barriers(*x):
-                values = values * (h > 0.0)
-            if self._leaves is not None:
-                known = [each[k * self._reduced.substeps] for each in self._reduced.known.values()]
-                values = values * (self._leaves(*q, *known)[0] <= 0.0)
+        values = self._values_of_cells(k, q) * self._seen.are_safe(k, x, q)
         return self._where_assumed(k, x, values)
 
     def expected(

@@ -16,7 +16,7 @@ from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.step_images import Step
 
-_CELLS = {1: 4000, 2: 1_000_000, 3: 500_000, 4: 600_000}
+_CELLS = {1: 1000, 2: 1_000_000, 3: 500_000, 4: 600_000}
 """Cells of a problem whose noise is not divided into boxes."""
 
 _LESS = 0.95
