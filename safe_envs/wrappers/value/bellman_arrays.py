@@ -15,6 +15,8 @@ from safe_envs.wrappers.value.grid_arrays import GridArrays
 
 _AT_ONCE = 200_000
 
+_ROUNDS = 60
+
 
 def expected_values(first: int, last: int, *arguments: Any) -> None:
     """Bound the expected value of states under inputs from below; see `bellman_kernel`."""
@@ -57,6 +59,26 @@ def sweep_upper(first: int, last: int, *arguments: Any) -> None:
         found[part] = known[part].max(axis=1)
 
 
+def least_caps(first: int, last: int, *arguments: Any) -> None:
+    """Find how little suffices of next values; see `spending_kernel`."""
+    images, effects, inputs, weights, layers, tables, *grid, _, _, levels, found = arguments
+    for part in _parts(first, last, images):
+        given = images[part, 0], effects[part], inputs[part, 0], layers[part]
+        values = _box_values(*given, tables, GridArrays(*grid))
+        wanted, caps = levels[part, None], np.repeat(levels[part, None], images.shape[2], axis=1)
+        for _ in range(_ROUNDS):
+            bound = np.minimum(values, caps[..., None]) @ weights
+            slope = (values > caps[..., None]) @ weights
+            open_ = (bound < wanted) & (caps < np.inf)
+            if not open_.any():
+                break
+            more = (wanted - bound) / np.maximum(slope, 1e-300) * (1.0 + 1e-9) + 1e-16
+            caps = np.where(open_, np.where(slope > 0.0, caps + more, np.inf), caps)
+        else:
+            caps[open_] = np.inf
+        found[part] = caps.max(axis=1)
+
+
 def _parts(first: int, last: int, images: np.ndarray) -> list[np.ndarray]:
     size = max(1, _AT_ONCE // (images.shape[2] * images.shape[3]))
     return [np.arange(a, min(a + size, last)) for a in range(first, last, size)]
@@ -73,14 +95,26 @@ def _expected(
     grid: GridArrays,
 ) -> np.ndarray:
     """Return bounds (B,) for images (B, R, W, n, 2) and inputs (B or 1, m, 2)."""
+    value = _box_values(images, effects, inputs, layers, tables, grid)
+    return (rest + value @ weights).min(axis=1)
+
+
+def _box_values(
+    images: np.ndarray,
+    effects: np.ndarray,
+    inputs: np.ndarray,
+    layers: np.ndarray,
+    tables: np.ndarray,
+    grid: GridArrays,
+) -> np.ndarray:
+    """Return the least values (B, R, W) of the cells that images (B, R, W, n, 2) touch."""
     products = effects[..., :, None] * inputs[:, None, None, :, None, :]
     low = images[..., 0] + products.min(axis=(-1, -2)).sum(axis=-1)[:, :, None]
     high = images[..., 1] + products.max(axis=(-1, -2)).sum(axis=-1)[:, :, None]
     first, last, misses, leaves = _windows(low, high, grid)
     value = _least(layers[:, None, None], tables, grid.counts, first, last)
     value = np.where(leaves, np.minimum(value, 0.0), value)
-    value = np.where(misses, 0.0, value)
-    return (rest + value @ weights).min(axis=1)
+    return np.where(misses, 0.0, value)
 
 
 def _windows(

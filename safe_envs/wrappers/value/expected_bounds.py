@@ -86,6 +86,61 @@ class ExpectedBounds:
             self._fill((k, places), q, inputs, sign, 0, found)
         return found
 
+    @property
+    def sees_values(self) -> bool:
+        """Whether boxes of noise show what values the next states have, and not only their mean."""
+        return not any(self._step.blur)
+
+    def caps(
+        self,
+        k: np.ndarray,
+        q: Sequence[np.ndarray],
+        inputs: np.ndarray,
+        levels: np.ndarray,
+        places: np.ndarray,
+    ) -> np.ndarray:
+        """Return the least caps c with lower bounds of E min(c, L) that reach levels, shape (B,).
+
+        inf where none is known.
+
+        Args:
+            k: control instants before K, int array (B,).
+            q: coordinates, arrays (B,).
+            inputs: one for each state, shape (B, m).
+            levels: that are wanted, shape (B,).
+            places: of the states of the automaton among those with tables, int array (B,).
+        """
+        found = np.full(len(k), np.inf)
+        if not self.sees_values:
+            return found
+        size = max(1, _AT_ONCE // len(self._step.noise.weights))
+        instants = np.unique(k) if self._step.depends_on_time else [None]
+        for instant in instants:
+            rows = np.arange(len(k)) if instant is None else np.flatnonzero(k == instant)
+            for first in range(0, len(rows), size):
+                part = rows[first : first + size]
+                own = np.empty(len(part))
+                ends = np.repeat(inputs[part, None, :, None], 2, axis=3)
+                layers = self._layers(k[part], places[part], 1)
+                images, effects = self._step.images(
+                    [c[part] for c in q], [c[part] for c in q], ends, (instant or 0) * self._substeps
+                )
+                self._functions["least_caps"](
+                    0, len(part), images, effects, ends, self._step.noise.weights, layers,
+                    self._ahead[1], *self._means, np.zeros(2 * AXES),
+                    np.empty(len(self._step.noise.weights)), levels[part], own,
+                )  # fmt: skip
+                found[part] = own
+        return found
+
+    def _layers(self, k: np.ndarray, places: np.ndarray, sign: int) -> np.ndarray:
+        """Return the rows of the smoothed tables of the next instants, after filling them."""
+        rows = np.maximum(k + 1 - self._table.first, 0) * self._table.states + places
+        if not self._filled[sign][rows].all():
+            for row, at in zip(*np.unique(rows, return_index=True), strict=True):
+                self._fill_row(int(row), sign, int(k[at]) + 1)
+        return rows
+
     def _fill(
         self,
         at: tuple[np.ndarray, np.ndarray],
@@ -96,9 +151,7 @@ class ExpectedBounds:
         found: np.ndarray,
     ) -> None:
         k, places = at
-        rows = np.maximum(k + 1 - self._table.first, 0) * self._table.states + places
-        for row, instant_ahead in zip(*np.unique(rows, return_index=True), strict=True):
-            self._fill_row(int(row), sign, int(k[instant_ahead]) + 1)
+        rows = self._layers(k, places, sign)
         images, effects = self._step.images(q, q, inputs, instant * self._substeps)
         rest = 0.0 if sign > 0 else self._rest
         expected = self._functions["expected_values"]

@@ -48,59 +48,113 @@ def expected_value(  # noqa: PLR0913
         scales: of the grid.
         shifts: scratch array.
     """
-    n, m = effects.shape[2], effects.shape[3]
+    n = effects.shape[2]
     worst = inf
     for r in range(images.shape[2]):
-        for i in range(n):
-            low, high = -scales[i, 3], scales[i, 3]
-            for j in range(m):
-                b0, b1 = effects[a, r, i, j, 0], effects[a, r, i, j, 1]
-                u0, u1 = inputs[b, u, j, 0], inputs[b, u, j, 1]
-                p, q, s, t = b0 * u0, b0 * u1, b1 * u0, b1 * u1
-                low += min(min(p, q), min(s, t))
-                high += max(max(p, q), max(s, t))
-            shifts[2 * i], shifts[2 * i + 1] = low, high
+        move_by_inputs(a, r, b, u, effects, inputs, scales, shifts)
         total = rest
         for w in range(images.shape[3]):
-            image = images[a, v, r, w]
-            f1, l1, f2, l2, f3, l3 = 0, 0, 0, 0, 0, 0
-            f0, l0 = cells_between(
-                image[0, 0] + shifts[0], image[0, 1] + shifts[1], 0, counts, places, edges, scales
+            value = box_value(
+                images[a, v, r, w], n, shifts, layer, tables, counts, places, edges, scales
             )
-            if n > 1:
-                f1, l1 = cells_between(
-                    image[1, 0] + shifts[2],
-                    image[1, 1] + shifts[3],
-                    1,
-                    counts,
-                    places,
-                    edges,
-                    scales,
-                )
-            if n > 2:
-                f2, l2 = cells_between(
-                    image[2, 0] + shifts[4],
-                    image[2, 1] + shifts[5],
-                    2,
-                    counts,
-                    places,
-                    edges,
-                    scales,
-                )
-            if n > 3:
-                f3, l3 = cells_between(
-                    image[3, 0] + shifts[6],
-                    image[3, 1] + shifts[7],
-                    3,
-                    counts,
-                    places,
-                    edges,
-                    scales,
-                )
-            value = least_value(f0, l0, f1, l1, f2, l2, f3, l3, layer, tables, counts)
             total += weights[w] * value
         worst = min(worst, total)
     return worst
+
+
+def move_by_inputs(
+    a: int,
+    r: int,
+    b: int,
+    u: int,
+    effects: np.ndarray,
+    inputs: np.ndarray,
+    scales: np.ndarray,
+    shifts: np.ndarray,
+) -> None:
+    """Put into `shifts` how far an input moves the ends of the images, with room for rounding.
+
+    Args:
+        a: the state.
+        r: the scenario.
+        b: place of the state in `inputs`.
+        u: place of the input in `inputs`.
+        effects: see `expected_values`, as for all others.
+        inputs: see there.
+        scales: of the grid.
+        shifts: receives the lower and the upper shift of each coordinate.
+    """
+    n, m = effects.shape[2], effects.shape[3]
+    for i in range(n):
+        low, high = -scales[i, 3], scales[i, 3]
+        for j in range(m):
+            b0, b1 = effects[a, r, i, j, 0], effects[a, r, i, j, 1]
+            u0, u1 = inputs[b, u, j, 0], inputs[b, u, j, 1]
+            p, q, s, t = b0 * u0, b0 * u1, b1 * u0, b1 * u1
+            low += min(min(p, q), min(s, t))
+            high += max(max(p, q), max(s, t))
+        shifts[2 * i], shifts[2 * i + 1] = low, high
+
+
+def box_value(
+    image: np.ndarray,
+    n: int,
+    shifts: np.ndarray,
+    layer: int,
+    tables: np.ndarray,
+    counts: np.ndarray,
+    places: np.ndarray,
+    edges: np.ndarray,
+    scales: np.ndarray,
+) -> float:
+    """Return the least value of the cells that an image touches.
+
+    Args:
+        image: ends of each coordinate, shape (n, 2).
+        n: number of coordinates.
+        shifts: of the ends; see `move_by_inputs`.
+        layer: which of the tables to take.
+        tables: see `expected_values`.
+        counts: of the grid.
+        places: of the grid.
+        edges: of the grid.
+        scales: of the grid.
+    """
+    f1, l1, f2, l2, f3, l3 = 0, 0, 0, 0, 0, 0
+    f0, l0 = cells_between(
+        image[0, 0] + shifts[0], image[0, 1] + shifts[1], 0, counts, places, edges, scales
+    )
+    if n > 1:
+        f1, l1 = cells_between(
+            image[1, 0] + shifts[2],
+            image[1, 1] + shifts[3],
+            1,
+            counts,
+            places,
+            edges,
+            scales,
+        )
+    if n > 2:
+        f2, l2 = cells_between(
+            image[2, 0] + shifts[4],
+            image[2, 1] + shifts[5],
+            2,
+            counts,
+            places,
+            edges,
+            scales,
+        )
+    if n > 3:
+        f3, l3 = cells_between(
+            image[3, 0] + shifts[6],
+            image[3, 1] + shifts[7],
+            3,
+            counts,
+            places,
+            edges,
+            scales,
+        )
+    return least_value(f0, l0, f1, l1, f2, l2, f3, l3, layer, tables, counts)
 
 
 def cells_between(

@@ -146,6 +146,36 @@ class LookAhead:
             chosen[silent] = upper.argmax(axis=1)
         return self.inputs[chosen], best
 
+    def caps(
+        self,
+        k: np.ndarray,
+        x: Components,
+        u: np.ndarray,
+        levels: np.ndarray,
+        a: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the least caps c with lower bounds of E min(c, L_{k+1}(x')) that reach levels.
+
+        Args:
+            k: control instants before K, int array (B,).
+            x: n components of the states, (B,).
+            u: inputs in physical units, shape (B, m).
+            levels: that are wanted, shape (B,).
+            a: states of the automaton after reading x, int (B,); by default those of starts.
+
+        Returns:
+            Shape (B,), inf where none is known.
+        """
+        k, q = np.asarray(k), self._coordinates(x)
+        if self._product is None:
+            return self._tables.caps(k, q, u, levels, np.zeros(len(k), dtype=np.int64))
+        a = self._product.first_states(q) if a is None else np.asarray(a)
+        found = np.full(len(k), np.inf)
+        rows = np.flatnonzero(np.isnan(self._product.settled(k, q, a)))
+        places = self._product.states.place[a[rows]]
+        found[rows] = self._tables.caps(k[rows], [c[rows] for c in q], u[rows], levels[rows], places)
+        return found
+
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
 
