@@ -123,7 +123,10 @@ class ExpectedBounds:
                 ends = np.repeat(inputs[part, None, :, None], 2, axis=3)
                 layers = self._layers(k[part], places[part], 1)
                 images, effects = self._step.images(
-                    [c[part] for c in q], [c[part] for c in q], ends, (instant or 0) * self._substeps
+                    [c[part] for c in q],
+                    [c[part] for c in q],
+                    ends,
+                    (instant or 0) * self._substeps,
                 )
                 self._functions["least_caps"](
                     0, len(part), images, effects, ends, self._step.noise.weights, layers,

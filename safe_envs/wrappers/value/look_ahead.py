@@ -30,6 +30,7 @@ class LookAhead:
         steps: control periods of the table, K.
         inputs: that the table was computed with, in physical units, shape (U, m).
         box: (low, high) of each input.
+        specification: of the table; "" for that of staying safe.
         automaton: of the specification; None for the values of staying safe.
 
     Raises:
@@ -48,6 +49,7 @@ class LookAhead:
         step = Step(small)
         smoothing = Smoothing(table.grid, step.blur)
         self._sets = Sets(small, settings.leaving)
+        self.specification = settings.specification
         self.automaton, self._product, self._most = small.automaton, None, 0.0
         if small.automaton is not None:
             self._product = ProductTables(small, settings.leaving, smoothing)
@@ -173,7 +175,9 @@ class LookAhead:
         found = np.full(len(k), np.inf)
         rows = np.flatnonzero(np.isnan(self._product.settled(k, q, a)))
         places = self._product.states.place[a[rows]]
-        found[rows] = self._tables.caps(k[rows], [c[rows] for c in q], u[rows], levels[rows], places)
+        found[rows] = self._tables.caps(
+            k[rows], [c[rows] for c in q], u[rows], levels[rows], places
+        )
         return found
 
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
@@ -203,6 +207,18 @@ class LookAhead:
             x: n components of the states, (B,).
         """
         return self._sets.of_states(k, self._coordinates(x))
+
+    def settled(self, k: np.ndarray, x: Components, a: np.ndarray) -> np.ndarray:
+        """Return 1 or 0 where it is settled whether a specification is met, NaN elsewhere.
+
+        Args:
+            k: control instants, int array (B,).
+            x: n components of the states, (B,).
+            a: states of the automaton after reading x, int array (B,).
+        """
+        if self._product is None:
+            return np.full(len(k), np.nan)
+        return self._product.settled(np.asarray(k), self._coordinates(x), a)
 
     def first_states(self, x: Components) -> np.ndarray:
         """Return the states of the automaton at starts; zeros without a specification.

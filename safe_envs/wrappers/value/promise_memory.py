@@ -1,4 +1,4 @@
-"""What a promise filter remembers of episodes: the control instant, and what is still kept."""
+"""What a promise filter remembers of episodes: control instant, what is kept, and its automaton."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.errors import InvalidInputError, NotCompilableError
 from safe_envs.wrappers.filter_qp import FilterDecision
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
+from safe_envs.wrappers.value.product_look_ahead import ProductLookAhead
+from safe_envs.wrappers.value.promise_filter import PromiseChoice, PromiseFilter
 
 _ROUNDING = 1e-9
 """The part of p_k that rounding may cost."""
 
-_NAMES = ("instant", "promise", "promise_ended")
+_NAMES = ("instant", "promise", "promise_ended", "promise_automaton")
 
 
 class PromiseMemory:
@@ -42,6 +43,10 @@ class PromiseMemory:
         self._last = promise_filter.look_ahead.steps - 1
         self._instants = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
+        # Of the automaton of a specification; 0 for that of staying safe.
+        self._states = np.zeros(num_envs, dtype=np.int64)
+        ahead = promise_filter.look_ahead
+        self._product = ahead if isinstance(ahead, ProductLookAhead) else None
         self._expected = np.ones(num_envs)
         self.levels = np.zeros(num_envs)
         self.losses, self.largest_loss = 0, 0.0
@@ -63,6 +68,11 @@ class PromiseMemory:
             self._instants[chosen], self._ended[chosen] = 0, False
             self.levels = self.levels.copy()
             self.levels[chosen] = self.safety_filter.start(starts)
+            if self._product is not None:
+                pairs = self._product.starts(starts)
+                self._states[chosen] = pairs[-1]
+                sure = self._product.settled(self._instants[chosen], pairs) == 1.0
+                self.levels[chosen] = np.where(sure, 1.0, self.levels[chosen])
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
         """Decide for one state; see `SafetyFilter.decide_floats`.
@@ -98,7 +108,11 @@ class PromiseMemory:
         """
         wanted = np.where(self._ended, 0.0, self.levels)
         k = np.minimum(self._instants, self._last)
-        action, expected, level, replaced = self.safety_filter.choose(k, wanted, x, u)
+        if self._product is None:
+            found = self.safety_filter.choose(k, wanted, x, u)
+        else:
+            found = self._chosen_of_pairs(self._product, k, wanted, x, u)
+        action, expected, level, replaced = found
         self._expected, self.levels = expected, level
         loss = wanted - level
         if np.count_nonzero(loss):
@@ -117,13 +131,42 @@ class PromiseMemory:
             ended: the envs whose episode is over, bool (num_envs,).
         """
         self._instants = self._instants + 1
-        reached = self.safety_filter.look_ahead.values(
-            np.minimum(self._instants, self._last + 1), _arrays(x)
+        k, reached_at, held = (
+            np.minimum(self._instants, self._last + 1),
+            _arrays(x),
+            self.levels > 0.0,
         )
-        held = self.levels > 0.0
+        sure = None
+        if self._product is not None:
+            sure = held & self._product.met(np.maximum(k - 1, 0), self._states)
+            reached_at = self._product.following(k, reached_at, self._states)
+            self._states = reached_at[-1]
+            # What is met before the workspace is left, counts.
+            sure |= held & (self._product.settled(k, reached_at) == 1.0)
+        reached = self.safety_filter.look_ahead.values(k, reached_at)
         share = self.levels / np.where(held, self._expected, 1.0)
         self.levels = np.where(held, np.clip(share * reached, 0.0, 1.0), 0.0)
+        if sure is not None:
+            self.levels[sure] = 1.0
         self._ended = self._ended | ended
+
+    def _chosen_of_pairs(
+        self,
+        product: ProductLookAhead,
+        k: np.ndarray,
+        wanted: np.ndarray,
+        x: Components,
+        u: Components,
+    ) -> PromiseChoice:
+        """Choose inputs for a specification; the proposed ones where it is violated for good."""
+        pairs = (*x, self._states)
+        found = self.safety_filter.choose(k, wanted, pairs, u)
+        lost = np.flatnonzero((found.level <= 0.0) & (product.settled(k, pairs) == 0.0))
+        if lost.size:
+            for component, proposed in zip(found.action, u, strict=True):
+                component[lost] = proposed[lost]
+            found.replaced[lost] = False
+        return found
 
     def report(self) -> Info:
         """Return p_k of the state that was reached last, by its name in the info."""
@@ -137,7 +180,7 @@ class PromiseMemory:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode is, in arrays with the batch in front."""
-        found = (self._instants, self.levels, self._ended)
+        found = (self._instants, self.levels, self._ended, self._states)
         return {name: each.copy() for name, each in zip(_NAMES, found, strict=True)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
@@ -152,9 +195,9 @@ class PromiseMemory:
                 f"the snapshot has no {', '.join(missing)}: it is of envs without a promise filter;"
                 " take one of envs with it"
             )
-        instants, levels, ended = [np.array(snapshot[name]) for name in _NAMES]
+        instants, levels, ended, states = [np.array(snapshot[name]) for name in _NAMES]
         self._instants, self._ended = instants.astype(np.int64), ended.astype(bool)
-        self.levels = levels.astype(float)
+        self.levels, self._states = levels.astype(float), states.astype(np.int64)
 
 
 def _arrays(components: Sequence[Any]) -> Components:
