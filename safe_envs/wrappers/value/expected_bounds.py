@@ -122,11 +122,8 @@ class ExpectedBounds:
                 own = np.empty(len(part))
                 ends = np.repeat(inputs[part, None, :, None], 2, axis=3)
                 layers = self._layers(k[part], places[part], 1)
-                images, effects = self._step.images(
-                    [c[part] for c in q],
-                    [c[part] for c in q],
-                    ends,
-                    (instant or 0) * self._substeps,
+                images, effects = self._step.of_points(
+                    [c[part] for c in q], ends, (instant or 0) * self._substeps
                 )
                 self._functions["least_caps"](
                     0, len(part), images, effects, ends, self._step.noise.weights, layers,
@@ -155,7 +152,7 @@ class ExpectedBounds:
     ) -> None:
         k, places = at
         rows = self._layers(k, places, sign)
-        images, effects = self._step.images(q, q, inputs, instant * self._substeps)
+        images, effects = self._step.of_points(q, inputs, instant * self._substeps)
         rest = 0.0 if sign > 0 else self._rest
         expected = self._functions["expected_values"]
 

@@ -12,7 +12,10 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.intervals import Interval, interval_function
-from safe_envs.errors import ConfigurationError
+from safe_envs.compiled.program import Program, is_available
+from safe_envs.errors import ConfigurationError, NotCompilableError
+from safe_envs.wrappers.value.image_kernel import point_images
+from safe_envs.wrappers.value.image_source import image_source
 from safe_envs.wrappers.value.noise_boxes import NoiseBoxes, noise_boxes
 from safe_envs.wrappers.value.reduction import ReducedProblem
 
@@ -182,6 +185,54 @@ class Step:
             own = inputs[part] if len(inputs) > 1 else inputs
             ends = [Interval(a[part], b[part]) for a, b in zip(low, high, strict=True)]
             self._fill(images[part], effects[part], ends, own, instant)
+        return StepImages(images, effects)
+
+    @cached_property
+    def _kernel(self) -> Any:
+        """`point_images` of the step; None where it is not to be compiled."""
+        reduced, parts = self._reduced, self._parts
+        if not is_available():
+            return None
+        try:
+            source = image_source(
+                {
+                    "points": reduced.symbols,
+                    "known": tuple(reduced.known),
+                    "worlds": tuple(reduced.intervals),
+                    "noise": parts.boxed,
+                    "inputs": reduced.inputs,
+                },
+                parts.rest,
+                parts.effect,
+            )
+            return Program("steps of states", (point_images,), source).compiled()["point_images"]
+        except NotCompilableError:
+            return None
+
+    @cached_property
+    def _worlds(self) -> np.ndarray:
+        return np.array(self._scenarios, dtype=float).reshape(len(self._scenarios), -1, 2)
+
+    def of_points(self, q: Sequence[np.ndarray], inputs: np.ndarray, instant: int) -> StepImages:
+        """Return where states go; see `images`.
+
+        Args:
+            q: coordinates, n arrays (B,).
+            inputs: ends of the inputs, shape (1 or B, V, m, 2), for steps that are not affine.
+            instant: number of the sub-step, for states that are known in advance.
+        """
+        if self._kernel is None:
+            return self.images(q, q, inputs, instant)
+        n, m, scenarios = len(q), len(self._reduced.inputs), len(self._scenarios)
+        tried = 1 if self.is_affine else inputs.shape[1]
+        points, noise = np.array(q), self.noise
+        images = np.empty((points.shape[1], tried, scenarios, len(noise.weights), n, 2))
+        effects = np.empty((points.shape[1], scenarios, n, m, 2))
+        known = np.array([float(values[instant]) for values in self._reduced.known.values()])
+        self._kernel(
+            0, points.shape[1], points, known, self._worlds, noise.low, noise.high, inputs, images,
+            effects,
+        )  # fmt: skip
         return StepImages(images, effects)
 
     def _fill(
