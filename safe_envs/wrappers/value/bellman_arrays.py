@@ -59,12 +59,15 @@ def sweep_upper(first: int, last: int, *arguments: Any) -> None:
         found[part] = known[part].max(axis=1)
 
 
-def least_caps(first: int, last: int, *arguments: Any) -> None:
-    """Find how little suffices of next values; see `spending_kernel`."""
-    images, effects, inputs, weights, layers, tables, *grid, _, _, levels, found = arguments
+def kept_values(first: int, last: int, *arguments: Any) -> None:
+    """Bound expected values, and find how little of them suffices; see `spending_kernel`."""
+    images, effects, inputs, weights, layers, tables, *grid, _, _, levels, expected, found = (
+        arguments
+    )
     for part in _parts(first, last, images):
         given = images[part, 0], effects[part], inputs[part, 0], layers[part]
         values = _box_values(*given, tables, GridArrays(*grid))
+        expected[part] = (values @ weights).min(axis=1)
         wanted, caps = levels[part, None], np.repeat(levels[part, None], images.shape[2], axis=1)
         for _ in range(_ROUNDS):
             bound = np.minimum(values, caps[..., None]) @ weights

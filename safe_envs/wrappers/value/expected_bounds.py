@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 
 import numpy as np
 
@@ -86,22 +87,20 @@ class ExpectedBounds:
             self._fill((k, places), q, inputs, sign, 0, found)
         return found
 
-    @property
+    @cached_property
     def sees_values(self) -> bool:
         """Whether boxes of noise show what values the next states have, and not only their mean."""
         return not any(self._step.blur)
 
-    def caps(
+    def sufficient(
         self,
         k: np.ndarray,
         q: Sequence[np.ndarray],
         inputs: np.ndarray,
         levels: np.ndarray,
         places: np.ndarray,
-    ) -> np.ndarray:
-        """Return the least caps c with lower bounds of E min(c, L) that reach levels, shape (B,).
-
-        inf where none is known.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower bounds under inputs, and how little of the next values suffices.
 
         Args:
             k: control instants before K, int array (B,).
@@ -109,32 +108,57 @@ class ExpectedBounds:
             inputs: one for each state, shape (B, m).
             levels: that are wanted, shape (B,).
             places: of the states of the automaton among those with tables, int array (B,).
+
+        Returns:
+            The bounds, and the least caps c with lower bounds of E min(c, L) that reach the levels,
+            inf where none is known; shapes (B,).
         """
-        found = np.full(len(k), np.inf)
-        if not self.sees_values:
-            return found
-        size = max(1, _AT_ONCE // len(self._step.noise.weights))
-        instants = np.unique(k) if self._step.depends_on_time else [None]
+        ends = np.empty((len(k), 1, inputs.shape[1], 2))
+        ends[:, 0, :, 0] = ends[:, 0, :, 1] = inputs
+        weights = self._step.noise.weights
+        count = len(k)
+        if not self.sees_values or count * len(weights) > _AT_ONCE:
+            return self.bounds(k, q, ends, 1, places)[:, 0], np.full(count, np.inf)
+        expected, caps = np.empty(count), np.empty(count)
+        instants = np.unique(k) if self._step.depends_on_time else (0,)
         for instant in instants:
-            rows = np.arange(len(k)) if instant is None else np.flatnonzero(k == instant)
-            for first in range(0, len(rows), size):
-                part = rows[first : first + size]
-                own = np.empty(len(part))
-                ends = np.repeat(inputs[part, None, :, None], 2, axis=3)
-                layers = self._layers(k[part], places[part], 1)
-                images, effects = self._step.of_points(
-                    [c[part] for c in q], ends, (instant or 0) * self._substeps
+            rows = np.flatnonzero(k == instant) if len(instants) > 1 else slice(None)
+            own, time = ends[rows], int(instant) * self._substeps
+            images, effects = self._step.of_points([c[rows] for c in q], own, time)
+            found = np.empty((2, len(own)))
+            layers, wanted = self._layers(k[rows], places[rows], 1), levels[rows]
+
+            def sweep(first: int, last: int, shifts: np.ndarray) -> None:
+                self._functions["kept_values"](
+                    first,
+                    last,
+                    images,  # noqa: B023
+                    effects,  # noqa: B023
+                    own,  # noqa: B023
+                    weights,
+                    layers,  # noqa: B023
+                    self._ahead[1],
+                    *self._means,
+                    shifts,
+                    np.empty(len(weights)),
+                    wanted,  # noqa: B023
+                    *found,  # noqa: B023
                 )
-                self._functions["least_caps"](
-                    0, len(part), images, effects, ends, self._step.noise.weights, layers,
-                    self._ahead[1], *self._means, np.zeros(2 * AXES),
-                    np.empty(len(self._step.noise.weights)), levels[part], own,
-                )  # fmt: skip
-                found[part] = own
-        return found
+
+            self._spread(sweep, len(own), len(own) * len(weights))
+            expected[rows], caps[rows] = found
+        return expected, caps
+
+    def _spread(self, sweep: Callable[[int, int, np.ndarray], None], count: int, work: int) -> None:
+        """Call a sweep, in threads where that takes longer than to start them."""
+        if work < _LONG:
+            sweep(0, count, np.zeros(2 * AXES))
+        else:
+            with ThreadPoolExecutor(threads()) as pool:
+                in_parts(pool, count, sweep)
 
     def _layers(self, k: np.ndarray, places: np.ndarray, sign: int) -> np.ndarray:
-        """Return the rows of the smoothed tables of the next instants, after filling them."""
+        """Return the places of the smoothed tables of the next instants, after filling them in."""
         rows = np.maximum(k + 1 - self._table.first, 0) * self._table.states + places
         if not self._filled[sign][rows].all():
             for row, at in zip(*np.unique(rows, return_index=True), strict=True):
@@ -172,11 +196,7 @@ class ExpectedBounds:
                 found,
             )
 
-        if found.size * len(self._step.noise.weights) < _LONG:
-            sweep(0, len(k), np.zeros(2 * AXES))
-        else:
-            with ThreadPoolExecutor(threads()) as pool:
-                in_parts(pool, len(k), sweep)
+        self._spread(sweep, len(k), found.size * len(self._step.noise.weights))
 
     def _fill_row(self, row: int, sign: int, k: int) -> None:
         if not self._filled[sign][row]:

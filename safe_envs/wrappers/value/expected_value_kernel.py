@@ -96,7 +96,7 @@ def move_by_inputs(
         shifts[2 * i], shifts[2 * i + 1] = low, high
 
 
-def box_value(
+def box_value(  # noqa: PLR0913
     image: np.ndarray,
     n: int,
     shifts: np.ndarray,

@@ -89,12 +89,22 @@ def ends_outward(low: float, high: float, relative: float, tiny: float) -> Ends:
 
 
 def ends_sum(a: Ends, b: Ends) -> Ends:
-    """Return the interval of sums."""
+    """Return the interval of sums.
+
+    Args:
+        a: one interval.
+        b: the other one.
+    """
     return ends_outward(a[0] + b[0], a[1] + b[1], _LAST, 0.0)
 
 
 def ends_product(a: Ends, b: Ends) -> Ends:
-    """Return the interval of products; of an infinite and a zero end nothing is known."""
+    """Return the interval of products; of an infinite and a zero end nothing is known.
+
+    Args:
+        a: one interval.
+        b: the other one.
+    """
     p, q, s, t = a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]
     if p != p or q != q or s != s or t != t:
         return -inf, inf
@@ -135,17 +145,32 @@ def ends_exponential(a: Ends) -> Ends:
 
 
 def ends_larger(a: Ends, b: Ends) -> Ends:
-    """Return the interval of the larger of two numbers."""
+    """Return the interval of the larger of two numbers.
+
+    Args:
+        a: one interval.
+        b: the other one.
+    """
     return max(a[0], b[0]), max(a[1], b[1])
 
 
 def ends_smaller(a: Ends, b: Ends) -> Ends:
-    """Return the interval of the smaller of two numbers."""
+    """Return the interval of the smaller of two numbers.
+
+    Args:
+        a: one interval.
+        b: the other one.
+    """
     return min(a[0], b[0]), min(a[1], b[1])
 
 
 def holds_phase(a: Ends, phase: float) -> bool:
-    """Return whether an interval holds a whole number of turns and a phase, or nearly so."""
+    """Return whether an interval holds a whole number of turns and a phase, or nearly so.
+
+    Args:
+        a: the interval.
+        phase: in turns.
+    """
     first, last = a[0] / (2.0 * pi), a[1] / (2.0 * pi)
     first = first - phase - 4.0 * _LAST * (abs(first) + 1.0)
     last = last - phase + 4.0 * _LAST * (abs(last) + 1.0)
@@ -182,7 +207,12 @@ def ends_cosine(a: Ends) -> Ends:
 
 
 def ends_angle(y: Ends, x: Ends) -> Ends:
-    """Return the interval of angles of vectors; all where they may point to -x."""
+    """Return the interval of angles of vectors; all where they may point to -x.
+
+    Args:
+        y: their second entry.
+        x: their first one.
+    """
     if x[0] <= 0.0 and y[0] <= 0.0 and y[1] >= 0.0:
         return -_ANGLE, _ANGLE
     side = x[1] if y[0] >= 0.0 else x[0]

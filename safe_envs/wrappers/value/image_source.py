@@ -10,6 +10,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.program import Program, is_available
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers.value import image_kernel as kernels
 
@@ -87,8 +88,8 @@ class ImageWriter:
             raise NotCompilableError(f"there is no kernel for the power {exponent}")
         if exponent % 2:
             rest = self.value(base) if exponent == 1 else self.value(sp.Pow(base, exponent - 1))
-            return rest if exponent == 1 else self._call(
-                kernels.ends_product, rest, self.value(base)
+            return (
+                rest if exponent == 1 else self._call(kernels.ends_product, rest, self.value(base))
             )
         half = self.value(base if exponent == 2 else sp.Pow(base, exponent / 2))
         return self._call(kernels.ends_square, half)
@@ -137,7 +138,9 @@ def image_source(
     }
     writer = ImageWriter(arguments)
     moved = [writer.value(e)[1] for e in rest]
-    effects = [(i, j, writer.value(e)[1]) for i, row in enumerate(effect) for j, e in enumerate(row)]
+    effects = [
+        (i, j, writer.value(e)[1]) for i, row in enumerate(effect) for j, e in enumerate(row)
+    ]
     lines = writer.lines
     for i, j, name in effects:
         # An infinite effect of an input that is 0 would be no number.
@@ -157,6 +160,29 @@ def image_source(
         code.append("    " * max(level, 1) + loop)
         code += ["    " * (level + 1) + line for line in own]
     return Source("\n".join(code) + "\n", tuple(writer.uses))
+
+
+def image_function(
+    symbols: Mapping[str, Sequence[sp.Symbol]],
+    rest: Sequence[sp.Expr],
+    effect: Sequence[Sequence[sp.Expr]],
+) -> Callable[..., None] | None:
+    """Return `point_images` of a step; None without Numba, or without a kernel for an operation.
+
+    Args:
+        symbols: see `image_source`, as for all others.
+        rest: see there.
+        effect: see there.
+    """
+    if not is_available():
+        return None
+    try:
+        program = Program(
+            "steps of states", (kernels.point_images,), image_source(symbols, rest, effect)
+        )
+        return program.compiled()["point_images"]
+    except NotCompilableError:
+        return None
 
 
 def _enclosure(number: Any) -> tuple[float, float]:

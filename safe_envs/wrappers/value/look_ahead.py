@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import Components
+from safe_envs.dynamics.codegen import Components, compile_function
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.cell_sets import Sets
@@ -54,6 +55,15 @@ class LookAhead:
         if small.automaton is not None:
             self._product = ProductTables(small, settings.leaving, smoothing)
             self._most = self._product.most
+        self._barriers: Any = compile_function(
+            problem.plant.states,
+            [problem.plant.numeric(barrier.expression) for barrier in problem.barriers],
+            "arrays",
+        )
+        self._leaves: Any = None
+        if settings.leaving == "violation" and small.outside.free_symbols:
+            symbols = (*small.symbols, *small.known)
+            self._leaves = compile_function(symbols, (small.outside,), "arrays")
         self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
         self._noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
@@ -72,13 +82,18 @@ class LookAhead:
             x: n components of the states, (B,).
             a: states of the automaton after reading x, int (B,); by default those of starts.
         """
-        q = self._coordinates(x)
+        k, q = np.asarray(k), self._coordinates(x)
         if self._product is not None:
-            return self._product_values(np.asarray(k), q, a)
-        cells = self._table.grid.cell_of(q)
-        rows = np.maximum(np.asarray(k) - self._table.first, 0)
-        inside, _ = self._sets.of_states(k, q)
-        return np.where(inside & (cells >= 0), self._table.lower[rows, cells], 0.0)
+            return self._product_values(k, q, a)
+        values = self._values_of_cells(k, q)
+        with np.errstate(all="ignore"):
+            # The signs that the env sees: in exact arithmetic they might be others.
+            for h in self._barriers(*x):
+                values = values * (h > 0.0)
+            if self._leaves is not None:
+                known = [each[k * self._reduced.substeps] for each in self._reduced.known.values()]
+                values = values * (self._leaves(*q, *known)[0] <= 0.0)
+        return values
 
     def expected(
         self, k: np.ndarray, x: Components, u: np.ndarray, a: np.ndarray | None = None
@@ -148,15 +163,15 @@ class LookAhead:
             chosen[silent] = upper.argmax(axis=1)
         return self.inputs[chosen], best
 
-    def caps(
+    def sufficient(
         self,
         k: np.ndarray,
         x: Components,
         u: np.ndarray,
         levels: np.ndarray,
         a: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Return the least caps c with lower bounds of E min(c, L_{k+1}(x')) that reach levels.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return `expected` of an input for each state, and how little of the next values suffices.
 
         Args:
             k: control instants before K, int array (B,).
@@ -166,19 +181,14 @@ class LookAhead:
             a: states of the automaton after reading x, int (B,); by default those of starts.
 
         Returns:
-            Shape (B,), inf where none is known.
+            q_k(x, u), and the least caps c with lower bounds of E min(c, L_{k+1}(x')) that reach
+            the levels, inf where none is known; shapes (B,).
         """
+        if self._product is not None:
+            expected = self.expected(k, x, u[:, None, :], a)[:, 0]
+            return expected, np.full(len(expected), np.inf)
         k, q = np.asarray(k), self._coordinates(x)
-        if self._product is None:
-            return self._tables.caps(k, q, u, levels, np.zeros(len(k), dtype=np.int64))
-        a = self._product.first_states(q) if a is None else np.asarray(a)
-        found = np.full(len(k), np.inf)
-        rows = np.flatnonzero(np.isnan(self._product.settled(k, q, a)))
-        places = self._product.states.place[a[rows]]
-        found[rows] = self._tables.caps(
-            k[rows], [c[rows] for c in q], u[rows], levels[rows], places
-        )
-        return found
+        return self._tables.sufficient(k, q, u, levels, np.zeros(len(k), dtype=np.int64))
 
     def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the value at starts by a step of look-ahead; 0 outside the safe set.
@@ -242,6 +252,17 @@ class LookAhead:
             return a
         return self._product.next_states(np.asarray(k), self._coordinates(x), a)
 
+    def _values_of_cells(self, k: np.ndarray, q: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the lower table at coordinates between the edges; 0 outside of the grid."""
+        rows = np.maximum(k - self._table.first, 0)
+        cells, beyond = 0, False
+        for axis, values in zip(self._table.grid.axes, q, strict=True):
+            places = axis.edges.searchsorted(values, side="right") - 1
+            inner = np.minimum(np.maximum(places, 0), axis.count - 1)
+            beyond = beyond | ((places != inner) & (values != axis.edges[-1]))
+            cells = cells * axis.count + inner
+        return self._table.lower[rows, cells] * ~beyond
+
     def _product_values(
         self, k: np.ndarray, q: Sequence[np.ndarray], a: np.ndarray | None
     ) -> np.ndarray:
@@ -256,11 +277,10 @@ class LookAhead:
         return np.where(open_, np.where(cells >= 0, values, 0.0), found)
 
     def _coordinates(self, x: Components) -> list[np.ndarray]:
-        found = self._reduced.of_states(x)
-        size = np.broadcast_shapes(*(np.shape(c) for c in x))
+        size = x[0].shape
         return [
-            axis.wrapped(np.broadcast_to(np.asarray(c, dtype=np.float64), size))
-            for axis, c in zip(self._table.grid.axes, found, strict=True)
+            axis.wrapped(c if c.shape == size else np.broadcast_to(c, size))
+            for axis, c in zip(self._table.grid.axes, self._reduced.of_states(x), strict=True)
         ]
 
     def _bounds(

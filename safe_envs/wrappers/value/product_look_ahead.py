@@ -48,6 +48,12 @@ class ProductLookAhead:
         """Return the inputs of the largest q_k, and these q_k; see `StepValues`."""
         return self._ahead.best_input(k, x[:-1], x[-1])
 
+    def sufficient(
+        self, k: np.ndarray, x: Components, u: np.ndarray, levels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return q_k of an input for each pair, and the caps of next values; see `StepValues`."""
+        return self._ahead.sufficient(k, x[:-1], u, levels, x[-1])
+
     def starts(self, x: Components) -> Components:
         """Return the pairs in which episodes begin.
 

@@ -9,13 +9,19 @@ on with
 
     p_{k+1} = p_k L_{k+1}(x_{k+1}) / q_k(x_k, u_k).
 
+Where the table shows what values the next states have, box of noise by box, and not only their
+mean, the filter spends more evenly: with the least number c for which a lower bound of
+E min(c, L_{k+1}(x_{k+1})) is p_k,
+
+    p_{k+1} = min(c, L_{k+1}(x_{k+1})).
+
 *Guarantee.* P(safe up to K) >= E p_0 for every policy, learned, random or hostile, that does not
 know xi_k before it proposes u_k. Proof: since p_k <= q_k(x_k, u_k), p_{k+1} <= L_{k+1}(x_{k+1}) <=
 max q_{k+1}(x_{k+1}, .). So nothing is ever lost by lowering p_k, but for rounding, and there always
-is an input. Given the past, E p_{k+1} = p_k E L_{k+1}(x_{k+1}) / q_k(x_k, u_k) >= p_k: p is a
-submartingale. Outside C it is 0, and stays 0. Hence p_K <= L_K(x_K) <= 1 where x_0..x_K are all in
-C, and p_K = 0 elsewhere, so that P(safe) >= E p_K >= E p_0. An episode that ends safely before K
-stops p at a value of at most 1.
+is an input. Given the past, E p_{k+1} = p_k E L_{k+1}(x_{k+1}) / q_k(x_k, u_k) >= p_k, and with c
+E p_{k+1} = E min(c, L_{k+1}(x_{k+1})) >= p_k: p is a submartingale. Outside C it is 0, and stays 0.
+Hence p_K <= L_K(x_K) <= 1 where x_0..x_K are all in C, and p_K = 0 elsewhere, so that P(safe) >=
+E p_K >= E p_0. An episode that ends safely before K stops p at a value of at most 1.
 
 *What the guarantee is of.* The table's chain: that of the model, with knowledge = "plant" that of
 the plant. Where the two differ, E L_{k+1} is another number under the plant, and nothing is
@@ -71,12 +77,14 @@ class PromiseChoice(NamedTuple):
         expected: q_k there, shape (B,).
         level: p_k, lowered where no input keeps it, shape (B,).
         replaced: whether it is not the proposed input that is executed, shape (B,).
+        caps: c, which no p_{k+1} needs to exceed, inf where none is known, shape (B,).
     """
 
     action: Components
     expected: np.ndarray
     level: np.ndarray
     replaced: np.ndarray
+    caps: np.ndarray
 
 
 class PromiseFilter:
@@ -174,17 +182,21 @@ class PromiseFilter:
         Returns:
             The choice for each state.
         """
-        given = np.stack(u, axis=-1)
-        found = self.look_ahead.expected(k, x, given[:, None, :])[:, 0]
+        given = np.array(u).T
+        found, caps = self.look_ahead.sufficient(k, x, given, level)
         replaced = ~((found >= level) & (level > 0.0))
         if not np.count_nonzero(replaced):
-            return PromiseChoice(u, found, level, replaced)
+            return PromiseChoice(u, found, level, replaced, caps)
         rows = np.flatnonzero(replaced)
         action, found, level = given.copy(), np.array(found), level.copy()
         action[rows], found[rows], level[rows] = self._nearest(
             k[rows], level[rows], tuple([c[rows] for c in x]), given[rows]
         )
-        return PromiseChoice(tuple(np.ascontiguousarray(action.T)), found, level, replaced)
+        kept = rows[level[rows] > 0.0]
+        _, caps[kept] = self.look_ahead.sufficient(
+            k[kept], _part(x, kept), action[kept], level[kept]
+        )
+        return PromiseChoice(tuple(np.ascontiguousarray(action.T)), found, level, replaced, caps)
 
     def _nearest(
         self, k: np.ndarray, level: np.ndarray, x: Components, given: np.ndarray

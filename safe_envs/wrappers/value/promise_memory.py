@@ -48,6 +48,7 @@ class PromiseMemory:
         ahead = promise_filter.look_ahead
         self._product = ahead if isinstance(ahead, ProductLookAhead) else None
         self._expected = np.ones(num_envs)
+        self._caps = np.full(num_envs, np.inf)
         self.levels = np.zeros(num_envs)
         self.losses, self.largest_loss = 0, 0.0
         count = len(promise_filter.problem.barriers)
@@ -112,7 +113,7 @@ class PromiseMemory:
             found = self.safety_filter.choose(k, wanted, x, u)
         else:
             found = self._chosen_of_pairs(self._product, k, wanted, x, u)
-        action, expected, level, replaced = found
+        action, expected, level, replaced, self._caps = found
         self._expected, self.levels = expected, level
         loss = wanted - level
         if np.count_nonzero(loss):
@@ -131,12 +132,8 @@ class PromiseMemory:
             ended: the envs whose episode is over, bool (num_envs,).
         """
         self._instants = self._instants + 1
-        k, reached_at, held = (
-            np.minimum(self._instants, self._last + 1),
-            _arrays(x),
-            self.levels > 0.0,
-        )
-        sure = None
+        k, held = np.minimum(self._instants, self._last + 1), self.levels > 0.0
+        reached_at, sure = _arrays(x), None
         if self._product is not None:
             sure = held & self._product.met(np.maximum(k - 1, 0), self._states)
             reached_at = self._product.following(k, reached_at, self._states)
@@ -145,7 +142,9 @@ class PromiseMemory:
             sure |= held & (self._product.settled(k, reached_at) == 1.0)
         reached = self.safety_filter.look_ahead.values(k, reached_at)
         share = self.levels / np.where(held, self._expected, 1.0)
-        self.levels = np.where(held, np.clip(share * reached, 0.0, 1.0), 0.0)
+        # Without a cap, in proportion to the value that was reached.
+        wanted = np.where(self._caps < np.inf, self._caps, share * reached)
+        self.levels = np.where(held, np.minimum(np.maximum(wanted, 0.0), reached), 0.0)
         if sure is not None:
             self.levels[sure] = 1.0
         self._ended = self._ended | ended

@@ -11,7 +11,7 @@ from safe_envs.wrappers.value.expected_value_kernel import box_value, move_by_in
 _ROUNDS = 60
 
 
-def least_caps(  # noqa: PLR0913
+def kept_values(  # noqa: PLR0913
     first: int,
     last: int,
     images: np.ndarray,
@@ -27,12 +27,13 @@ def least_caps(  # noqa: PLR0913
     shifts: np.ndarray,
     values: np.ndarray,
     levels: np.ndarray,
-    found: np.ndarray,
+    expected: np.ndarray,
+    caps: np.ndarray,
 ) -> None:
-    """Find the least c for which a lower bound of E min(c, L) is a wanted level.
+    """Bound expected values, and find the least c for which E min(c, L) is a wanted level.
 
-    The bound is B(c) = sum_w P(w) min(c, v_w) with the least value v_w of the cells that the box w
-    of noise leads to, for the worst scenario. B is concave and piecewise linear: Newton's method
+    The bound is B(c) = sum_w P(w) min(c, v_w) with the least value v_w of the cells that box w of
+    the noise leads to, for the worst scenario. B is concave and piecewise linear: Newton's method
     from the left ends after a few steps.
 
     Args:
@@ -51,19 +52,23 @@ def least_caps(  # noqa: PLR0913
         shifts: scratch array of 8 entries.
         values: scratch array (W,).
         levels: that are wanted, shape (B,).
-        found: receives the caps, inf where no number is enough, shape (B,).
+        expected: receives the lower bounds of the expected values, shape (B,).
+        caps: receives c, inf where no number is enough, shape (B,).
     """
     n = effects.shape[2]
     for a in range(first, last):
-        cap = levels[a]
+        cap, worst = levels[a], inf
         for r in range(images.shape[2]):
             move_by_inputs(a, r, a, 0, effects, inputs, scales, shifts)
+            total = 0.0
             for w in range(images.shape[3]):
                 values[w] = box_value(
                     images[a, 0, r, w], n, shifts, layers[a], tables, counts, places, edges, scales
                 )
-            cap = max(cap, capped_at(levels[a], cap, values, weights))
-        found[a] = cap
+                total += weights[w] * values[w]
+            worst = min(worst, total)
+            cap = capped_at(levels[a], cap, values, weights) if total > levels[a] else inf
+        expected[a], caps[a] = worst, cap
 
 
 def capped_at(level: float, cap: float, values: np.ndarray, weights: np.ndarray) -> float:

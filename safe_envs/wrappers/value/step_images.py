@@ -12,10 +12,8 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.intervals import Interval, interval_function
-from safe_envs.compiled.program import Program, is_available
-from safe_envs.errors import ConfigurationError, NotCompilableError
-from safe_envs.wrappers.value.image_kernel import point_images
-from safe_envs.wrappers.value.image_source import image_source
+from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.value.image_source import image_function
 from safe_envs.wrappers.value.noise_boxes import NoiseBoxes, noise_boxes
 from safe_envs.wrappers.value.reduction import ReducedProblem
 
@@ -105,7 +103,7 @@ class Step:
         """Number of boxes of the uncertain parameters."""
         return len(self._scenarios)
 
-    @property
+    @cached_property
     def depends_on_time(self) -> bool:
         """Whether states that are known in advance occur in the step."""
         used = set().union(*(e.free_symbols for e in reduced_expressions(self._parts)))
@@ -189,25 +187,15 @@ class Step:
 
     @cached_property
     def _kernel(self) -> Any:
-        """`point_images` of the step; None where it is not to be compiled."""
         reduced, parts = self._reduced, self._parts
-        if not is_available():
-            return None
-        try:
-            source = image_source(
-                {
-                    "points": reduced.symbols,
-                    "known": tuple(reduced.known),
-                    "worlds": tuple(reduced.intervals),
-                    "noise": parts.boxed,
-                    "inputs": reduced.inputs,
-                },
-                parts.rest,
-                parts.effect,
-            )
-            return Program("steps of states", (point_images,), source).compiled()["point_images"]
-        except NotCompilableError:
-            return None
+        symbols = {
+            "points": reduced.symbols,
+            "known": tuple(reduced.known),
+            "worlds": tuple(reduced.intervals),
+            "noise": parts.boxed,
+            "inputs": reduced.inputs,
+        }
+        return image_function(symbols, parts.rest, parts.effect)
 
     @cached_property
     def _worlds(self) -> np.ndarray:
@@ -219,16 +207,15 @@ class Step:
         Args:
             q: coordinates, n arrays (B,).
             inputs: ends of the inputs, shape (1 or B, V, m, 2), for steps that are not affine.
-            instant: number of the sub-step, for states that are known in advance.
+            instant: number of the sub-step.
         """
         if self._kernel is None:
             return self.images(q, q, inputs, instant)
         n, m, scenarios = len(q), len(self._reduced.inputs), len(self._scenarios)
-        tried = 1 if self.is_affine else inputs.shape[1]
-        points, noise = np.array(q), self.noise
+        tried, noise, points = 1 if self.is_affine else inputs.shape[1], self.noise, np.array(q)
         images = np.empty((points.shape[1], tried, scenarios, len(noise.weights), n, 2))
         effects = np.empty((points.shape[1], scenarios, n, m, 2))
-        known = np.array([float(values[instant]) for values in self._reduced.known.values()])
+        known = np.array([values[instant] for values in self._reduced.known.values()], dtype=float)
         self._kernel(
             0, points.shape[1], points, known, self._worlds, noise.low, noise.high, inputs, images,
             effects,

@@ -56,3 +56,18 @@ class StepValues(Protocol):
             x: n components of the states, arrays (B,).
         """
         ...
+
+    def sufficient(
+        self, k: np.ndarray, x: Components, u: np.ndarray, levels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return q_k(x, u) and the caps c of next values, shapes (B,).
+
+        A lower bound of E min(c, L_{k+1}(x')) is at least the level; c is inf where none is known.
+
+        Args:
+            k: control instants, int (B,).
+            x: n components of the states, arrays (B,).
+            u: inputs in physical units, shape (B, m).
+            levels: at most q_k(x, u), shape (B,).
+        """
+        ...

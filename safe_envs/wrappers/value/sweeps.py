@@ -15,7 +15,7 @@ from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers.value import bellman_arrays
 from safe_envs.wrappers.value.bellman_kernel import expected_values, sweep_lower, sweep_upper
 from safe_envs.wrappers.value.expected_value_kernel import AXES
-from safe_envs.wrappers.value.spending_kernel import least_caps
+from safe_envs.wrappers.value.spending_kernel import kept_values
 
 _PARTS = 8
 """Parts for each thread, so that all threads end at about the same time."""
@@ -23,7 +23,7 @@ _PARTS = 8
 
 def bellman_functions() -> Functions:
     """Return the entry points of `bellman_kernel`, compiled where Numba is installed."""
-    entries = (expected_values, sweep_lower, sweep_upper, least_caps)
+    entries = (expected_values, sweep_lower, sweep_upper, kept_values)
     if is_available():
         try:
             return Program("dynamic programs", entries, Source("")).compiled()

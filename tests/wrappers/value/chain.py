@@ -77,6 +77,9 @@ class Chain:
         q = self.scanned(k, x)
         return self.inputs[q.argmax(axis=1)], q.max(axis=1)
 
+    def sufficient(self, k, x, u, levels):
+        return self.expected(k, x, u[:, None, :])[:, 0], np.full(len(u), np.inf)
+
     def moved(self, x, u, rng):
         """Return the states (B,) after a step from states (B,) under inputs (B,)."""
         laws = [c[0] + u * (c[1] + u * c[2]) for c in MOVES.values()]

@@ -211,6 +211,9 @@ class Plane:
     def best_input(self, k, x):
         return np.broadcast_to(self.inputs[0], (len(k), 2)), self.scanned(k, x).max(axis=1)
 
+    def sufficient(self, k, x, u, levels):
+        return self.expected(k, x, u[:, None, :])[:, 0], np.full(len(u), np.inf)
+
 
 def test_two_inputs_move_in_the_euclidean_distance():
     problem = state_problem(
