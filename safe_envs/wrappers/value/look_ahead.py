@@ -84,7 +84,7 @@ class LookAhead:
         """
         k, q = np.asarray(k), self._coordinates(x)
         if self._product is not None:
-            return self._product_values(k, q, a)
+            return self._product.values(self._table, k, q, a)
         values = self._values_of_cells(k, q)
         with np.errstate(all="ignore"):
             # The signs that the env sees: in exact arithmetic they might be others.
@@ -262,19 +262,6 @@ class LookAhead:
             beyond = beyond | ((places != inner) & (values != axis.edges[-1]))
             cells = cells * axis.count + inner
         return self._table.lower[rows, cells] * ~beyond
-
-    def _product_values(
-        self, k: np.ndarray, q: Sequence[np.ndarray], a: np.ndarray | None
-    ) -> np.ndarray:
-        """Return `values` of a specification, at coordinates."""
-        assert self._product is not None
-        a = self._product.first_states(q) if a is None else np.asarray(a)
-        found, cells = self._product.settled(k, q, a), self._table.grid.cell_of(q)
-        open_ = np.isnan(found)
-        rows = np.maximum(k - self._table.first, 0)
-        places = self._product.states.place[a] * self._table.grid.cells + cells
-        values = self._table.lower[rows, np.where(open_, places, 0)]
-        return np.where(open_, np.where(cells >= 0, values, 0.0), found)
 
     def _coordinates(self, x: Components) -> list[np.ndarray]:
         size = x[0].shape

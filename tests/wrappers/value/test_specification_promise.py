@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.evaluation.promise_bound import PromiseAverager
 from safe_envs.agents.evaluation.spec import EvaluationSpec
+from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.render import split_filters
@@ -54,6 +55,11 @@ def memory_of(chosen: PromiseFilter, x: np.ndarray) -> tuple[PromiseMemory, np.n
     return memory, memory.levels
 
 
+def memory_in(envs: SafetyFilterVectorWrapper) -> PromiseMemory:
+    assert isinstance(envs._filter, PromiseMemory)
+    return envs._filter
+
+
 def hostile(chosen: PromiseFilter, k: int, x, a) -> np.ndarray:
     """Return the inputs under which the least is expected of the table."""
     ahead = chosen.look_ahead
@@ -71,7 +77,7 @@ def play(text: str, p: float, moves: bool, episodes: int = 3000):
     chosen = filter_of(text, p, moves)
     env = SafeVectorEnv(chosen.problem, episodes)
     filtered = SafetyFilterVectorWrapper(env, chosen)
-    monitor, memory = SpecificationMonitorVector(filtered, text), filtered._filter
+    monitor, memory = SpecificationMonitorVector(filtered, text), memory_in(filtered)
     _, info = monitor.reset(seed=0)
     begun, rows = info["promise"], []
     met, alive = np.zeros(episodes, dtype=bool), np.ones(episodes, dtype=bool)
@@ -160,7 +166,7 @@ def test_the_automaton_begins_anew_with_every_episode(mode):
     chosen = filter_of(ORDER, 0.9)
     env = SafeVectorEnv(dataclasses.replace(chosen.problem), 40, autoreset_mode=mode)
     filtered = SafetyFilterVectorWrapper(env, chosen)
-    monitor, memory = SpecificationMonitorVector(filtered, ORDER), filtered._filter
+    monitor, memory = SpecificationMonitorVector(filtered, ORDER), memory_in(filtered)
     _, info = monitor.reset(seed=1)
     start, rng, begun = memory._states.copy(), np.random.default_rng(0), 0
     fresh, seen = np.zeros(40, dtype=bool), set()
@@ -284,17 +290,18 @@ def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
     problem = walk()
     starts = np.array([[0.0], [0.5], [-0.9]])
     spec = EvaluationSpec("safe_envs/Scalar-v0", knowledge="model")
+    nothing = VisitedStates(*[np.empty((0, 1))] * 5)
     with pytest.MonkeyPatch.context() as patch:
         made = "safe_envs.agents.evaluation.promise_bound.promise_filter_for"
         patch.setattr(made, lambda problem, settings, knowledge: filter_of(REACH, 0.9))
         averager = PromiseAverager(PromiseSettings(0.9, specification=REACH), problem, spec)
         averager.add(starts)
-        assert averager.summary([]).estimated_bound == pytest.approx(0.6)
+        assert averager.summary(nothing).estimated_bound == pytest.approx(0.6)
         settings = PromiseSettings(0.9, specification="eventually goal")
         assert "unsafe episodes may meet" in why_not_of_safety(problem, settings)
         averager = PromiseAverager(settings, problem, spec)
         averager.add(starts)
-        found = averager.summary([])
+        found = averager.summary(nothing)
     assert found.estimated_bound is None
     assert (
         found.bound_note == "it is of meeting 'eventually goal', which unsafe episodes may meet too"
