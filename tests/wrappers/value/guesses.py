@@ -31,6 +31,9 @@ class Guess:
     def scanned(self, k, x):
         return self.expected(k, x, np.broadcast_to(self.inputs, (len(k), *self.inputs.shape)))
 
+    def sufficient(self, k, x, u, levels):
+        return self.expected(k, x, u[:, None, :])[:, 0], np.full(len(u), np.inf)
+
     def best_input(self, k, x):
         q = self.scanned(k, x)
         return self.inputs[q.argmax(axis=1)], q.max(axis=1)
