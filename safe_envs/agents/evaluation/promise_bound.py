@@ -16,7 +16,11 @@ from safe_envs.agents.evaluation.statistics import share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.promise_memory import ROUNDING
-from safe_envs.wrappers.value.promise_tables import promise_filter_for, why_not_of_plant
+from safe_envs.wrappers.value.promise_tables import (
+    promise_filter_for,
+    why_not_of_plant,
+    why_not_of_safety,
+)
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
@@ -36,7 +40,9 @@ class PromiseAverager:
     """The guarantee of a promise filter: the mean of p_0 = min(p, one step of look-ahead).
 
     It holds for every policy, up to the horizon, as `safe_envs.wrappers.value.promise_filter`
-    proves, where the filter's table is of the plant.
+    proves, where the filter's table is of the plant. With a specification it is of the probability
+    of meeting that, P(spec), and a bound of being safe where P(safe) >= P(spec): where no episode
+    meets the specification that leaves C. Else there is none.
 
     Args:
         settings: of the filter.
@@ -55,7 +61,11 @@ class PromiseAverager:
         if spec.monitoring == "continuous":
             why_not = "it is of control instants, not of the time between them"
         self._filter = promise_filter_for(problem, settings, spec.knowledge)
-        self._why_none = why_not or why_not_of_plant(problem, settings, spec.knowledge)
+        self._why_none = (
+            why_not
+            or why_not_of_plant(problem, settings, spec.knowledge)
+            or why_not_of_safety(problem, settings)
+        )
         self._total, self._count = RunningSum(), 0
 
     def add(self, starts: np.ndarray) -> None:

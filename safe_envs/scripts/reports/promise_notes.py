@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from safe_envs.wrappers.conditions.text_parts import names_promise
+from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
 def computed_notes(names: Iterable[str]) -> list[str]:
@@ -17,7 +18,15 @@ def computed_notes(names: Iterable[str]) -> list[str]:
     if not found:
         return []
     which = f"the bound of {found[0]} is" if len(found) == 1 else "bounds of promise filters are"
-    return [
+    notes = [
         f"{which} computed, not estimated: the mean of p_0 over the starts, which the filter keeps"
         " for every policy up to the horizon, in the floating-point numbers of its table."
     ]
+    tasks = [name for name in found if PromiseSettings.of_text(name).specification]
+    if tasks:
+        notes.append(
+            f"what {' and '.join(tasks)} keeps is the probability of meeting the specification,"
+            " at least the mean of min(p, L_0) of the starts: a bound of being safe too, since no"
+            " unsafe episode meets it."
+        )
+    return notes

@@ -25,6 +25,9 @@ _SHARP = 1e-9
 
 _AT_ONCE = 1_000_000
 
+_SKIN = 1e-7
+"""Of the width of a cell, and of the h in it."""
+
 _ROUNDING = 1e-12
 """Of the distance to the edge of the workspace, on which edges of cells lie."""
 
@@ -155,6 +158,7 @@ class Sets:
         for h in barriers:
             np.logical_and(found.inside, h.low > 0.0, out=found.inside)
             np.logical_and(found.touches, h.high >= 0.0, out=found.touches)
+        self._keep_edges(found.inside, barriers, (low, high), known)
         if self._stays:
             np.logical_and(found.inside, outside.high <= _ROUNDING, out=found.inside)
             np.logical_and(found.touches, outside.low <= 0.0, out=found.touches)
@@ -165,6 +169,26 @@ class Sets:
             np.logical_or(found.ends, g.low >= 0.0, out=found.ends)
             np.logical_or(found.may_end, g.high >= 0.0, out=found.may_end)
         return found
+
+    def _keep_edges(
+        self,
+        inside: np.ndarray,
+        barriers: Sequence[Interval],
+        ends: tuple[Sequence[np.ndarray], Sequence[np.ndarray]],
+        known: Sequence[float],
+    ) -> None:
+        """Mark cells that are in the safe set but for their edge, whose probability is nil."""
+        least = np.minimum.reduce([np.broadcast_to(h.low, inside.shape) for h in barriers])
+        most = np.minimum.reduce([np.broadcast_to(h.high, inside.shape) for h in barriers])
+        near = np.flatnonzero((least <= 0.0) & (least >= -_SKIN * most))
+        if near.size:
+            skins = [_SKIN * (b[near] - a[near]) for a, b in zip(*ends, strict=True)]
+            boxes = [
+                Interval(a[near] + skin, b[near] - skin)
+                for a, b, skin in zip(*ends, skins, strict=True)
+            ]
+            inner = self._function([*boxes, *known])[: self._barriers]
+            inside[near] = np.logical_and.reduce([h.low > 0.0 for h in inner])
 
 
 def halved(low: Sequence[Any], high: Sequence[Any], number: int) -> tuple[list[Any], list[Any]]:

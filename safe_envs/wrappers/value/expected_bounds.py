@@ -10,7 +10,7 @@ import numpy as np
 
 from safe_envs.wrappers.value.cell_sets import CellSets, Sets
 from safe_envs.wrappers.value.expected_value_kernel import AXES
-from safe_envs.wrappers.value.grid_arrays import grid_arrays
+from safe_envs.wrappers.value.grid_arrays import POINT_SLACK, ROUNDING, grid_arrays
 from safe_envs.wrappers.value.product_tables import ProductTables
 from safe_envs.wrappers.value.smoothing import Smoothing
 from safe_envs.wrappers.value.step_images import Step
@@ -41,7 +41,7 @@ class ExpectedBounds:
         self._rest = -(step.noise.rest + smoothing.beyond)
         if isinstance(sets, ProductTables) and sets.most:
             self._rest = 0.0
-        self._means = grid_arrays(smoothing.means)
+        self._means = grid_arrays(smoothing.means, ROUNDING if step.is_noisy else POINT_SLACK)
         self._parts: CellSets | None = None
         self._functions = bellman_functions()
         shape = len(table.lower) * table.states, smoothing.means.cells

@@ -10,9 +10,13 @@ import numpy as np
 from safe_envs.wrappers.value.expected_value_kernel import AXES
 from safe_envs.wrappers.value.grid import Grid
 
+ROUNDING = 1e-13
+"""Of the largest number of an axis: how far a sum of a few numbers may be off."""
+
 POINT_SLACK = 4e-7
-"""Of the largest number of an axis: how far a state and an input may be off that pass through
-single precision, as observations and actions do."""
+"""The same for states and inputs that pass through single precision, as observations and actions
+do. It is for problems without noise, where a little off may be outside for good; with noise a
+state is as likely at one place as at another so near to it."""
 
 CELL_SLACK = 1e-6
 """The same for cells: a state that is read off an observation may lie next to its cell by the
@@ -39,7 +43,7 @@ class GridArrays(NamedTuple):
 
 
 def grid_arrays(
-    grid: Grid, slack: float = POINT_SLACK, blocks: Sequence[int] | None = None
+    grid: Grid, slack: float = ROUNDING, blocks: Sequence[int] | None = None
 ) -> GridArrays:
     """Return a grid as arrays.
 

@@ -23,8 +23,8 @@ from safe_envs.wrappers.value.table import ValueTable
 class LookAhead:
     """Reads a table at states of the plant, in batches.
 
-    Where states that are known in advance are not what the table assumes of them, as after another
-    start, lower bounds are 0 and upper ones 1.
+    Where known states are not what the table assumes of them, as after another start, lower bounds
+    are 0 and upper ones 1.
 
     Args:
         table: of the problem.
@@ -34,6 +34,7 @@ class LookAhead:
         steps: control periods of the table, K.
         inputs: that the table was computed with, in physical units, shape (U, m).
         box: (low, high) of each input.
+        specification: of the table; "" for that of staying safe.
         automaton: of the specification; None for the values of staying safe.
 
     Raises:
@@ -52,6 +53,7 @@ class LookAhead:
         step = Step(small)
         smoothing = Smoothing(table.grid, step.blur)
         self._sets = Sets(small, settings.leaving)
+        self.specification = settings.specification
         self.automaton, self._product, self._most = small.automaton, None, 0.0
         if small.automaton is not None:
             self._product = ProductTables(small, settings.leaving, smoothing)
@@ -61,16 +63,14 @@ class LookAhead:
         self._noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
         if not np.array_equal(self._scanned.values, table.inputs):
-            # Then the largest of the scanned bounds might be below the table.
             raise ConfigurationError(
-                f"the table of {table.problem} was computed with other inputs than are scanned now;"
-                " compute it again"
+                f"the table of {table.problem} is for other inputs; compute it"
             )
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
 
     @property
     def noise_boxes(self) -> int:
-        """Number of boxes into which the noise of a step is divided."""
+        """Number of boxes of the noise."""
         return self._noise_boxes
 
     def values(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
@@ -83,7 +83,7 @@ class LookAhead:
         """
         k, q = np.asarray(k), self._coordinates(x)
         if self._product is not None:
-            return self._product_values(k, q, a)
+            return self._product.values(self._table, k, q, a)
         values = self._values_of_cells(k, q) * self._seen.are_safe(k, x, q)
         return self._where_assumed(k, x, values)
 
@@ -214,6 +214,18 @@ class LookAhead:
         """
         return self._sets.of_states(k, self._coordinates(x))
 
+    def settled(self, k: np.ndarray, x: Components, a: np.ndarray) -> np.ndarray:
+        """Return 1 or 0 where it is settled whether a specification is met, NaN elsewhere.
+
+        Args:
+            k: control instants, int array (B,).
+            x: n components of the states, (B,).
+            a: states of the automaton after reading x, int array (B,).
+        """
+        if self._product is None:
+            return np.full(len(k), np.nan)
+        return self._product.settled(np.asarray(k), self._coordinates(x), a)
+
     def first_states(self, x: Components) -> np.ndarray:
         """Return the states of the automaton at starts; zeros without a specification.
 
@@ -247,19 +259,6 @@ class LookAhead:
             cells = cells * axis.count + inner
         return self._table.lower[rows, cells] * ~beyond
 
-    def _product_values(
-        self, k: np.ndarray, q: Sequence[np.ndarray], a: np.ndarray | None
-    ) -> np.ndarray:
-        """Return `values` of a specification, at coordinates."""
-        assert self._product is not None
-        a = self._product.first_states(q) if a is None else np.asarray(a)
-        found, cells = self._product.settled(k, q, a), self._table.grid.cell_of(q)
-        open_ = np.isnan(found)
-        rows = np.maximum(k - self._table.first, 0)
-        places = self._product.states.place[a] * self._table.grid.cells + cells
-        values = self._table.lower[rows, np.where(open_, places, 0)]
-        return np.where(open_, np.where(cells >= 0, values, 0.0), found)
-
     def _where_assumed(
         self, k: np.ndarray, x: Components, found: np.ndarray, otherwise: float = 0.0
     ) -> np.ndarray:
@@ -291,7 +290,7 @@ class LookAhead:
         k, q = np.asarray(k), self._coordinates(x)
         if self._product is None:
             return self._tables.bounds(k, q, inputs, sign, np.zeros(len(k), dtype=np.int64))
-        a = self._product.first_states(q) if a is None else np.asarray(a)
+        a = self._product.first_states(q) if a is None else a
         known = self._product.settled(k, q, a)
         found = np.repeat((known if sign > 0 else self._most - known)[:, None], inputs.shape[1], 1)
         rows = np.flatnonzero(np.isnan(known))

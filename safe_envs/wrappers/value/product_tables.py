@@ -11,6 +11,7 @@ from safe_envs.wrappers.value.label_sets import LabelSets
 from safe_envs.wrappers.value.product_states import ProductStates
 from safe_envs.wrappers.value.reduction import ReducedProblem
 from safe_envs.wrappers.value.smoothing import Smoothing
+from safe_envs.wrappers.value.table import ValueTable
 
 
 class ProductTables:
@@ -103,3 +104,23 @@ class ProductTables:
         verdict = automaton.verdict(k, a)
         found = np.where(verdict == 0, np.nan, (verdict + 1) / 2)
         return np.where(lost, 0.0, np.where(ends, automaton.accepting[a], found))
+
+    def values(
+        self, table: ValueTable, k: np.ndarray, q: Sequence[np.ndarray], a: np.ndarray | None
+    ) -> np.ndarray:
+        """Return the lower envelope, 0 outside the grid; shape (B,).
+
+        Args:
+            table: of the specification.
+            k: control instants, int array (B,).
+            q: coordinates, arrays (B,).
+            a: states of the automaton after their reading, int array (B,); None for those of
+                starts.
+        """
+        a = self.first_states(q) if a is None else np.asarray(a)
+        found, cells = self.settled(k, q, a), table.grid.cell_of(q)
+        open_ = np.isnan(found)
+        rows = np.maximum(k - table.first, 0)
+        places = self.states.place[a] * table.grid.cells + cells
+        values = table.lower[rows, np.where(open_, places, 0)]
+        return np.where(open_, np.where(cells >= 0, values, 0.0), found)

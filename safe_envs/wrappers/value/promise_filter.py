@@ -29,6 +29,15 @@ guaranteed; a filter that is robust over intervals of parameters covers the plan
 covers control instants, not what lies between them, up to step K. Beyond K p_k is 0: it is not
 renewed.
 
+*A specification* in place of safety makes all this one of pairs z = (x, a) of a state and a state
+of its automaton, with L_K(z) <= 1 where a accepts and 0 elsewhere, and likewise where an episode
+ends. No barrier is looked at. The same proof says P(spec) >= E min(p, max q_0(z_0, .)) for every
+policy, and this is at least the mean of min(p, L_0(z_0)). As soon as the specification is met
+whatever follows, p_k is 1 and every input is allowed; p is still at most L, and has only grown. As
+soon as it is violated, p_k is 0, and as no input is better than another, the proposed one is taken:
+then nothing is kept, not even safety. A bound of P(safe) it is for a specification that no
+episode meets that leaves C.
+
 *Without a guarantee*, outside C, after the end of an episode, or where the table is 0, p_k is 0,
 the filter says that it is infeasible, and it executes the input of the largest table value.
 """
@@ -42,6 +51,7 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.product_look_ahead import ProductLookAhead, read_for
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 from safe_envs.wrappers.value.step_values import StepValues
 
@@ -97,7 +107,7 @@ class PromiseFilter:
     Attributes:
         settings: as given.
         problem: as given.
-        look_ahead: as given.
+        look_ahead: as given; for a specification one of pairs.
         text: of the settings.
 
     Raises:
@@ -108,6 +118,7 @@ class PromiseFilter:
         self, look_ahead: StepValues, settings: PromiseSettings, problem: SafetyProblem
     ) -> None:
         settings.require_fit(problem)
+        look_ahead = read_for(look_ahead, settings.specification)
         if problem.steps > look_ahead.steps:
             raise ConfigurationError(
                 f"episodes of {problem.name} have {problem.steps} steps, and the table of the"
@@ -131,7 +142,7 @@ class PromiseFilter:
 
     def require_problem(self, problem: SafetyProblem) -> None:
         """Raise ConfigurationError where the table is not of a problem."""
-        for name in _OF_CHAIN:
+        for name in (*_OF_CHAIN, *(["regions"] if self.settings.specification else [])):
             if getattr(problem, name) != getattr(self.problem, name):
                 raise ConfigurationError(
                     f"the promise filter was made for {self.problem.name}, which has another"
@@ -141,13 +152,19 @@ class PromiseFilter:
     def start(self, x: Components) -> np.ndarray:
         """Return p_0 at the starts of episodes.
 
+        For a specification no barrier is looked at: q_0 is 0 where it is violated.
+
         Args:
             x: n components of the states, arrays (B,).
 
         Returns:
             min(p, max q_0) in the safe set and 0 outside, shape (B,).
         """
-        best = self.look_ahead.scanned(np.zeros(len(x[0]), dtype=np.int64), x).max(axis=1)
+        k = np.zeros(len(x[0]), dtype=np.int64)
+        if isinstance(self.look_ahead, ProductLookAhead):
+            best = self.look_ahead.scanned(k, self.look_ahead.starts(x)).max(axis=1)
+            return np.where(best > 0.0, np.minimum(best, self.settings.probability), 0.0)
+        best = self.look_ahead.scanned(k, x).max(axis=1)
         with np.errstate(all="ignore"):
             safe = (stacked(self._barriers(*x), len(x[0])) > 0.0).all(axis=1)
         return np.where(safe & (best > 0.0), np.minimum(best, self.settings.probability), 0.0)
@@ -160,7 +177,7 @@ class PromiseFilter:
         Args:
             k: control instants, below K, int (B,).
             level: p_k, shape (B,); where it is 0 the best input is taken.
-            x: n components of the states, arrays (B,).
+            x: n components of the states, or n + 1 of `ProductLookAhead`, arrays (B,).
             u: m components of the proposed inputs, within their bounds, arrays (B,).
 
         Returns:

@@ -1,4 +1,4 @@
-"""What a promise filter remembers of episodes: the control instant, and what is still kept."""
+"""What a promise filter remembers of episodes: control instant, what is kept, and its automaton."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.errors import InvalidInputError, NotCompilableError
 from safe_envs.wrappers.filter_qp import FilterDecision
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
+from safe_envs.wrappers.value.product_look_ahead import ProductLookAhead
+from safe_envs.wrappers.value.promise_filter import PromiseChoice, PromiseFilter
 
 ROUNDING = 1e-9
 """The part of p_k that rounding may cost."""
 
-_NAMES = ("instant", "promise", "promise_ended")
+_NAMES = ("instant", "promise", "promise_ended", "promise_automaton")
 
 
 class PromiseMemory:
@@ -42,6 +43,10 @@ class PromiseMemory:
         self._last = promise_filter.look_ahead.steps - 1
         self._instants = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
+        # Of the automaton of a specification; 0 for that of staying safe.
+        self._states = np.zeros(num_envs, dtype=np.int64)
+        ahead = promise_filter.look_ahead
+        self._product = ahead if isinstance(ahead, ProductLookAhead) else None
         self._expected = np.ones(num_envs)
         self._caps = np.full(num_envs, np.inf)
         self.levels = np.zeros(num_envs)
@@ -64,6 +69,11 @@ class PromiseMemory:
             self._instants[chosen], self._ended[chosen] = 0, False
             self.levels = self.levels.copy()
             self.levels[chosen] = self.safety_filter.start(starts)
+            if self._product is not None:
+                pairs = self._product.starts(starts)
+                self._states[chosen] = pairs[-1]
+                sure = self._product.settled(self._instants[chosen], pairs) == 1.0
+                self.levels[chosen] = np.where(sure, 1.0, self.levels[chosen])
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
         """Decide for one state; see `SafetyFilter.decide_floats`.
@@ -100,7 +110,11 @@ class PromiseMemory:
         # Beyond the last instant of the table nothing is kept.
         wanted = np.where(self._ended | (self._instants > self._last), 0.0, self.levels)
         k = np.minimum(self._instants, self._last)
-        action, expected, level, replaced, self._caps = self.safety_filter.choose(k, wanted, x, u)
+        if self._product is None:
+            found = self.safety_filter.choose(k, wanted, x, u)
+        else:
+            found = self._chosen_of_pairs(self._product, k, wanted, x, u)
+        action, expected, level, replaced, self._caps = found
         self._expected, self.levels = expected, level
         loss = wanted - level
         if np.count_nonzero(loss):
@@ -119,15 +133,40 @@ class PromiseMemory:
             ended: the envs whose episode is over, bool (num_envs,).
         """
         self._instants = self._instants + 1
-        reached = self.safety_filter.look_ahead.values(
-            np.minimum(self._instants, self._last + 1), _arrays(x)
-        )
-        held = self.levels > 0.0
+        k, held = np.minimum(self._instants, self._last + 1), self.levels > 0.0
+        reached_at, sure = _arrays(x), None
+        if self._product is not None:
+            sure = held & self._product.met(np.maximum(k - 1, 0), self._states)
+            reached_at = self._product.following(k, reached_at, self._states)
+            self._states = reached_at[-1]
+            # What is met before the workspace is left, counts.
+            sure |= held & (self._product.settled(k, reached_at) == 1.0)
+        reached = self.safety_filter.look_ahead.values(k, reached_at)
         share = self.levels / np.where(held, self._expected, 1.0)
         # Without a cap, in proportion to the value that was reached.
         wanted = np.where(self._caps < np.inf, self._caps, share * reached)
         self.levels = np.where(held, np.minimum(np.maximum(wanted, 0.0), reached), 0.0)
+        if sure is not None:
+            self.levels[sure] = 1.0
         self._ended = self._ended | ended
+
+    def _chosen_of_pairs(
+        self,
+        product: ProductLookAhead,
+        k: np.ndarray,
+        wanted: np.ndarray,
+        x: Components,
+        u: Components,
+    ) -> PromiseChoice:
+        """Choose inputs for a specification; the proposed ones where it is violated for good."""
+        pairs = (*x, self._states)
+        found = self.safety_filter.choose(k, wanted, pairs, u)
+        lost = np.flatnonzero((found.level <= 0.0) & (product.settled(k, pairs) == 0.0))
+        if lost.size:
+            for component, proposed in zip(found.action, u, strict=True):
+                component[lost] = proposed[lost]
+            found.replaced[lost] = False
+        return found
 
     def report(self) -> Info:
         """Return p_k of the state that was reached last, by its name in the info."""
@@ -141,7 +180,7 @@ class PromiseMemory:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode is, in arrays with the batch in front."""
-        found = (self._instants, self.levels, self._ended)
+        found = (self._instants, self.levels, self._ended, self._states)
         return {name: each.copy() for name, each in zip(_NAMES, found, strict=True)}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
@@ -156,10 +195,10 @@ class PromiseMemory:
                 f"the snapshot has no {', '.join(missing)}: it is of envs without a promise filter;"
                 " take one of envs with it"
             )
-        instants, levels, ended = [np.array(snapshot[name]) for name in _NAMES]
+        instants, levels, ended, states = [np.array(snapshot[name]) for name in _NAMES]
         levels, shape = levels.astype(float), self.levels.shape
         if not (
-            instants.shape == levels.shape == ended.shape == shape
+            instants.shape == levels.shape == ended.shape == states.shape == shape
             and instants.min() >= 0
             and levels.min() >= 0.0
             and levels.max() <= 1.0
@@ -169,7 +208,7 @@ class PromiseMemory:
                 " take one of envs with a promise filter"
             )
         self._instants, self._ended = instants.astype(np.int64), ended.astype(bool)
-        self.levels = levels
+        self.levels, self._states = levels, states.astype(np.int64)
 
 
 def _arrays(components: Sequence[Any]) -> Components:

@@ -8,12 +8,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.problem.named_sets import set_names
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.value.automaton_building import automaton_of
 from safe_envs.wrappers.value.look_ahead import LookAhead
+from safe_envs.wrappers.value.product_states import keeps_safe
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.specification import Specification
 from safe_envs.wrappers.value.table_cache import table_for
 
 _IN_USE: weakref.WeakValueDictionary[str, LookAhead] = weakref.WeakValueDictionary()
@@ -40,9 +44,14 @@ def promise_filter_for(
     """
     settings.require_fit(problem)
     wanted = ValueSettings(
-        knowledge=knowledge, leaving=settings.leaving, intervals=settings.intervals
+        knowledge=knowledge,
+        leaving=settings.leaving,
+        intervals=settings.intervals,
+        specification=settings.specification,
     )
-    fingerprint = reduced(problem, knowledge, settings.intervals).fingerprint
+    fingerprint = reduced(
+        problem, knowledge, settings.intervals, settings.specification
+    ).fingerprint
     if problem.model == problem.plant:
         # Then a table of the plant is one of the model, and may be there already.
         wanted = replace(wanted, knowledge="plant")
@@ -77,7 +86,25 @@ def why_not_of_plant(problem: SafetyProblem, settings: PromiseSettings, knowledg
     covered = {name: true[name] for name in settings.intervals if name in true}
     believed = replace(problem, model=problem.model.with_parameters(**covered))
     try:
-        same = reduced(believed, "model").fingerprint == reduced(believed, "plant").fingerprint
+        model, plant = (
+            reduced(believed, whose, {}, settings.specification) for whose in ("model", "plant")
+        )
+        same = model.fingerprint == plant.fingerprint
     except ConfigurationError:
         same = False
     return "" if same else "the filter's guarantee is of the model, from which the plant differs"
+
+
+def why_not_of_safety(problem: SafetyProblem, settings: PromiseSettings) -> str:
+    """Return why the guarantee of a promise filter is not one of being safe; "" where it is.
+
+    Args:
+        problem: that is to be kept safe.
+        settings: of the filter.
+    """
+    if not settings.specification:
+        return ""
+    specification = Specification(settings.specification, set_names(problem))
+    if keeps_safe(automaton_of(specification)):
+        return ""
+    return f"it is of meeting {settings.specification!r}, which unsafe episodes may meet too"

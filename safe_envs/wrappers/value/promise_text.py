@@ -1,4 +1,8 @@
-"""The text of the promise filter: `promise:p=0.99:robust=v:0.8..2.4:leaving=safe:table=FILE`."""
+"""The text of the promise filter: `promise:p=0.99:robust=v:0.8..2.4:leaving=safe:table=FILE`.
+
+`spec=always safe & eventually goal` says what is kept in place of safety. No sign of a
+specification divides the text of a filter, so that it is written as it is.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +13,17 @@ from dataclasses import dataclass
 
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, real
+from safe_envs.problem.named_sets import set_names
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.registry import PROMISE
 from safe_envs.wrappers.conditions.text_parts import parts_of
+from safe_envs.wrappers.value.automaton_building import automaton_of
 from safe_envs.wrappers.value.settings import LEAVING
+from safe_envs.wrappers.value.specification import Specification
 
-_KEYS = ("p", "robust", "leaving", "table")
+_KEYS = ("p", "robust", "leaving", "spec", "table")
 _EXAMPLE = f"{PROMISE}:p=0.99"
+_SPEC_EXAMPLE = "like always safe & eventually goal"
 
 # What is robust and the name of a file may hold a colon: one divides before "key=" alone.
 _DIVIDES = re.compile(r":(?=\w+=)")
@@ -36,6 +44,8 @@ class PromiseSettings:
             "violation", or as "safe".
         table: file of the table; None for the one of the user's cache, which is computed where it
             is missing.
+        specification: that an episode is to meet, over the sets that the problem names; "" for that
+            of staying safe.
 
     Raises:
         ConfigurationError: A value is out of range.
@@ -45,6 +55,7 @@ class PromiseSettings:
     robust: tuple[Interval, ...] = ()
     leaving: str = LEAVING[0]
     table: str | None = None
+    specification: str = ""
 
     def __post_init__(self) -> None:
         p = finite_number("p of the promise filter", self.probability)
@@ -59,6 +70,12 @@ class PromiseSettings:
                 f"leaving = {shown(self.leaving)} of the promise filter;"
                 f" {nearest(str(self.leaving), LEAVING)}"
             )
+        if not isinstance(self.specification, str):
+            raise ConfigurationError(
+                f"specification = {shown(self.specification)} of the promise filter; give text,"
+                f" {_SPEC_EXAMPLE}"
+            )
+        object.__setattr__(self, "specification", " ".join(self.specification.split()))
         names = [name for name, _, _ in self.robust]
         for name, low, high in self.robust:
             if names.count(name) > 1:
@@ -75,7 +92,8 @@ class PromiseSettings:
 
         Args:
             text: `promise:p=0.99`, and if need be `:robust=v:0.8..2.4` (several parameters with ";"
-                between), `:leaving=safe` and `:table=FILE`.
+                between), `:leaving=safe`, `:spec=always safe & eventually goal` and
+                `:table=FILE`.
 
         Raises:
             ConfigurationError: It has another form, or a value is out of range.
@@ -103,11 +121,17 @@ class PromiseSettings:
         table = given.get("table")
         if table is not None and not table:
             raise ConfigurationError(f"filter {shown(text)}: table names no file")
+        if "spec" in given and not given["spec"].strip():
+            raise ConfigurationError(
+                f"filter {shown(text)}: spec has no specification; give one, {_SPEC_EXAMPLE}, or"
+                " leave it out for safety"
+            )
         return cls(
             finite_number("p of the promise filter", given["p"]),
             _intervals(text, given["robust"]) if "robust" in given else (),
             given.get("leaving", LEAVING[0]),
             table,
+            given.get("spec", ""),
         )
 
     @property
@@ -118,6 +142,8 @@ class PromiseSettings:
             parts.append("robust=" + ";".join(f"{n}:{a!r}..{b!r}" for n, a, b in self.robust))
         if self.leaving != LEAVING[0]:
             parts.append(f"leaving={self.leaving}")
+        if self.specification:
+            parts.append(f"spec={self.specification}")
         if self.table is not None:
             parts.append(f"table={self.table}")
         return ":".join(parts)
@@ -141,6 +167,10 @@ class PromiseSettings:
                     f"robust of the promise filter: {problem.name} has no parameter {shown(name)};"
                     f" {nearest(name, known)}"
                 )
+        if self.specification:
+            specification = Specification(self.specification, set_names(problem))
+            specification.require_horizon(problem.steps)
+            automaton_of(specification)
         if objective != "nearest":
             raise ConfigurationError(
                 f"objective = {shown(objective)}: the promise filter takes the input nearest to"

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.cell_sets import CellSets, Sets
-from safe_envs.wrappers.value.grid_arrays import CELL_SLACK, grid_arrays
+from safe_envs.wrappers.value.grid_arrays import CELL_SLACK, ROUNDING, grid_arrays
 from safe_envs.wrappers.value.reduction import ReducedProblem, reduced
 from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
 from safe_envs.wrappers.value.settings import ValueSettings
@@ -126,7 +126,8 @@ class _Operator:
         self._sets, self._pool, self._smoothing = solver._sets, pool, smoothing
         self._scanned = solver._scanned
         self._functions = bellman_functions()
-        self._means = grid_arrays(smoothing.means, CELL_SLACK, smoothing.parts)
+        slack = ROUNDING if self._reduced.noise else CELL_SLACK
+        self._means = grid_arrays(smoothing.means, slack, smoothing.parts)
         self._moves = self._step.depends_on_time
         self.is_constant = not (self._moves or self._sets.depend_on_time)
         self._cells, self._parts = self._classified(self._reduced.steps)

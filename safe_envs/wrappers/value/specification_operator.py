@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.value.grid import Grid
-from safe_envs.wrappers.value.grid_arrays import CELL_SLACK, grid_arrays
+from safe_envs.wrappers.value.grid_arrays import CELL_SLACK, ROUNDING, grid_arrays
 from safe_envs.wrappers.value.input_search import InputSearch
 from safe_envs.wrappers.value.product_tables import ProductTables
 from safe_envs.wrappers.value.reduction import ReducedProblem
@@ -78,7 +78,8 @@ class SpecificationOperator:
             phases = [0, *self._states.automaton.begins.tolist()]
             found = [self._reached(k).on.any(axis=0) for k in phases]
             self._numbers = np.flatnonzero(np.logical_or.reduce(found))
-        means = grid_arrays(smoothing.means, CELL_SLACK, smoothing.parts)
+        slack = ROUNDING if reduced.noise else CELL_SLACK
+        means = grid_arrays(smoothing.means, slack, smoothing.parts)
         # What is not remembered can be shared.
         searches = len(self._states.live) if self.is_constant else 1
         self._searches = [

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-import sympy as sp
 
 from safe_envs.dynamics.intervals import Interval, interval_function
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.value.image_source import image_function
 from safe_envs.wrappers.value.noise_boxes import NoiseBoxes, noise_boxes
 from safe_envs.wrappers.value.reduction import ReducedProblem
+from safe_envs.wrappers.value.step_parts import scenarios, step_parts
 
-_PARTS = {1: 8, 2: 4}
-_FEW_PARTS = 2
 _AT_ONCE = 2_000_000
 _HUGE = 1e200
 
@@ -42,25 +38,6 @@ class StepImages(NamedTuple):
 
     images: np.ndarray
     effects: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """A step in parts: x' = rest + effect u + blur w.
-
-    Attributes:
-        rest: of each coordinate, with the boxed noise.
-        effect: of each coordinate and input.
-        blur: standard deviation along each coordinate of noise that is integrated exactly.
-        boxed: normals that are divided into boxes.
-        is_affine: whether `rest` does not hold the inputs.
-    """
-
-    rest: tuple[sp.Expr, ...]
-    effect: tuple[tuple[sp.Expr, ...], ...]
-    blur: tuple[float, ...]
-    boxed: tuple[sp.Symbol, ...]
-    is_affine: bool
 
 
 class Step:
@@ -88,15 +65,20 @@ class Step:
                 " problems whose control period is one integration step; take substeps = 1"
             )
         self._reduced = reduced
-        self._parts = _parts_of(reduced)
+        self._parts = step_parts(reduced)
         self.blur, self.is_affine = self._parts.blur, self._parts.is_affine
-        self._scenarios = _scenarios(reduced.intervals)
+        self._scenarios = scenarios(reduced.intervals)
         self.noise: NoiseBoxes = noise_boxes(self._intervals())
 
     @property
     def substeps(self) -> int:
         """Sub-steps of a control period."""
         return self._reduced.substeps
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether a step has noise."""
+        return bool(self._reduced.noise)
 
     @property
     def scenarios(self) -> int:
@@ -106,7 +88,7 @@ class Step:
     @cached_property
     def depends_on_time(self) -> bool:
         """Whether states that are known in advance occur in the step."""
-        used = set().union(*(e.free_symbols for e in reduced_expressions(self._parts)))
+        used = set().union(*(e.free_symbols for e in self._parts.expressions))
         return bool(used & set(self._reduced.known))
 
     @cached_property
@@ -257,44 +239,3 @@ class Step:
             # An infinite effect of an input that is 0 would be no number.
             effects[:, :, i // m, i % m, 0] = np.maximum(found.low, -_HUGE)
             effects[:, :, i // m, i % m, 1] = np.minimum(found.high, _HUGE)
-
-
-def reduced_expressions(parts: _Parts) -> list[sp.Expr]:
-    """Return all expressions of a step."""
-    return [*parts.rest, *(entry for row in parts.effect for entry in row)]
-
-
-def _parts_of(reduced: ReducedProblem) -> _Parts:
-    rest = [sp.sympify(e) for e in reduced.step]
-    blur, boxed = [0.0] * len(rest), []
-    for w in reduced.noise:
-        sizes = [sp.diff(e, w) for e in rest]
-        touched = [i for i, size in enumerate(sizes) if size != 0]
-        if len(touched) == 1 and sizes[touched[0]].is_number and not blur[touched[0]]:
-            i = touched[0]
-            blur[i] = abs(float(sizes[i]))
-            rest[i] = rest[i].subs(w, 0)
-        elif touched:
-            boxed.append(w)
-    inputs = reduced.inputs
-    varying = {*inputs, *boxed}
-    effect = [[sp.diff(e, u) for u in inputs] for e in rest]
-    is_affine = not any(entry.free_symbols & varying for row in effect for entry in row)
-    if is_affine:
-        rest = [e.subs(dict.fromkeys(inputs, 0)) for e in rest]
-    else:
-        effect = [[sp.Integer(0)] * len(inputs) for _ in rest]
-    return _Parts(tuple(rest), tuple(map(tuple, effect)), tuple(blur), tuple(boxed), is_affine)
-
-
-def _scenarios(
-    intervals: dict[sp.Symbol, tuple[float, float]] | Any,
-) -> list[tuple[tuple[float, float], ...]]:
-    """Return boxes that cover the uncertain parameters."""
-    parts = _PARTS.get(len(intervals), _FEW_PARTS)
-    cut = []
-    for low, high in intervals.values():
-        number = parts if high > low else 1
-        ends = [low + (high - low) * i / number for i in range(number)] + [high]
-        cut.append(list(itertools.pairwise(ends)))
-    return list(itertools.product(*cut))

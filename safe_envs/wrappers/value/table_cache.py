@@ -96,7 +96,9 @@ def table_at_hand(problem: SafetyProblem, settings: ValueSettings) -> ValueTable
     # The fingerprint takes some time, and most users have no table at all.
     if folder is None or next(folder.glob("[0-9a-f]" * _DIGITS + ".npz"), None) is None:
         return None
-    fingerprint = reduced(problem, settings.knowledge, settings.intervals).fingerprint
+    fingerprint = reduced(
+        problem, settings.knowledge, settings.intervals, settings.specification
+    ).fingerprint
     return _kept(folder / f"{_key(fingerprint, settings)}.npz", fingerprint, settings)
 
 

@@ -45,6 +45,8 @@ def test_cells_are_what_their_points_are(small, leaving, count):
     )
     # Points at the very edge may be judged either way.
     near = np.abs(np.subtract.outer(q, [-1.0, 2.0])).min(axis=-1) < 1e-9
+    # The edge of a cell may be that of the safe set.
+    near[:, [0, -1]] = True
     assert inside[cells.inside][~near[cells.inside]].all()
     assert not inside[~cells.touches].any()
     assert ends[cells.ends].all()

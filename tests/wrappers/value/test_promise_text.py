@@ -41,7 +41,7 @@ def test_settings_hold_what_was_written():
     [
         ("promise", "names no probability; give one, like promise:p=0.99"),
         ("promise:p", "gives p no value; settings are key=value, as in promise:p=0.99"),
-        ("promise:q=3:p=.9", "no setting 'q'; allowed: p, robust, leaving, table"),
+        ("promise:q=3:p=.9", "no setting 'q'; allowed: p, robust, leaving, spec, table"),
         ("promise:robst=v:1..2:p=.9", "did you mean 'robust'"),
         ("promise:0.99", "no setting '0.99'"),
         ("promise:p=0", "p = 0 of the promise filter; give a probability.*between 0 and 1"),

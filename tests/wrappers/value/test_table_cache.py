@@ -214,5 +214,5 @@ def test_other_values_are_of_another_format(problem, means):
     Else the tables in caches, which an earlier way has computed, are taken for the new ones.
     """
     table = solved(problem, 60, inputs=9)
-    assert FORMAT == 2
+    assert FORMAT == 3
     assert (table.lower.mean(), table.upper.mean()) == pytest.approx(means, abs=2e-6)
