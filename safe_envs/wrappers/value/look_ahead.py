@@ -36,6 +36,7 @@ class LookAhead:
         box: (low, high) of each input.
         specification: of the table; "" for that of staying safe.
         automaton: of the specification; None for the values of staying safe.
+        noise_boxes: number of boxes into which the noise of a step is divided.
 
     Raises:
         ConfigurationError: The table is of another problem.
@@ -60,18 +61,13 @@ class LookAhead:
             self._most = self._product.most
         self._seen = SeenSets(problem, small, settings.leaving)
         self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
-        self._noise_boxes = len(step.noise.weights)
+        self.noise_boxes = len(step.noise.weights)
         self._scanned = scanned_inputs(small.box, settings.inputs)
         if not np.array_equal(self._scanned.values, table.inputs):
             raise ConfigurationError(
                 f"the table of {table.problem} is for other inputs; compute it"
             )
         self.steps, self.inputs, self.box = table.steps, self._scanned.values, small.box
-
-    @property
-    def noise_boxes(self) -> int:
-        """Number of boxes of the noise."""
-        return self._noise_boxes
 
     def values(self, k: np.ndarray, x: Components, a: np.ndarray | None = None) -> np.ndarray:
         """Return the lower envelope at states, 0 outside the safe set.
