@@ -84,6 +84,12 @@ def print_best(console: Console, answer: BestAnswer) -> None:
         say(console, line)
     if found.contradiction:
         say(console, f"Note: the bounds are withheld: {found.contradiction}")
+    if found.lower == 0.0 and found.upper == 1.0:
+        say(
+            console,
+            "Note: this grid is too coarse to say anything; the shorter the control period, the"
+            " narrower cells have to be. More of them are asked for by --cells.",
+        )
     say(console, f"Note: lower and upper are {COMPUTED}. They are not proved.")
 
 
