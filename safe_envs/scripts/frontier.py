@@ -86,9 +86,8 @@ def frontier(
     """Print the largest returns that can be had at each risk, next to those of filters.
 
     The curve is computed by dynamic programming with a price that is paid once for the first
-    violation, on a grid: no policy crosses it but for the error of the grid. Episodes of policies
-    that the prices lead to, of the nominal controller, of filters over it and of the safest policy
-    show what is attained.
+    violation, on a grid, whose error is not bounded. Episodes of policies that the prices lead to,
+    of the nominal controller, of filters over it and of the safest policy show what is attained.
     """
     from safe_envs.agents.evaluation.frontier import FrontierSpec
     from safe_envs.agents.evaluation.frontier import frontier as compute

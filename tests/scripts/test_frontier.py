@@ -20,7 +20,7 @@ def test_points_lie_on_or_below_the_curve(frontier, tmp_path):
     options = ("--filter", "cbf", "--policy", "zero", "--json", path, "--plot", picture)
     status, out, _ = frontier("Scalar-v0", *SMALL, *options)
     assert status == 0
-    assert "no policy crosses it but for the error of the grid" in out
+    assert "error of the grid that is not bounded" in out
     found = strictly(path)
     names = [point["name"] for point in found["points"]]
     assert names[:2] == ["nominal", "zero"]

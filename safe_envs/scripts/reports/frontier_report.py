@@ -53,8 +53,8 @@ def print_report(console: Console, title: str, found: Frontier) -> None:
     names = ", ".join(map(str, values.given.small.symbols))
     for line in (
         f"The curve is computed from {len(values.prices)} prices of a violation on {grid} nodes of"
-        f" ({names}) in {values.seconds:.1f} s: no policy crosses it but for the error of the grid,"
-        " which is not bounded.",
+        f" ({names}) in {values.seconds:.1f} s, with an error of the grid that is not bounded: it"
+        " does not show that no policy can cross it.",
         "`price` names the policies that these prices lead to: they show that it is attained.",
         *(
             [

@@ -60,19 +60,6 @@ class Automaton:
         """
         return sum(np.asarray(each, dtype=np.int64) << i for i, each in enumerate(inside))
 
-    def possible_labels(self, surely: np.ndarray, perhaps: np.ndarray) -> np.ndarray:
-        """Return which labels may occur in the cells of a grid, bool (2^atoms, B).
-
-        A lower envelope of V takes the smallest value over them, an upper one the largest.
-
-        Args:
-            surely: for each atom whether all of a cell is inside, bool (atoms, B).
-            perhaps: for each atom whether some of it is, bool (atoms, B).
-        """
-        count = len(self.atoms)
-        bits = (np.arange(1 << count)[:, None] >> np.arange(count) & 1).astype(bool)[:, :, None]
-        return np.all((surely <= bits) & (bits <= perhaps), axis=1)
-
     def phase(self, k: Any) -> Any:
         """Return the phase of control instants, an int or an array of them."""
         return np.searchsorted(self.begins, k, side="right") - 1

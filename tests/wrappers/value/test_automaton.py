@@ -125,15 +125,6 @@ def test_the_longest_window_is_short_work() -> None:
     assert automaton.size == 4
 
 
-def test_labels_of_a_cell_are_those_of_its_points() -> None:
-    _, automaton = built("always safe & eventually goal")
-    surely = np.array([[True, False, False, False], [False, False, False, True]])
-    perhaps = np.array([[True, True, True, False], [False, True, False, True]])
-    found = automaton.possible_labels(surely, perhaps)
-    labels = [np.flatnonzero(column).tolist() for column in found.T]
-    assert labels == [[1], [0, 1, 2, 3], [0, 1], [2]]  # bit 0 is safe, bit 1 the goal
-
-
 @pytest.mark.parametrize(
     "text",
     [
