@@ -1,0 +1,87 @@
+"""What a barrier certificate states: a barrier psi, and the numbers of its bound."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.polynomial import Polynomial
+
+Control = Literal["constraint", "policy"]
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The system of a certificate, in exact numbers.
+
+    Attributes:
+        states: symbols.
+        workspace: lower and upper end of each state; to leave it ends an episode. For a state that
+            is an angle of period 2 pi in all expressions it may be one period.
+        inputs: symbols.
+        bounds: lower and upper bound of each input.
+        drift: f, n expressions of the states.
+        input_matrix: g, n lists of m expressions.
+        diffusion: sigma, n lists of d expressions.
+        barriers: h_1, ..., h_k; the safe set C is where all of them are positive.
+        policy: u(x), m expressions, where the certificate is of one policy; empty where it is of
+            every input that meets its constraint.
+    """
+
+    states: tuple[sp.Symbol, ...]
+    workspace: tuple[tuple[sp.Expr, sp.Expr], ...]
+    inputs: tuple[sp.Symbol, ...]
+    bounds: tuple[tuple[sp.Expr, sp.Expr], ...]
+    drift: tuple[sp.Expr, ...]
+    input_matrix: tuple[tuple[sp.Expr, ...], ...]
+    diffusion: tuple[tuple[sp.Expr, ...], ...]
+    barriers: tuple[sp.Expr, ...]
+    policy: tuple[sp.Expr, ...] = ()
+
+
+@dataclass(frozen=True)
+class BarrierCertificate:
+    """A barrier psi for which P(safe up to T) >= [psi(x_0) e^(-a T) - m (1 - e^(-a T))/a]/c.
+
+    It is a proof where a sound check of its statements passes: on G, where psi and all h_i are
+    positive and the workspace is not left, psi <= c and A psi >= -a psi - m along some input within
+    the bounds (along the policy if there is one); and psi <= 0 where an h_i is 0.
+
+    Attributes:
+        env_id: of the registered env, with its options; empty for other systems.
+        options: of the env, as for `gym.make`, JSON values.
+        plant: the system.
+        psi: the barrier.
+        rate: a >= 0 in 1/s.
+        shortfall: m >= 0 in 1/s, for psi has no unit.
+        supremum: c > 0.
+        horizon: T in s.
+    """
+
+    env_id: str
+    options: dict[str, object]
+    plant: Plant
+    psi: Polynomial
+    rate: Fraction
+    shortfall: Fraction
+    supremum: Fraction
+    horizon: Fraction
+
+    def bounds_at(self, starts: np.ndarray) -> np.ndarray:
+        """Return the bound at starts in C, where psi <= 0 it is 0.
+
+        Args:
+            starts: states, shape (B, n).
+
+        Returns:
+            Values in [0, 1], shape (B,).
+        """
+        a, m, c, horizon = map(float, (self.rate, self.shortfall, self.supremum, self.horizon))
+        spent = -math.expm1(-a * horizon) / a if a else horizon
+        values = self.psi.values(starts) * math.exp(-a * horizon) - m * spent
+        return np.clip(values / c, 0.0, 1.0)
