@@ -63,12 +63,8 @@ def failures(analysis: SafeSetAnalysis) -> list[str]:
     return [reason for reason in found if reason]
 
 
-def unverified_assumptions(analysis: SafeSetAnalysis) -> list[str]:
-    """Return the assumptions that are not established even as an estimate, in words."""
-    found = [analysis.limits]
-    if not analysis.formulas.joint:
-        found.append("the shortfall of several conditions together is not established")
-    return [reason for reason in found if reason]
+JOINT = "the shortfall of several conditions together is not established"
+"""What is not known where conditions share the inputs and cannot all be met."""
 
 
 def _undefined(analysis: SafeSetAnalysis) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition, spec_of
+from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.extrema import (
     max_shortfall,
     supremum,
@@ -18,7 +19,6 @@ from safe_envs.wrappers.verification.extrema import (
     without_control,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
