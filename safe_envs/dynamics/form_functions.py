@@ -37,15 +37,15 @@ class FormOperations(FormArithmetic):
         return applied
 
     def _absolute(self, a: Form) -> Form:
-        positive, negative_ = a.range.low > 0.0, a.range.high < 0.0
-        sign = np.where(positive, 1.0, np.where(negative_, -1.0, 0.0))
+        """Return |a|: a or -a by the sign of its center, plus what it may fall short by."""
+        sign = np.where(a.center >= 0.0, 1.0, -1.0)
+        below = np.maximum(np.where(sign > 0.0, -a.range.low, a.range.high), 0.0)
         known = _INTERVALS.absolute(a.range)
-        certain = positive | negative_
-        plain = self.of_interval(known, np.zeros(a.smooth.shape, dtype=bool))
-        return Form(
-            np.where(certain, sign * a.center, plain.center),
-            np.where(certain, sign * a.slopes, 0.0),
-            np.where(certain, a.radius, plain.radius),
+        certain = (a.range.low > 0.0) | (a.range.high < 0.0)
+        return with_range(
+            sign * a.center + np.where(np.isfinite(below), below, 0.0),
+            sign * a.slopes,
+            a.radius + below + EPS * (np.abs(a.center) + below),
             known,
             certain & a.smooth,
         )

@@ -16,6 +16,7 @@ import sympy as sp
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.wrappers.verification.branch_and_bound import Budget
+from safe_envs.wrappers.verification.input_terms import largest_input_term
 from safe_envs.wrappers.verification.judge import Verdict, judge, supremum
 from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
 
@@ -67,12 +68,14 @@ class CertificateStatements:
         value, slopes, curves = self._parts
         found: Any = sp.Rational(self.rate) * value
         found += sum(f * p for f, p in zip(plant.drift, slopes, strict=True))
-        for j, (low, high) in enumerate(plant.bounds):
-            moved: Any = sum(row[j] * p for row, p in zip(plant.input_matrix, slopes, strict=True))
-            if plant.policy:
-                found += plant.policy[j] * moved
-            elif moved != 0:
-                found += sp.Max(low * moved, high * moved)
+        moved: list[Any] = [
+            sum(row[j] * p for row, p in zip(plant.input_matrix, slopes, strict=True))
+            for j in range(len(plant.bounds))
+        ]
+        if plant.policy:
+            found += sum(u * a for u, a in zip(plant.policy, moved, strict=True))
+        else:
+            found += largest_input_term(moved, plant.bounds)
         for (i, j), symbol in curves.items():
             covariance: Any = sum(
                 a * b for a, b in zip(plant.diffusion[i], plant.diffusion[j], strict=True)

@@ -15,6 +15,7 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.verification.assumptions import JOINT
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.input_terms import exact_number, largest_input_term
 from safe_envs.wrappers.verification.judge import Verdict, Word, judge, supremum
 from safe_envs.wrappers.verification.statement import Statement
 
@@ -22,7 +23,8 @@ BUDGET = Budget(boxes=1_000_000, seconds=4.0)
 """Of each statement of a bound, so that an evaluation does not wait for it."""
 
 _RELATIVE = 1e-3
-_FINE = 1e-9
+_SMALL = 1e-7
+_QUICK = 1.0
 _WIDTHS = (1e1, 1e2, 1e4, 1e6)
 
 
@@ -129,7 +131,7 @@ class ChainProof:
         self, name: str, expression: Any, found: float, supremum_hints: bool = False
     ) -> JudgedNumber:
         """Prove an upper bound of an expression on G that is near what a search found."""
-        wanted = _RELATIVE * abs(found) if math.isfinite(found) and found else _FINE
+        wanted = max(_RELATIVE * abs(found) if math.isfinite(found) else 0.0, self._negligible)
         result = supremum(
             replace(self._region, name=name),
             expression,
@@ -143,6 +145,12 @@ class ChainProof:
         reason = result.reason or f"{name} is infinite"
         return JudgedNumber(name, math.inf, Verdict("undecided", result.boxes, reason=reason))
 
+    @property
+    def _negligible(self) -> float:
+        """A rate that over the horizon costs a bound nothing that matters."""
+        size = min((c for c in self._found if math.isfinite(c) and c > 0.0), default=1.0)
+        return _SMALL * size / self._formulas.problem.duration
+
     @cached_property
     def feasible(self) -> Verdict:
         """Whether some input within the bounds meets all conditions everywhere on G."""
@@ -152,7 +160,9 @@ class ChainProof:
         name = "the condition can be met everywhere on G"
         if self._formulas.independent:
             best = sp.Min(*[self._best(row) for row in rows])
-            return judge(replace(self._region, name=name, claim=best), self._budget, self._hints)
+            # Where the claim is 0 somewhere no budget suffices, but a small shortfall is proved.
+            quick = replace(self._budget, seconds=min(_QUICK, self._budget.seconds))
+            return judge(replace(self._region, name=name, claim=best), quick, self._hints)
         inputs = self._formulas.system.inputs
         claims = [
             sum(a * u for a, u in zip(self._coefficients(row), inputs, strict=True))
@@ -204,11 +214,8 @@ class ChainProof:
 
     def _best(self, row: AffineConstraint) -> Any:
         """Return a u + b for the best input within the bounds."""
-        found = self._offset(row)
-        for a, (low, high) in zip(self._coefficients(row), self._formulas.problem.box, strict=True):
-            if a != 0:
-                found += sp.Max(exact_number(low) * a, exact_number(high) * a)
-        return found
+        bounds = [tuple(map(exact_number, ends)) for ends in self._formulas.problem.box]
+        return self._offset(row) + largest_input_term(self._coefficients(row), bounds)
 
     def _common_input(self, x: np.ndarray) -> np.ndarray:
         """Return the inputs that the filter chooses at states, shape (B, m)."""
@@ -249,8 +256,3 @@ class ChainProof:
                 if verdict.word == word:
                     return word, verdict.reason
         return "proved", ""
-
-
-def exact_number(value: float) -> Any:
-    """Return the decimal that a float is written as, exactly; infinities stay what they are."""
-    return sp.Rational(repr(float(value))) if math.isfinite(value) else sp.Float(value)
