@@ -169,12 +169,13 @@ class ExpressionProgram:
     def _power(self, base: Any, exponent: Any) -> tuple[Operation, Sequence[Any]]:
         ops = self._arithmetic
         if exponent.is_number:
-            value = float(exponent) if exponent.is_Rational or exponent.is_Float else 0.0
-            if value and value.is_integer():
-                return partial(ops.integer_power, n=int(value)), [base]
-            if value == 0.5:
+            # Exactly: a number that rounds to a whole one is none.
+            exact = sp.Rational(exponent) if exponent.is_Rational or exponent.is_Float else None
+            if exact and exact.is_Integer:
+                return partial(ops.integer_power, n=int(exact)), [base]
+            if exact == sp.Rational(1, 2):
                 return ops.square_root, [base]
-            if value == -0.5:
+            if exact == sp.Rational(-1, 2):
                 return lambda a: ops.reciprocal(ops.square_root(a)), [base]
             constant = ops.constant(exponent)
             return lambda a: ops.real_power(a, constant), [base]

@@ -49,6 +49,7 @@ class BranchAndBound:
         self._upper = np.array([math.inf])
         self._width = high - low
         self._settled = -math.inf
+        self._stuck: np.ndarray | None = None
         self._begun = time.monotonic()
         self.best, self.best_state, self.boxes = -math.inf, None, 0
         self.guide = -math.inf
@@ -61,7 +62,9 @@ class BranchAndBound:
 
     @property
     def widest_open(self) -> np.ndarray:
-        """The box whose bound is worst, shape (2, n)."""
+        """The box that bisection does not help, or whose bound is worst, shape (2, n)."""
+        if self._stuck is not None:
+            return self._stuck
         worst = int(np.nan_to_num(self._upper, nan=math.inf).argmax())
         return np.array([self._low[:, worst], self._high[:, worst]])
 
@@ -91,7 +94,9 @@ class BranchAndBound:
         )
 
     def tried(self, x: np.ndarray) -> bool:
-        """Look at states, shape (n, B), and return whether one of them refutes the statement."""
+        """Look at states in the box, shape (n, B), and return whether one refutes the statement."""
+        low, high = self._statement.ends
+        x = x[:, ((x.T >= low) & (x.T <= high)).all(axis=1)]
         if not x.size:
             return False
         found = self._program(x, x)
@@ -193,6 +198,7 @@ class BranchAndBound:
         if len(found.zeros) != 1:
             return False
         fails = found.inside & (found.claim.range.high < 0.0) & np.isfinite(found.claim.range.low)
+        fails &= found.zeros[0].smooth
         for i in chosen[fails[chosen]].tolist():
             upward = found.zeros[0].slopes[:, i] >= 0.0
             ends = np.stack(
@@ -226,17 +232,24 @@ class BranchAndBound:
         with np.errstate(invalid="ignore"):
             narrow = ((high - low) <= _NARROW * np.minimum(self._width, 1.0)[:, None]).all(axis=0)
         rough = narrow & ~found.smooth[open_] & found.inside[open_]
+        for form in found.zeros:
+            rough |= narrow & ~form.smooth[open_]
         below, above = high.copy(), low.copy()
         below[axis, at], above[axis, at] = middle, middle
         if (stuck | rough).any():
             i = int((stuck | rough).argmax())
-            self._low, self._high = low[:, [i]], high[:, [i]]
-            self._upper = upper[[i]]
+            self._stuck = np.array([low[:, i], high[:, i]])
+            self._leave(low, high, upper)  # All: a bound is over all that are left.
             return self._why_stuck(bool(rough[i]), bool(found.smooth[open_][i]))
-        self._low = np.concatenate([self._low, low, above], axis=1)
-        self._high = np.concatenate([self._high, below, high], axis=1)
-        self._upper = np.concatenate([self._upper, upper, upper])
+        self._leave(low, below, upper)
+        self._leave(above, high, upper)
         return ""
+
+    def _leave(self, low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> None:
+        """Add boxes to those that are left."""
+        self._low = np.concatenate([self._low, low], axis=1)
+        self._high = np.concatenate([self._high, high], axis=1)
+        self._upper = np.concatenate([self._upper, upper])
 
     def _why_stuck(self, rough: bool, smooth: bool) -> str:
         name, (low, high) = self._statement.name, self.widest_open
