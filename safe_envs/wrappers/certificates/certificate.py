@@ -72,16 +72,18 @@ class BarrierCertificate:
     supremum: Fraction
     horizon: Fraction
 
-    def bounds_at(self, starts: np.ndarray) -> np.ndarray:
-        """Return the bound at starts in C, where psi <= 0 it is 0.
+    def bounds_at(self, starts: np.ndarray, horizon: float | None = None) -> np.ndarray:
+        """Return the bound at starts in C; where psi <= 0 it is 0.
 
         Args:
             starts: states, shape (B, n).
+            horizon: T in s; by default that of the certificate.
 
         Returns:
             Values in [0, 1], shape (B,).
         """
-        a, m, c, horizon = map(float, (self.rate, self.shortfall, self.supremum, self.horizon))
-        spent = -math.expm1(-a * horizon) / a if a else horizon
-        values = self.psi.values(starts) * math.exp(-a * horizon) - m * spent
+        a, m, c = map(float, (self.rate, self.shortfall, self.supremum))
+        time = float(self.horizon) if horizon is None else horizon
+        spent = -math.expm1(-a * time) / a if a else time
+        values = self.psi.values(starts) * math.exp(-a * time) - m * spent
         return np.clip(values / c, 0.0, 1.0)
