@@ -61,15 +61,14 @@ class CertificateGuarantee:
         with np.errstate(all="ignore"):
             barriers = tabulated(plant.states, list(plant.barriers))(x)
         low, high = np.array([[float(end) for end in ends] for ends in plant.workspace]).T
-        # Angles may be any turn of the one that the workspace holds.
-        angle = np.isclose(high - low, 2.0 * math.pi)
-        return (barriers > 0.0).all(axis=1) & (((x >= low) & (x <= high)) | angle).all(axis=1)
+        within = ((x >= low) & (x <= high)) | np.array(plant.angles)
+        return (barriers > 0.0).all(axis=1) & within.all(axis=1)
 
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
         """Say what states contradict in c; see `ChainGuarantee.contradiction`."""
-        psi = self.certificate.psi.values(reached[self._inside(reached)])
+        psi = self.certificate.values(reached[self._inside(reached)])
         highest, c = float(psi.max(initial=-math.inf)), float(self.certificate.supremum)
         return reaches("psi", highest, c) if highest > c * (1.0 + RELATIVE) else ""
 
