@@ -32,16 +32,17 @@ def system_differences(plant: Plant, system: ControlAffineSDE) -> list[str]:
     if (plant.states, plant.inputs) != (system.states, system.inputs):
         return [_symbols(plant, system)]
     sigma: Any = sp.Matrix(plant.diffusion)
-    parts = (
-        ("the drift", sp.Matrix(plant.drift), system.drift),
-        ("the effect of the inputs", sp.Matrix(plant.input_matrix), system.input_matrix),
-        ("the noise", sigma * sigma.T, system.diffusion * system.diffusion.T),
+    # A product of decimals is exact only after they are rationals.
+    drift, effect, spread = (
+        sp.Matrix(part).applyfunc(lambda e: _exact(system, e))
+        for part in (system.drift, system.input_matrix, system.diffusion)
     )
-    return [
-        name
-        for name, known, given in parts
-        if not _equal(known.tolist(), system.exact(given).tolist())
-    ]
+    parts = (
+        ("the drift", sp.Matrix(plant.drift), drift),
+        ("the effect of the inputs", sp.Matrix(plant.input_matrix), effect),
+        ("the noise", sigma * sigma.T, spread * spread.T),
+    )
+    return [name for name, known, given in parts if not _equal(known.tolist(), given.tolist())]
 
 
 def problem_differences(plant: Plant, problem: SafetyProblem) -> list[str]:
@@ -53,7 +54,7 @@ def problem_differences(plant: Plant, problem: SafetyProblem) -> list[str]:
     """
     if (plant.states, plant.inputs) != (problem.plant.states, problem.plant.inputs):
         return [_symbols(plant, problem.plant)]
-    barriers = [problem.plant.exact(b.expression) for b in problem.barriers]
+    barriers = [_exact(problem.plant, b.expression) for b in problem.barriers]
     differing = [
         f"the workspace of {v.symbol}"
         for v, ends in zip(problem.states, plant.workspace, strict=True)
@@ -75,6 +76,12 @@ def is_among(known: Sequence[sp.Expr], given: sp.Expr) -> bool:
         given: the one.
     """
     return any(_equal([each], [given]) for each in known)
+
+
+def _exact(system: ControlAffineSDE, expression: Any) -> Any:
+    """Return an expression with decimals as rationals, those of the parameters too."""
+    found = system.exact(expression)
+    return found.xreplace({f: sp.Rational(repr(float(f))) for f in found.atoms(sp.Float)})
 
 
 def _symbols(plant: Plant, system: ControlAffineSDE) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import Barrier
+from safe_envs import Barrier, ControlAffineSDE, state_problem
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError
@@ -77,7 +77,28 @@ def folder(tmp_path, monkeypatch):
 # the constraint
 
 
-@pytest.mark.parametrize(("problem", "degree"), [(DISK, 16), (PENDULUM, 9)])
+def correlated():
+    """A problem whose two noises act on both states, one of them more where x_1 is larger."""
+    u, w = sp.symbols("u w", real=True)
+    system = ControlAffineSDE(
+        (x_1, x_2),
+        (u, w),
+        [x_2, -sp.sin(x_1)],
+        [[1, x_2], [0, 2]],
+        [[0.3, 0.2 * x_1], [0.1, -0.4]],
+    )
+    return state_problem(
+        system,
+        1 - x_1**2,
+        box=(-5.0, 5.0),
+        start=(0.0, 0.0),
+        dt=0.01,
+        horizon=1.0,
+        workspace={x_1: (-2.0, 2.0), x_2: (-2.0, 2.0)},
+    )
+
+
+@pytest.mark.parametrize(("problem", "degree"), [(DISK, 16), (PENDULUM, 9), (correlated(), 5)])
 def test_the_constraint_is_the_generator_of_psi_by_finite_differences(problem, degree):
     system, psi = problem.plant, random_polynomial(problem, degree)
     safety_filter = filter_of(problem, psi, rate=".7", shortfall=".3")
@@ -207,6 +228,7 @@ def test_an_angle_counts_by_its_turn():
     assert found.feasible.all()
     np.testing.assert_allclose(found.action, found.action[:1].repeat(3, axis=0), atol=1e-12)
     assert found.active.all()
+    assert check(safety_filter, x, np.full((3, 1), 3.0)) == {"met"}
 
 
 # several barriers
