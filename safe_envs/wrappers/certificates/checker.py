@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import time
 from itertools import combinations_with_replacement
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.certificates.check_result import CheckResult, StatementCheck, combined
+from safe_envs.wrappers.certificates.claims import Statement, first_statement, statements_of
 from safe_envs.wrappers.certificates.enclosures import (
     EPS,
     Form,
@@ -28,72 +29,6 @@ from safe_envs.wrappers.certificates.enclosures import (
 
 _STEEPEST, _TRIED, _NUMBERS = 1e6, 200, 2_000_000  # multipliers; points, numbers in a batch
 _SMALLEST = 1e-9  # box for the workspace
-
-
-class _Statement(NamedTuple):
-    """Claim + sum of w u >= 0, for some u of each (w, low, high) in inputs, in a region.
-
-    Attributes:
-        name: of the statement.
-        claim: expression of the states and of the symbols of psi and its derivatives.
-        region: the expressions that are positive there.
-        zero: another one that is 0 there, if any.
-        inputs: the coefficients of the inputs, with their bounds.
-        defined: what has to have a value there, in place of the claim.
-        faces: in place of the workspace those of its faces where a state, by index, has a value.
-    """
-
-    name: str
-    claim: Any
-    region: tuple[Any, ...]
-    zero: Any = None
-    inputs: tuple[Any, ...] = ()
-    defined: tuple[Any, ...] = ()
-    faces: tuple[tuple[int, Any], ...] = ()
-
-
-def statements_of(certificate: BarrierCertificate, psi: dict[Any, sp.Symbol]) -> list[_Statement]:
-    """Return all statements; psi has the symbols of its derivatives by the indices of states."""
-    plant, p, h = certificate.plant, psi[()], certificate.plant.barriers
-    a, m, c = map(sp.Rational, (certificate.rate, certificate.shortfall, certificate.supremum))
-    claim = a * p + m + sum(f * psi[i,] for i, f in enumerate(plant.drift))
-    for i, k in combinations_with_replacement(range(len(plant.states)), 2):
-        both = zip(plant.diffusion[i], plant.diffusion[k], strict=True)
-        claim += sum(x * y for x, y in both) * psi[i, k] / (2 if i == k else 1)
-    columns = zip(*plant.input_matrix, strict=True)
-    effects = [sum(g * psi[i,] for i, g in enumerate(column)) for column in columns]
-    inputs = tuple((w, *ends) for w, ends in zip(effects, plant.bounds, strict=True))
-    if plant.policy:
-        for u, (w, low, high) in zip(plant.policy, inputs, strict=True):
-            claim += w * sp.Max(low, sp.Min(high, u))
-        inputs = ()
-    used = (*plant.drift, *h, *plant.policy, *sum((*plant.input_matrix, *plant.diffusion), ()))
-    found = [
-        _Statement(
-            "f, g, sigma, h and the policy are defined", sp.Integer(1), (p, *h), defined=used
-        ),
-        _Statement("psi <= c", c - p, (p, *h)),
-        _Statement("A psi >= -a psi - m", claim, (p, *h), inputs=inputs),
-    ]
-    for i, e in enumerate(h):
-        if not _divides(e, certificate):
-            rest = (p, *h[:i], *h[i + 1 :])
-            found.append(_Statement(f"psi <= 0 where h_{i + 1} = 0", -p, rest, zero=e))
-    for i, (x, (low, high)) in enumerate(zip(plant.states, plant.workspace, strict=True)):
-        turn = sp.simplify(high - low - 2 * sp.pi) == 0
-        repeats = turn and all(e.subs(x, x + 2 * sp.pi) == e for e in used)
-        if repeats and any(key[i] for key in certificate.psi.coefficients):
-            name, faces = f"psi <= 0 at the ends of the turn of {x}", ((i, low), (i, high))
-            found.append(_Statement(name, -p, (p, *h), faces=faces))
-    return found
-
-
-def _divides(h: sp.Expr, certificate: BarrierCertificate) -> bool:
-    """Whether psi is a multiple of h, so that it is 0 where h is."""
-    states, psi = certificate.plant.states, certificate.psi
-    if not (h.is_polynomial(*states) and 0 < sp.Poly(h, *states).total_degree() <= psi.degree):
-        return False
-    return sp.reduced(sp.expand(psi.expression), [h], *states)[1] == 0
 
 
 def _best(total: Form, helpers: list[Any]) -> Form:
@@ -126,7 +61,7 @@ class _Search:
         self._batch = int(np.clip(_NUMBERS // certificate.psi.tensor.size, 8, 4096))
         self._end = time.monotonic() + seconds
 
-    def _forms(self, st: _Statement, x: np.ndarray, r: np.ndarray) -> tuple[Any, ...]:
+    def _forms(self, st: Statement, x: np.ndarray, r: np.ndarray) -> tuple[Any, ...]:
         """Return those of claim, region and zero, and the inputs with theirs."""
         n, effects = len(x), [w for w, _, _ in st.inputs]
         wanted = (st.claim, st.zero or sp.Integer(0), *st.region, *effects, *st.defined)
@@ -146,7 +81,7 @@ class _Search:
         inputs = [(q, float(i[1]), float(i[2])) for q, i in zip(forms[k:], st.inputs, strict=False)]
         return forms[0], forms[2:k], forms[1], inputs
 
-    def run(self, st: _Statement) -> StatementCheck:
+    def run(self, st: Statement) -> StatementCheck:
         """Check one statement."""
         began, seen, short = time.monotonic(), 0, 0.0
         ends = np.array([[float(e) for e in pair] for pair in self._plant.workspace])
@@ -180,7 +115,7 @@ class _Search:
             x, r = _halved(x[:, np.concatenate(left)], r[:, np.concatenate(left)], sizes)
         return StatementCheck(st.name, "checked", seen, time.monotonic() - began)
 
-    def _open(self, st: _Statement, x: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _open(self, st: Statement, x: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return lower ends of the claim, and the boxes where it is neither true nor void."""
         claim, region, zero, inputs = self._forms(st, x, r)
         helpers = [*inputs, *((q, -_STEEPEST, 0.0) for q in region)]
@@ -189,7 +124,7 @@ class _Search:
         void = np.any([q.high < 0 for q in region], axis=0) | (zero.low > 0) | (zero.high < 0)
         return low, np.flatnonzero(~((low >= 0) | void))
 
-    def _counterexample(self, st: _Statement, x: np.ndarray, r: np.ndarray) -> Any:
+    def _counterexample(self, st: Statement, x: np.ndarray, r: np.ndarray) -> Any:
         """Return a state that is sure to refute the statement, among the middles of boxes."""
         if st.defined or not x.shape[1]:
             return None
@@ -228,15 +163,8 @@ def check(
     Raises:
         ConfigurationError: an expression has a function that the checker does not know.
     """
-    signs = certificate.rate >= 0 and certificate.shortfall >= 0 and certificate.supremum > 0
-    ends = (*certificate.plant.workspace, *certificate.plant.bounds)
-    sound = signs and certificate.horizon > 0 and all(e.is_finite for pair in ends for e in pair)
-    parts = [
-        StatementCheck(
-            "the workspace is bounded; a, m >= 0; c, T > 0", "checked" if sound else "refuted"
-        )
-    ]
-    if sound:
+    parts = [first_statement(certificate)]
+    if parts[0].word == "checked":
         with np.errstate(all="ignore"):
             search = _Search(certificate, boxes, seconds)
             parts += [search.run(statement) for statement in search.statements]

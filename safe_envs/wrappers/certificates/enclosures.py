@@ -170,10 +170,11 @@ class PolynomialForms:
         for order in orders:
             taken = np.bincount(np.array(order, int), minlength=len(x))
             up = self.powers - taken[:, None]
-            weight = np.prod(
-                [[math.perm(k, a) for k in row] for row, a in zip(self.powers, taken, strict=True)],
-                axis=0,
-            ) / np.prod(self.scale[:, 0] ** taken)
+            counts = [
+                [math.perm(k, a) for k in range(d)] for a, d in zip(taken, shape, strict=True)
+            ]
+            parts = [np.array(c, float)[k] for c, k in zip(counts, self.powers, strict=True)]
+            weight = math.prod(parts) / np.prod(self.scale[:, 0] ** taken)
             total, even = up.sum(0), (up % 2 == 0).all(0) * (up.sum(0) > 0) / 2  # of z^2, in [0, 1]
             linear = weight * (total == 1) * (up == 1)  # (n, K)
             back = np.prod(wide ** taken[:, None], axis=0)
