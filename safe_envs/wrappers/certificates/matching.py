@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.certificates.certificate import Plant
+from safe_envs.wrappers.certificates.statements import exact_in, plant_of
 
 PERIOD = 2 * sp.pi
 """Of an angle."""
@@ -31,18 +31,18 @@ def system_differences(plant: Plant, system: ControlAffineSDE) -> list[str]:
     """
     if (plant.states, plant.inputs) != (system.states, system.inputs):
         return [_symbols(plant, system)]
-    sigma: Any = sp.Matrix(plant.diffusion)
-    # A product of decimals is exact only after they are rationals.
-    drift, effect, spread = (
-        sp.Matrix(part).applyfunc(lambda e: _exact(system, e))
+    drift, effect, sigma = (
+        sp.Matrix(part).applyfunc(lambda e: exact_in(system, e))
         for part in (system.drift, system.input_matrix, system.diffusion)
     )
-    parts = (
-        ("the drift", sp.Matrix(plant.drift), drift),
+    # Noises with the same covariance are the same.
+    known: Any = sp.Matrix(plant.diffusion)
+    parts: Any = (
+        ("the drift", plant.drift, drift),
         ("the effect of the inputs", sp.Matrix(plant.input_matrix), effect),
-        ("the noise", sigma * sigma.T, spread * spread.T),
+        ("the noise", known * known.T, sigma * sigma.T),
     )
-    return [name for name, known, given in parts if not _equal(known.tolist(), given.tolist())]
+    return [name for name, ours, theirs in parts if not _equal(list(ours), list(theirs))]
 
 
 def problem_differences(plant: Plant, problem: SafetyProblem) -> list[str]:
@@ -51,21 +51,23 @@ def problem_differences(plant: Plant, problem: SafetyProblem) -> list[str]:
     Args:
         plant: of the certificate.
         problem: with its states, inputs and barriers.
+
+    Raises:
+        ConfigurationError: No certificate can be of the problem; see `plant_of`.
     """
     if (plant.states, plant.inputs) != (problem.plant.states, problem.plant.inputs):
         return [_symbols(plant, problem.plant)]
-    barriers = [_exact(problem.plant, b.expression) for b in problem.barriers]
+    given = plant_of(problem)
+    ranges = [
+        *zip(plant.states, plant.workspace, given.workspace, strict=True),
+        *zip(plant.inputs, plant.bounds, given.bounds, strict=True),
+    ]
     differing = [
-        f"the workspace of {v.symbol}"
-        for v, ends in zip(problem.states, plant.workspace, strict=True)
-        if not (_same_ends(ends, v.low, v.high) or (is_one_period(ends) and np.isinf(v.high)))
+        f"the {'workspace' if symbol in plant.states else 'bounds'} of {symbol}"
+        for symbol, ours, theirs in ranges
+        if not _equal(ours, theirs)
     ]
-    differing += [
-        f"the bounds of {v.symbol}"
-        for v, ends in zip(problem.inputs, plant.bounds, strict=True)
-        if not _same_ends(ends, v.low, v.high)
-    ]
-    return differing + ["the barriers"] * (not _equal(plant.barriers, barriers))
+    return differing + ["the barriers"] * (not _equal(plant.barriers, given.barriers))
 
 
 def is_among(known: Sequence[sp.Expr], given: sp.Expr) -> bool:
@@ -78,31 +80,12 @@ def is_among(known: Sequence[sp.Expr], given: sp.Expr) -> bool:
     return any(_equal([each], [given]) for each in known)
 
 
-def _exact(system: ControlAffineSDE, expression: Any) -> Any:
-    """Return an expression with decimals as rationals, those of the parameters too."""
-    found = system.exact(expression)
-    return found.xreplace({f: sp.Rational(repr(float(f))) for f in found.atoms(sp.Float)})
-
-
 def _symbols(plant: Plant, system: ControlAffineSDE) -> str:
     known, given = (", ".join(map(str, (*s.states, *s.inputs))) for s in (plant, system))
     return f"the states and inputs ({known} in place of {given})"
 
 
 def _equal(known: Sequence[Any], given: Sequence[Any]) -> bool:
-    """Return whether expressions, or lists of them, are equal one by one."""
     return len(known) == len(given) and all(
-        _equal(a, b) if isinstance(a, list) else is_zero(a - b)
-        for a, b in zip(known, given, strict=True)
+        is_zero(a - b) for a, b in zip(known, given, strict=True)
     )
-
-
-def _same_ends(ends: tuple[sp.Expr, sp.Expr], low: float, high: float) -> bool:
-    """Return whether exact ends are those of a range, whose numbers are decimal or rounded."""
-    return all(_same(exact, end) for exact, end in zip(ends, (low, high), strict=True))
-
-
-def _same(exact: sp.Expr, given: float) -> bool:
-    if exact.is_Rational:
-        return np.isfinite(given) and exact == sp.Rational(repr(float(given)))
-    return float(exact) == given

@@ -26,6 +26,7 @@ from safe_envs.wrappers.certificates.matching import (
     is_one_period,
     system_differences,
 )
+from safe_envs.wrappers.certificates.statements import exact_in
 from safe_envs.wrappers.conditions.base import FIRST_ORDER, Condition
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.qp.rounding import ROUNDING
@@ -129,7 +130,7 @@ class Certified(Condition):
         """
         certificate = self.certificate
         plant = certificate.plant
-        if not is_among(plant.barriers, model.exact(barrier.expression)):
+        if not is_among(plant.barriers, exact_in(model, barrier.expression)):
             raise ConfigurationError(
                 f"{self._described} is not of the barrier {barrier.name} = {barrier.expression}."
                 f" {_ADVICE}"
