@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.lie import has_kinks
+from safe_envs.wrappers.conditions import Certified
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import in_workspace, workspace_of
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
@@ -15,6 +16,8 @@ from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 
 def no_bound(formulas: Formulas) -> str:
     """Say why there is no bound whatever the numbers are; "" if there may be one."""
+    if any(isinstance(condition, Certified) for condition in formulas.conditions):
+        return "its bound is that of the certificate, and not one of the chain of h"
     if not formulas.noisy:
         return ""
     for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
