@@ -80,6 +80,25 @@ def _undefined(analysis: SafeSetAnalysis) -> str:
     )
 
 
+def outside(formulas: Formulas, b: np.ndarray) -> str:
+    """Say where the start is outside, by the value that is lowest.
+
+    Args:
+        formulas: of the chains.
+        b: values of all b_j at the starts, shape (B, sum of the r).
+
+    Returns:
+        A text.
+    """
+    if (b > 0.0).any(axis=0).all():
+        return "no start lies in all C_j at once"
+    j = int(b.max(axis=0).argmin())
+    stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
+    return f"the start is outside C_{stage}: {formulas.names[j]} = {b[:, j].max():.4g}" + (
+        " at most" if len(b) > 1 else ""
+    )
+
+
 def amount(shortfall: float) -> str:
     """Say by how much a condition is violated."""
     return f"by up to {shortfall:.4g}"
