@@ -17,7 +17,7 @@ from safe_envs.wrappers.verification.input_terms import exact_number
 from safe_envs.wrappers.verification.judge import judge, supremum
 from safe_envs.wrappers.verification.statement import Statement
 
-_BUDGET = Budget(boxes=1_000_000, seconds=4.0)
+_BUDGET = Budget(boxes=300_000, seconds=60.0)
 _RELATIVE, _SMALL = 1e-2, 1e-4
 
 
