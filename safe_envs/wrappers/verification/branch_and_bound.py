@@ -63,10 +63,9 @@ class BranchAndBound:
     @property
     def widest_open(self) -> np.ndarray:
         """The box that bisection does not help, or whose bound is worst, shape (2, n)."""
-        if self._stuck is not None:
-            return self._stuck
-        worst = int(np.nan_to_num(self._upper, nan=math.inf).argmax())
-        return np.array([self._low[:, worst], self._high[:, worst]])
+        worst = int(self._upper.argmax())
+        open_ = np.array([self._low[:, worst], self._high[:, worst]])
+        return open_ if self._stuck is None else self._stuck
 
     @property
     def upper(self) -> float:
@@ -95,8 +94,8 @@ class BranchAndBound:
 
     def tried(self, x: np.ndarray) -> bool:
         """Look at states in the box, shape (n, B), and return whether one refutes the statement."""
-        low, high = self._statement.ends
-        x = x[:, ((x.T >= low) & (x.T <= high)).all(axis=1)]
+        low, high = (end[:, None] for end in self._statement.ends)
+        x = x[:, ((low <= x) & (x <= high)).all(axis=0)]
         if not x.size:
             return False
         found = self._program(x, x)

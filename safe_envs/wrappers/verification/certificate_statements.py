@@ -73,7 +73,12 @@ class CertificateStatements:
             for j in range(len(plant.bounds))
         ]
         if plant.policy:
-            found += sum(u * a for u, a in zip(plant.policy, moved, strict=True))
+            # What is applied: an input beyond its bounds is cut to them.
+            applied = [
+                sp.Max(low, sp.Min(high, u))
+                for u, (low, high) in zip(plant.policy, plant.bounds, strict=True)
+            ]
+            found += sum(u * a for u, a in zip(applied, moved, strict=True))
         else:
             found += largest_input_term(moved, plant.bounds)
         for (i, j), symbol in curves.items():
@@ -168,6 +173,10 @@ def judged(
     Returns:
         The name and the verdict of each; it is a proof where all are proved.
     """
+    name = "a >= 0, m >= 0 and c > 0"
+    if min(certificate.rate, certificate.shortfall) < 0 or certificate.supremum <= 0:
+        # With a < 0 an end of the episode, at the edge of the workspace, would be worth too much.
+        return [(name, Verdict("refuted", 0, reason=f"not {name}"))]
     parts = CertificateStatements(certificate.plant, certificate.psi, certificate.rate)
     c, m = sp.Rational(certificate.supremum), sp.Rational(certificate.shortfall)
     statements = [

@@ -41,7 +41,7 @@ class Statement:
     """A claim: an expression is at least 0 at every state of a region.
 
     The region is where all of `positive` are above 0, all of `nonnegative` at least 0 and all of
-    `zeros` are 0 (or jump), within a box. Where `smooth` is given the statement says besides that these
+    `zeros` are 0, within a box. Where `smooth` is given the statement says besides that these
     expressions are twice continuously differentiable there.
 
     Attributes:

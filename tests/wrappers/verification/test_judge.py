@@ -81,6 +81,26 @@ def test_the_bound_of_a_supremum_is_over_all_boxes_where_bisection_ends_at_one()
     assert found.lower <= 5.0 + 0.5
 
 
+def _certificate(psi, barrier, drift, effect=0, policy=(), rate=Fraction(101, 100)):
+    """Of x' = drift + effect u on [-2, 2], with c = 3.1 and m = .01."""
+    one = sp.Integer(1)
+    coefficients = {(k,): Fraction(int(c)) for (k,), c in sp.Poly(psi, x).terms()}
+    plant = Plant(
+        states=(x,),
+        workspace=((-2 * one, 2 * one),),
+        inputs=(u,),
+        bounds=((-one, one),),
+        drift=(drift * one,),
+        input_matrix=((effect * one,),),
+        diffusion=((0 * one,),),
+        barriers=(barrier,),
+        policy=tuple(p * one for p in policy),
+    )
+    made = Polynomial((x,), (Fraction(0),), (Fraction(1),), coefficients)
+    numbers = (Fraction(rate), Fraction(1, 100), Fraction(31, 10), Fraction(2))
+    return BarrierCertificate("", {}, plant, made, *numbers)
+
+
 @pytest.mark.parametrize(
     "barrier",
     [
@@ -99,25 +119,29 @@ def test_the_bound_of_a_supremum_is_over_all_boxes_where_bisection_ends_at_one()
 )
 def test_a_barrier_that_changes_its_sign_without_a_zero_has_an_edge_there(barrier):
     """x' = -1 leaves C = (0, 2) at x = 0 for certain, where psi = 1 + x is 1."""
-    zero, one = sp.Integer(0), sp.Integer(1)
-    plant = Plant(
-        states=(x,),
-        workspace=((-2 * one, 2 * one),),
-        inputs=(u,),
-        bounds=((-one, one),),
-        drift=(-one,),
-        input_matrix=((zero,),),
-        diffusion=((zero,),),
-        barriers=(barrier,),
-    )
-    psi = Polynomial((x,), (Fraction(0),), (Fraction(1),), {(0,): Fraction(1), (1,): Fraction(1)})
-    certificate = BarrierCertificate(
-        "", {}, plant, psi, Fraction(101, 100), Fraction(1, 100), Fraction(31, 10), Fraction(2)
-    )
+    certificate = _certificate(1 + x, barrier, drift=-1)
     words = {name: verdict.word for name, verdict in judged(certificate, Budget(20_000, 5.0))}
     assert words["psi <= c"] == words["A psi >= -a psi - m"] == "proved"
     assert words["psi <= 0 on the edge of C"] != "proved"
     assert certificate.bounds_at(np.array([[1.9]]))[0] > 0.1
+
+
+def test_a_policy_is_cut_to_the_bounds_of_its_input():
+    """x' = -5 + u with u = 10 falls where |u| is at most 1."""
+    words = [
+        verdict.word
+        for _, verdict in judged(_certificate(x, x, drift=-5, effect=1, policy=(10,), rate=0))
+    ]
+    assert words[1] == "refuted"
+
+
+@pytest.mark.parametrize("change", [{"rate": -1}, {"shortfall": -1}, {"supremum": 0}])
+def test_numbers_out_of_the_theorem_are_refuted(change):
+    certificate = _certificate(1 + x, x, drift=1)
+    assert {v.word for _, v in judged(replace(certificate, supremum=Fraction(4)))} >= {"proved"}
+    changed = replace(certificate, **{name: Fraction(v) for name, v in change.items()})
+    (verdict,) = (verdict for _, verdict in judged(changed))
+    assert verdict.word == "refuted"
 
 
 def test_a_sign_that_changes_at_a_pole_refutes_nothing():
