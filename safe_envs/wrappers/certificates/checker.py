@@ -95,7 +95,7 @@ class _Search:
             for start in range(0, x.shape[1], self._batch):
                 y, s = x[:, start : start + self._batch], r[:, start : start + self._batch]
                 late = self._boxes <= 0 or time.monotonic() > self._end
-                if late or (s[:, 0] < _SMALLEST * sizes).all():
+                if late or (seen and (s[:, 0] < _SMALLEST * sizes).all()):
                     count = x.shape[1] - start + sum(map(len, left))
                     why = f"is short by {short:.1e} or less" if np.isfinite(short) else "has a pole"
                     reason = (
@@ -133,7 +133,7 @@ class _Search:
             most = [times(constant(u, len(x)), w).high for u in (low, high)]
             claim = plus(claim, claim._replace(b=0 * x, c=0.0, rho=np.inf, high=np.maximum(*most)))
         wrong = (claim.high < 0) & np.all([q.low > 0 for q in region], axis=0)
-        if st.zero is not None:  # it changes its sign within the box
+        if st.zero is not None:  # it changes its sign in between
             step = r * np.sign(zero.b)
             low, high = (self._forms(st, x + k * step, 0 * r)[2] for k in (-1, 1))
             wrong &= (low.high < 0) & (high.low > 0)

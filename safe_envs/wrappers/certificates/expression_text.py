@@ -45,6 +45,10 @@ _DEEPEST = 100
 def require_name(name: Any, where: str) -> str:
     """Return the name of a symbol.
 
+    Args:
+        name: what was given.
+        where: it stands, for errors.
+
     Raises:
         ConfigurationError: a text of an expression cannot have it.
     """
@@ -74,7 +78,8 @@ def write_expression(expression: sp.Expr, names: Mapping[str, sp.Symbol], where:
     """
     text = str(expression)
     found = read_expression(text, names, where)
-    if found != expression and sp.expand(found - expression) != 0:
+    same = found == expression or sp.expand(found - expression) == 0
+    if not same or expression.atoms(sp.Float):
         raise ConfigurationError(
             f"{where}: {shortened(expression)} is read back as {shortened(found)}; give exact"
             " numbers and sympy's own forms of expressions"
