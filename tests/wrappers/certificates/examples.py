@@ -83,6 +83,7 @@ TRUE = {
     "a line": brownian(),
     "rate": brownian(rate="0.5"),
     "the disk": disk(),
+    "the disk without any room": disk(shortfall="0.08", supremum=1),
     "several barriers": with_plant(brownian(), barriers=(x, sp.pi - x)),
     "a root": in_line(
         ["-0.01", "2", "-1"], drift=sp.sqrt(1 + x**2), h=2 - x, shortfall=6, supremum="1.1"
@@ -125,5 +126,7 @@ UNDECIDED = {
     "a pole that the input avoids": with_plant(brownian(), input_matrix=((1 / (x - 2),),)),
     "a root of a negative number": with_plant(brownian(), input_matrix=((sp.sqrt(x - 1),),)),
     "no value, but a bounded one": with_plant(brownian(), input_matrix=((sp.sin(1 / (x - 2)),),)),
-    "true without any room": disk(shortfall="0.08", supremum=1),
+    "true without any room on a line": disk(
+        {(2, 0): F(-1), (1, 0): F(1)}, shortfall="100", supremum="0.25"
+    ),
 }
