@@ -215,6 +215,7 @@ class PolynomialForms:
             back = np.prod(wide ** taken[:, None], axis=0)
             c, b = terms @ (weight * ((total == 0) + even)) / back, linear @ terms.T / back
             rho = np.abs(terms) @ (weight * (total > 1) * (1 - even)) + errors @ weight
-            rho = (rho * (1 + terms.shape[1] * EPS)) / back + (np.abs(b) * slack / wide).sum(0)
+            rho = rho * (1 + terms.shape[1] * EPS) / back + (np.abs(b) * slack / wide).sum(0)
+            rho = rho + terms.shape[1] * EPS / 8 * np.abs(c)  # of the sum that is c
             forms.append(form(c, b * (r / self.scale) / wide, rho * (1 + EPS), -np.inf, np.inf))
         return forms

@@ -1,7 +1,7 @@
 """Claims that hold without any room, as equalities at the center of psi.
 
-Let e be a claim with fixed inputs. If e and its gradient are exactly 0 at the center, and the matrix
-of its second derivatives is positive semidefinite on a neighbourhood (by the circles of Gershgorin),
+Let e be a claim with fixed inputs. If e and its gradient are exactly 0 at the center, and the
+matrix of its second derivatives is positive semidefinite around it (by the circles of Gershgorin),
 then e >= 0 there, by Taylor's theorem. No bisection shows that.
 """
 
