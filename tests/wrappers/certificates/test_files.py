@@ -147,6 +147,7 @@ def test_numbers_are_exact(value, text):
         ("drift", ["x_1", "x" * 30_000], "characters"),
         ("drift", ["x_1", "gamma(x_1)"], "unknown function"),
         ("drift", ["x_1", "sin(x_1, x_2)"], "unknown function"),
+        ("drift", ["x_1", "Max(" + "x_1, " * 12 + "x_2)"], "of 13 arguments"),
         ("drift", ["x_1", "1_000"], "not allowed"),
         ("drift", ["x_1", "True"], "not allowed"),
         ("input_matrix", [["0"]], "2 lists"),
