@@ -8,7 +8,6 @@ occurs several times. Results are rounded outwards: see `interval_arithmetic`.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
 from typing import Any
@@ -16,11 +15,12 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.computable import excerpt, require_computable
+from safe_envs.dynamics.computable import excerpt
+from safe_envs.dynamics.expression_program import ExpressionProgram, Operation
 from safe_envs.dynamics.interval_arithmetic import Interval, IntervalArithmetic, negative
 from safe_envs.errors import SystemDefinitionError
 
-__all__ = ["Interval", "interval_function"]
+__all__ = ["Interval", "IntervalOperations", "interval_function"]
 
 _HALF_PI = math.nextafter(math.pi / 2, 2)
 _PI = math.nextafter(math.pi, 4)
@@ -38,17 +38,54 @@ _INCREASING: dict[Any, tuple[Callable[..., Any], tuple[float, float]]] = {
     sp.atanh: (np.arctanh, _ALL),
 }
 _STEPS = {sp.sign: np.sign, sp.floor: np.floor, sp.ceiling: np.ceil}
-_INVERSES = {
-    sp.sec: sp.cos,
-    sp.csc: sp.sin,
-    sp.cot: sp.tan,
-    sp.sech: sp.cosh,
-    sp.csch: sp.sinh,
-    sp.coth: sp.tanh,
-}
 
-Operation = Callable[..., Interval]
 IntervalFunction = Callable[[Sequence[Any]], tuple[Interval, ...]]
+
+
+class IntervalOperations(IntervalArithmetic):
+    """Interval arithmetic with the functions of expressions, by their SymPy classes."""
+
+    def constant(self, number: Any) -> Interval:
+        """Return the floats around a real number, or a point if it is one."""
+        exact = number.is_Rational or number.is_Float
+        try:
+            value = float(number if exact else sp.N(number, 40))
+        except TypeError as error:
+            raise SystemDefinitionError(f"{excerpt(number)} is not a real number") from error
+        if math.isnan(value):
+            raise SystemDefinitionError(f"{excerpt(number)} is not a real number")
+        if exact and sp.Rational(number) == sp.Rational(value):
+            return Interval(value, value)
+        return Interval(math.nextafter(value, -math.inf), math.nextafter(value, math.inf))
+
+    def size(self, a: Interval) -> int:
+        """Return the number of entries of an interval."""
+        return int(np.size(a.low))
+
+    def function(self, kind: Any) -> Operation:
+        """Return a function of one argument."""
+        if kind in _INCREASING:
+            function, ends = _INCREASING[kind]
+            return partial(self.increasing, function, ends=ends)
+        others: dict[Any, Operation] = {
+            sp.sin: partial(self.wave, np.sin, peak=0.25),
+            sp.cos: partial(self.wave, np.cos, peak=0.0),
+            sp.tan: self.tan,
+            sp.acos: lambda a: negative(self.increasing(_negative_arccos, a, (-_PI, 0.0))),
+            sp.cosh: lambda a: self.increasing(np.cosh, self.absolute(a), (1.0, np.inf)),
+            sp.Abs: self.absolute,
+        }
+        return others[kind]
+
+    def step(self, kind: Any) -> Operation:
+        """Return the sign, or a rounding down or up."""
+        step = _STEPS[kind]
+        return lambda a: Interval(step(a.low), step(a.high))
+
+    def extreme(self, kind: Any) -> Operation:
+        """Return the larger or the smaller of two."""
+        chosen = np.maximum if kind is sp.Max else np.minimum
+        return lambda a, b: Interval(chosen(a.low, b.low), chosen(a.high, b.high))
 
 
 def interval_function(
@@ -80,149 +117,8 @@ def interval_function(
 def _compile(
     symbols: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], rounded: bool
 ) -> IntervalFunction:
-    for expression in expressions:
-        require_computable(expression, symbols)
-        strange = {f.func for f in expression.atoms(sp.Function) if _is_unknown(f)}
-        if strange:
-            raise SystemDefinitionError(
-                f"{excerpt(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no"
-                " interval form; write it with powers, exponentials, logarithms, trigonometric and"
-                " hyperbolic functions, Abs, Max, Min, sign, floor and ceiling"
-            )
-    shared: Any
-    reduced: Any
-    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols(cls=sp.Dummy), list=False)
-    program = _Program(symbols, rounded)
-    for symbol, expression in shared:
-        program.known[symbol] = program.slot(expression)
-    return program.function([program.slot(e) for e in reduced])
-
-
-def _is_unknown(function: Any) -> bool:
-    known = (*_INCREASING, *_STEPS, *_INVERSES, sp.sin, sp.cos, sp.tan, sp.acos, sp.cosh, sp.Abs)
-    return not isinstance(function, (*known, sp.atan2, sp.Max, sp.Min))
-
-
-class _Program:
-    """Operations in the order in which they are carried out, each on the results of others.
-
-    Attributes:
-        known: the places of the results that are at hand, by expression.
-    """
-
-    def __init__(self, symbols: tuple[sp.Symbol, ...], rounded: bool) -> None:
-        self.known: dict[Any, int] = {symbol: i for i, symbol in enumerate(symbols)}
-        self._arguments = len(symbols)
-        self._size = len(symbols)
-        self._constants: list[tuple[int, Interval]] = []
-        self._operations: list[tuple[Operation, tuple[int, ...], int]] = []
-        self._arithmetic = IntervalArithmetic(rounded)
-
-    def slot(self, expression: Any) -> int:
-        """Return the place of the result of an expression, after adding what computes it."""
-        if expression not in self.known:
-            if expression.is_number:
-                self._constants.append((self._size, _enclosure(expression)))
-                self._size += 1
-                self.known[expression] = self._size - 1
-            else:
-                operation, parts = self._operation(expression)
-                self.known[expression] = self._append(operation, [self.slot(p) for p in parts])
-        return self.known[expression]
-
-    def _append(self, operation: Operation, places: Sequence[int]) -> int:
-        self._operations.append((operation, tuple(places), self._size))
-        self._size += 1
-        return self._size - 1
-
-    def _operation(self, expression: Any) -> tuple[Operation, Sequence[Any]]:
-        """Return an operation on intervals, and the expressions of which it takes the results."""
-        ops = self._arithmetic
-        kind, parts = expression.func, expression.args
-        if kind is sp.Add:
-            return partial(_folded, ops.add), parts
-        if kind is sp.Mul:
-            powers = Counter(parts)
-            return partial(_folded, ops.multiply), [
-                part if n == 1 else sp.Pow(part, n) for part, n in powers.items()
-            ]
-        if kind is sp.Pow:
-            return self._power(*parts)
-        if kind in _INCREASING and len(parts) == 1:
-            function, ends = _INCREASING[kind]
-            return partial(ops.increasing, function, ends=ends), parts
-        if kind in _STEPS:
-            step = _STEPS[kind]
-            return lambda a: Interval(step(a.low), step(a.high)), parts
-        if kind in _INVERSES:
-            return ops.reciprocal, [_INVERSES[kind](*parts)]
-        if kind in (sp.Max, sp.Min):
-            chosen = np.maximum if kind is sp.Max else np.minimum
-            return partial(
-                _folded, lambda a, b: Interval(chosen(a.low, b.low), chosen(a.high, b.high))
-            ), parts
-        others: dict[Any, Operation] = {
-            sp.sin: partial(ops.wave, np.sin, peak=0.25),
-            sp.cos: partial(ops.wave, np.cos, peak=0.0),
-            sp.tan: ops.tan,
-            sp.acos: lambda a: negative(ops.increasing(_negative_arccos, a, (-_PI, 0.0))),
-            sp.cosh: lambda a: ops.increasing(np.cosh, ops.absolute(a), (1.0, np.inf)),
-            sp.Abs: ops.absolute,
-            sp.atan2: ops.atan2,
-        }
-        if kind not in others:
-            raise SystemDefinitionError(f"{excerpt(expression)} has no interval form")
-        return others[kind], parts
-
-    def _power(self, base: Any, exponent: Any) -> tuple[Operation, Sequence[Any]]:
-        ops = self._arithmetic
-        if exponent.is_Integer:
-            return partial(ops.integer_power, n=int(exponent)), [base]
-        if exponent.is_number:
-            constant = _enclosure(exponent)
-            value = constant.low if constant.low == constant.high else 0.0
-            if value and value.is_integer():
-                return partial(ops.integer_power, n=int(value)), [base]
-            if value == 0.5:
-                return ops.square_root, [base]
-            if value == -0.5:
-                return lambda a: ops.reciprocal(ops.square_root(a)), [base]
-            return lambda a: ops.real_power(a, constant), [base]
-        return partial(ops.increasing, np.exp, ends=(0.0, np.inf)), [
-            sp.Mul(exponent, sp.log(base), evaluate=False)
-        ]
-
-    def function(self, results: Sequence[int]) -> IntervalFunction:
-        """Return the function that carries out the operations, and drops what nobody needs."""
-        last = {place: i for i, (_, places, _) in enumerate(self._operations) for place in places}
-        steps = [
-            (operation, places, target, [p for p in set(places) - set(results) if last[p] == i])
-            for i, (operation, places, target) in enumerate(self._operations)
-        ]
-        constants, arguments, size = self._constants, self._arguments, self._size
-
-        def evaluate(values: Sequence[Any]) -> tuple[Interval, ...]:
-            if len(values) != arguments:
-                raise TypeError(f"a function of {arguments} intervals got {len(values)}")
-            memory: list[Any] = [*map(_interval, values), *[None] * (size - arguments)]
-            for place, constant in constants:
-                memory[place] = constant
-            with np.errstate(all="ignore"):
-                for operation, places, target, done in steps:
-                    memory[target] = operation(*[memory[p] for p in places])
-                    for place in done:
-                        memory[place] = None
-            return tuple(memory[place] for place in results)
-
-        return evaluate
-
-
-def _folded(operation: Operation, *intervals: Interval) -> Interval:
-    """Return the operation on all intervals, the small ones first, for arrays grow on the way."""
-    first, *others = sorted(intervals, key=lambda a: np.size(a.low))
-    for other in others:
-        first = operation(first, other)
-    return first
+    program = ExpressionProgram(symbols, expressions, IntervalOperations(rounded))
+    return lambda values: program([_interval(v) for v in values])
 
 
 def _negative_arccos(values: Any) -> Any:
@@ -236,17 +132,3 @@ def _interval(value: Any) -> Interval:
             low, high = np.broadcast_arrays(low, high)
         return Interval(low, high)
     return Interval(value, value)
-
-
-def _enclosure(number: Any) -> Interval:
-    """Return the floats around a real number, or a point if it is one."""
-    exact = number.is_Rational or number.is_Float
-    try:
-        value = float(number if exact else sp.N(number, 40))
-    except TypeError as error:
-        raise SystemDefinitionError(f"{excerpt(number)} is not a real number") from error
-    if math.isnan(value):
-        raise SystemDefinitionError(f"{excerpt(number)} is not a real number")
-    if exact and sp.Rational(number) == sp.Rational(value):
-        return Interval(value, value)
-    return Interval(math.nextafter(value, -math.inf), math.nextafter(value, math.inf))

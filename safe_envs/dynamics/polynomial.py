@@ -107,7 +107,7 @@ class Polynomial:
 def _nested(tensor: np.ndarray, variables: Sequence[Any]) -> Any:
     """Return the expression of a tensor of coefficients by Horner's rule in each variable."""
     if not variables:
-        value = tensor[()] if isinstance(tensor, np.ndarray) else tensor
+        value: Any = tensor[()] if isinstance(tensor, np.ndarray) else tensor
         return sp.Rational(value.numerator, value.denominator)
     found: Any = sp.Integer(0)
     for part in tensor[::-1]:

@@ -1,260 +1,23 @@
-"""The guarantee of conditions: which theorems apply, and what they are worth."""
+"""The guarantee of conditions, by the kind of what they know."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from functools import cached_property
-
-import numpy as np
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.assumptions import (
-    above_shortfall,
-    above_suprema,
-    amount,
-    failures,
-    mismatch,
-    no_bound,
-    unbounded,
-    unverified_assumptions,
+from safe_envs.wrappers.conditions import Certified, Condition
+from safe_envs.wrappers.verification.certificate_guarantee import (
+    CertificateGuarantee,
+    certificate_guarantee,
 )
+from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.posterior_guarantee import (
     PosteriorGuarantee,
     posterior_guarantee,
 )
-from safe_envs.wrappers.verification.results import (
-    Bound,
-    Candidate,
-    Stages,
-    Status,
-    of_order_one,
-    of_stages,
-    surely_safe,
-)
-from safe_envs.wrappers.verification.safe_set import sample
-from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
-from safe_envs.wrappers.verification.search import largest
 
-_SAMPLES = 2048
-_EMPTY = "the sets C_j have no state in common"
-
-
-class ChainGuarantee:
-    """The bounds that the chains b_0, ..., b_(r-1) of the barriers give.
-
-    The suprema and the shortfall in them are those that a search found: they are estimates.
-
-    Args:
-        formulas: the chains and conditions, compiled.
-        analysis: of the safe set, if there is one; made when it is needed otherwise.
-    """
-
-    def __init__(self, formulas: Formulas, analysis: SafeSetAnalysis | None = None) -> None:
-        self.formulas, self._given = formulas, analysis
-
-    @cached_property
-    def analysis(self) -> SafeSetAnalysis:
-        """What was found in the safe set."""
-        return self._given or SafeSetAnalysis(self.formulas)
-
-    @property
-    def note(self) -> str | None:
-        """Why there is no bound, the first of several reasons; None if there is one."""
-        return self._reason or None
-
-    @cached_property
-    def _reason(self) -> str:
-        # What needs no search comes first.
-        reason = no_bound(self.formulas) or mismatch(self.formulas)
-        if not reason and self.analysis.invariant_set is None:
-            reason = _EMPTY
-        if not reason:
-            against = (
-                *failures(self.analysis),
-                unbounded(self.analysis),
-                *unverified_assumptions(self.analysis),
-            )
-            reason = next(filter(None, against), "")
-        if not reason and self.formulas.certain and not self._certain_up_to_a_time:
-            reason = self.remark
-        return reason
-
-    @property
-    def remark(self) -> str:
-        """Why the bound is weak: where no action meets the condition; may be empty."""
-        shortfall = self.analysis.max_shortfall[0]
-        return f"no action meets the condition somewhere, {amount(shortfall)}" * bool(shortfall)
-
-    @cached_property
-    def stages(self) -> Stages:
-        """The stages of all barriers."""
-        shortfall, rates, shortfalls = self.analysis.max_shortfall[0], [], []
-        for condition, stage in zip(self.formulas.conditions, self.formulas.stages, strict=True):
-            degree = stage.stop - stage.start
-            rates += condition.chain_rates(degree) or (math.nan,) * degree
-            shortfalls += [*[0.0] * (degree - 1), shortfall]
-        # Where every path is safe, no supremum matters.
-        suprema = (1.0,) * len(rates) if self.formulas.certain else self.analysis.suprema.tolist()
-        return Stages(tuple(rates), tuple(suprema), tuple(shortfalls))
-
-    @property
-    def _certain_up_to_a_time(self) -> bool:
-        """Whether a shortfall, if there is one, is known not to matter up to some time."""
-        noisy, stages = self.formulas.noisy, self.stages
-        return not any(stages.shortfalls) or not (noisy or any(map(math.isnan, stages.rates)))
-
-    def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """Return the largest bound on P(safe up to the horizon) whose hypotheses hold.
-
-        Args:
-            starts: states, shape (B, n).
-            horizon: T in s.
-
-        Returns:
-            Values in [0, 1], shape (B,); 0 where there is no bound.
-        """
-        b = self.formulas.chain(np.asarray(starts, dtype=np.float64))
-        return np.zeros(len(b)) if self.note else self._candidates(b, horizon)[-1].values
-
-    def contradiction(
-        self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
-    ) -> str:
-        """Say what states contradict in the numbers of the bound; "" if nothing.
-
-        Args:
-            reached: states that were reached, starts among them, shape (B, n).
-            violated: states where the filter violated its conditions, shape (E, n).
-            actions: what it executed there, shape (E, m).
-            slack: by how much it reports to have violated them, shape (E,); the actions themselves
-                tell how much of it is a sampling margin.
-
-        Returns:
-            A text.
-        """
-        if self.note:
-            return ""
-        return above_suprema(self.formulas, self.stages.suprema, reached) or above_shortfall(
-            self.formulas, max(self.stages.shortfalls), violated, actions
-        )
-
-    def applicable_bounds(self, starts: np.ndarray, horizon: float) -> list[Bound]:
-        """Return the results that suit the conditions, at a start or on average over several.
-
-        P(safe) from a random start is the mean of P(safe) over it, so that the mean of a bound is a
-        bound.
-
-        Args:
-            starts: states, shape (B, n).
-            horizon: T in s.
-        """
-        formulas = self.formulas
-        nothing = no_bound(formulas) or unbounded(self.analysis)
-        if nothing or self.analysis.invariant_set is None:
-            return [Bound("all of them", None, "no bound", nothing or _EMPTY)]
-        b = formulas.chain(starts)
-        inside = (b > 0.0).all(axis=1)
-        if not inside.any():
-            return [Bound("all of them", None, "hypothesis fails", _outside(formulas, b))]
-        outside = f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some"
-        partly = [] if inside.all() else [f"{outside} C_j"]
-        found = [self._judged(candidate, partly) for candidate in self._candidates(b, horizon)]
-        high = above_suprema(formulas, self.stages.suprema, starts)
-        return [bound.without(high) for bound in found]
-
-    def _judged(self, candidate: Candidate, partly: list[str]) -> Bound:
-        """Return the mean of a result over the starts, with what is against it."""
-        infeasible = "" if candidate.allows_shortfall else self._infeasible
-        broken = [*failures(self.analysis), *filter(None, [infeasible])]
-        unproved = [*unverified_assumptions(self.analysis), *filter(None, [candidate.gap])]
-        status: Status = (
-            "hypothesis fails" if broken else "not established" if unproved else "estimated"
-        )
-        values, reason = candidate.values, "; ".join([*broken, *unproved, *partly])
-        error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
-        return Bound(candidate.name, float(values.mean()), status, reason, candidate.forever, error)
-
-    @cached_property
-    def _infeasible(self) -> str:
-        """Where the conditions cannot be met, in words; may be empty."""
-        formulas, analysis = self.formulas, self.analysis
-        shortfall, infeasible = analysis.max_shortfall[0], analysis.infeasible
-        if not shortfall:
-            return ""
-        share = f"{100 * infeasible:.2g} % of" if infeasible else "a thin part of"
-        where = "C" if formulas.first_order else "the intersection of the C_j"
-        conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
-        return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
-
-    def _candidates(self, b: np.ndarray, horizon: float) -> list[Candidate]:
-        """Return the results that suit the conditions; the last one has the weakest hypotheses.
-
-        Args:
-            b: b_0..b_(r-1) of every barrier at the starts, shape (B, sum of the r).
-            horizon: T in s.
-        """
-        stages = self.stages
-        if self.formulas.certain:
-            found = [Candidate(self._name_of_certainty, (b > 0.0).all(axis=1).astype(float), True)]
-            if any(stages.shortfalls) and self._certain_up_to_a_time:
-                name = "no noise, in spite of the shortfall: safe up to T"
-                values = surely_safe(stages, b, horizon)
-                found.append(Candidate(name, values, allows_shortfall=True))
-            return found
-        found = (
-            of_order_one(b[:, 0], stages, horizon)
-            if b.shape[1] == 1
-            else of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
-        )
-        if any(stages.shortfalls):
-            name = f"repaired for the shortfall m = {max(stages.shortfalls):.4g}, up to T"
-            values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
-            found.append(Candidate(name, values, allows_shortfall=True))
-        return found
-
-    @property
-    def _name_of_certainty(self) -> str:
-        noisy = self.formulas.noisy
-        return "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: no path leaves"
-
-    def best_start(self, seed: int = 0) -> np.ndarray | None:
-        """Return the state (n,) where the printed bound is largest; None without such a bound.
-
-        Args:
-            seed: of the search.
-        """
-        formulas, analysis = self.formulas, self.analysis
-        if (
-            analysis.invariant_set is None
-            or formulas.certain
-            or no_bound(formulas)
-            or unbounded(analysis)
-        ):
-            return None
-        level, region, rng = formulas.invariant_level, analysis.region, np.random.default_rng(seed)
-        points = sample("the intersection of the C_j", level, region, _SAMPLES, rng).points
-
-        def printed(x: np.ndarray) -> np.ndarray:
-            return bounds.theorem_4_2_10_printed(formulas.chain(x), self.stages.suprema)
-
-        return largest(printed, points, region, rng)[1]
-
-
-def _outside(formulas: Formulas, b: np.ndarray) -> str:
-    """Say where the start is outside, by the value that is lowest."""
-    if (b > 0.0).any(axis=0).all():
-        return "no start lies in all C_j at once"
-    j = int(b.max(axis=0).argmin())
-    stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
-    return f"the start is outside C_{stage}: {formulas.names[j]} = {b[:, j].max():.4g}" + (
-        " at most" if len(b) > 1 else ""
-    )
-
-
-Guarantee = ChainGuarantee | PosteriorGuarantee
+Guarantee = ChainGuarantee | PosteriorGuarantee | CertificateGuarantee
 """The largest bound that is estimated for a filter: `at` starts, with a `note` where there is none,
 a `remark` where it is weak, and the `contradiction` by states that were seen."""
 
@@ -264,8 +27,9 @@ def guarantee_of(
 ) -> Guarantee:
     """Estimate the bound of conditions, deterministically and with no more search than it needs.
 
-    For a known system it is a `ChainGuarantee`, with the suprema and the shortfall of `verify` with
-    its defaults. For a robust condition on an identified one it is a `PosteriorGuarantee`.
+    For a known system it is a `ChainGuarantee`, with what the judge proves of it. For a robust
+    condition on an identified one it is a `PosteriorGuarantee`, and for that of a certificate a
+    `CertificateGuarantee`.
 
     Args:
         problem: whose barriers, input bounds, ranges and system are taken.
@@ -280,6 +44,8 @@ def guarantee_of(
             contradict what the posterior takes for granted, or no state of C was found.
         RelativeDegreeError: a condition does not suit a barrier.
     """
+    if any(isinstance(c, Certified) for c in conditions):
+        return certificate_guarantee(problem, conditions)
     if any(c.credible_set is not None for c in conditions):
         return posterior_guarantee(problem, conditions)
     return ChainGuarantee(Formulas(problem, conditions, knowledge))

@@ -10,9 +10,15 @@ import numpy as np
 
 from safe_envs.wrappers.verification import bounds
 
-Status = Literal["estimated", "withheld", "hypothesis fails", "no bound", "not established"]
-"""What a bound is worth: no hypothesis was found to fail; it did until episodes contradicted it;
-one fails; there is none; or an assumption is known to be false or was not looked at."""
+Status = Literal[
+    "proved", "estimated", "withheld", "hypothesis fails", "no bound", "not established"
+]
+"""What a bound is worth: the judge proved all hypotheses and numbers; a search found none that
+fails, and the judge left one undecided; episodes contradicted it; one fails; there is none; or an
+assumption is known to be false or was not looked at."""
+
+HOLDING: tuple[Status, ...] = ("proved", "estimated")
+"""Of a bound whose hypotheses are not known to fail."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +30,7 @@ class Bound:
         value: at the start, or its mean over several; None if there is none.
         error: standard error of that mean as the mean over all starts; 0 for one start.
         status: what it is worth.
-        reason: why, in words; may be empty where it is estimated.
+        reason: why, in words; may be empty where it is proved.
         forever: whether it is of all times, not only up to the horizon.
     """
 
@@ -36,8 +42,8 @@ class Bound:
     error: float = 0.0
 
     def without(self, reason: str) -> Bound:
-        """Return the bound as withheld for a reason, if it was estimated and there is one."""
-        if not reason or self.status != "estimated":
+        """Return the bound as withheld for a reason, if it is one and there is a reason."""
+        if not reason or self.status not in HOLDING:
             return self
         return replace(self, value=None, error=0.0, status="withheld", reason=reason)
 

@@ -33,7 +33,7 @@ from tests.wrappers.verification.verified import (
 
 pytestmark = pytest.mark.slow
 
-STATUSES = {"estimated", "withheld", "hypothesis fails", "no bound", "not established"}
+STATUSES = {"proved", "estimated", "withheld", "hypothesis fails", "no bound", "not established"}
 
 
 def test_radial_headings_leave_the_dubins_disk_without_control():
@@ -110,7 +110,7 @@ def test_every_id_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
     for bound in bounds:
         assert bound.status in STATUSES
         assert bound.value is None or 0.0 <= bound.value <= 1.0
-        assert bound.reason or bound.status == "estimated"
+        assert bound.reason or bound.status == "proved"
     # The same look at the system gives the estimated bound, or a note on why there is none.
     estimated = found.guarantee
     values = estimated.at(starts, problem.horizon)

@@ -15,6 +15,7 @@ from safe_envs.wrappers.verification.extrema import unbounded
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.guarantee import guarantee_of
+from safe_envs.wrappers.verification.results import HOLDING
 from safe_envs.wrappers.verification.safe_set import draw_starts
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import (
@@ -52,8 +53,9 @@ def test_scbf_fails_near_the_centre_of_the_cubic_disk():
     bounds = found.guarantee.applicable_bounds(np.array([[-0.1, 0.7]]), 1.0)
     assert by_name(bounds, "4.2.8").status == "hypothesis fails"
     assert by_name(bounds, "4.2.8").value == pytest.approx(0.5)
-    assert by_name(bounds, "repaired").status == "estimated"
-    assert by_name(bounds, "repaired").value == pytest.approx(0.42)
+    assert by_name(bounds, "repaired").status == "proved"
+    # The judge proves numbers that are larger than those found by 1e-3 of them at most.
+    assert 0.419 < by_name(bounds, "repaired").value <= 0.42
 
 
 def endless(env_id):
@@ -122,18 +124,23 @@ def test_an_endless_range_counts_on_its_endless_side_only():
     assert made(problem, samples=256).analysis.suprema[0] == pytest.approx(2.0, rel=1e-9)
 
 
-def test_the_attained_bound_is_estimated():
+def test_the_attained_bound_is_proved():
     problem = system_in_a_box()
     conditions = parse_conditions("scbf", problem)
     found = verify(problem, conditions, samples=1024)
     assert found.safe_set.shortfall == found.safe_set.infeasible == 0.0
     starts = np.array([[0.0], [0.5], [-0.9]])
-    np.testing.assert_allclose(
-        guarantee_of(problem, conditions).at(starts, 7.0), 1 - starts[:, 0] ** 2, rtol=1e-9
-    )
-    (bound,) = found.guarantee.applicable_bounds(starts, 7.0)
-    assert (bound.status, bound.forever) == ("estimated", True)
-    assert bound.value == pytest.approx((1 - starts**2).mean())
+    attained = 1 - starts[:, 0] ** 2
+    bound = guarantee_of(problem, conditions)
+    np.testing.assert_allclose(bound.at(starts, 7.0), attained, rtol=2e-3)
+    assert (bound.at(starts, 7.0) <= attained).all()
+    assert bound.word == "proved"
+    forever, repaired = found.guarantee.applicable_bounds(starts, 7.0)
+    # The condition is met with nothing to spare at x = 0, where no evaluation tells 0 from less.
+    assert (forever.status, forever.forever) == ("estimated", True)
+    assert "undecided" in forever.reason
+    assert repaired.status == "proved"
+    assert forever.value >= repaired.value > 0.998 * attained.mean()
 
 
 def test_bounds_of_several_barriers_are_put_together_by_the_union():
@@ -141,12 +148,15 @@ def test_bounds_of_several_barriers_are_put_together_by_the_union():
     conditions = parse_conditions("scbf", problem)
     starts = np.array([[0.1, 0.2], [0.7, 0.8], [0.1, 1.1]])
     expected = np.maximum(0.0, (1 - starts**2).sum(axis=1) - 1) * (abs(starts) < 1).all(axis=1)
-    np.testing.assert_allclose(
-        guarantee_of(problem, conditions).at(starts, 3.0), expected, atol=1e-8
+    at_starts = guarantee_of(problem, conditions).at(starts, 3.0)
+    np.testing.assert_allclose(at_starts, expected, atol=4e-3)
+    assert (at_starts <= expected).all()
+    forever, repaired = verify(problem, conditions, samples=500).guarantee.applicable_bounds(
+        starts, 3.0
     )
-    (bound,) = verify(problem, conditions, samples=500).guarantee.applicable_bounds(starts, 3.0)
-    assert (bound.status, bound.value) == ("estimated", pytest.approx(expected.mean(), abs=1e-8))
-    assert "33.3 % of the starts" in bound.reason
+    assert (forever.status, repaired.status) == ("estimated", "proved")
+    assert repaired.value == pytest.approx(expected.mean(), abs=4e-3)
+    assert all("33.3 % of the starts" in bound.reason for bound in (forever, repaired))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +194,7 @@ def test_a_start_outside_is_said_to_be():
 def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
     found = findings("safe_envs/Scalar-v0", "cbf", noise=0)
     (bound,) = found.guarantee.applicable_bounds(np.array([[0.0], [0.5]]), 1.0)
-    assert (bound.status, bound.value) == ("estimated", 1.0)
+    assert (bound.status, bound.value) == ("proved", 1.0)
     weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, box=[-0.8, 0.8])
     near, far = (
         weak.guarantee.applicable_bounds(np.array([[0.99]]), 1.0),
@@ -203,7 +213,7 @@ def test_zeroing_forms_and_the_misprint():
     )
     assert by_name(bounds, "printed").status == "not established"
     assert by_name(bounds, "printed").value == pytest.approx(0.75 * math.exp(-1.0))
-    assert by_name(bounds, "corrected").status == "estimated"
+    assert by_name(bounds, "corrected").status == "proved"
     assert by_name(bounds, "corrected").value == pytest.approx(0.75 * math.exp(-2.0))
     slow = findings(CUBIC_DISK, "szcbf:alphas=0.5").guarantee.applicable_bounds(
         np.array([[0.5, 0.0]]), 1.0
@@ -301,7 +311,7 @@ def test_conditions_that_share_several_inputs_have_no_bound():
     bounds = verify(
         coupled, parse_conditions("scbf", coupled), samples=256
     ).guarantee.applicable_bounds(np.array([[0.1, 0.1]]), 1.0)
-    assert all(reason in b.reason and b.status != "estimated" for b in bounds)
+    assert all(reason in b.reason and b.status not in HOLDING for b in bounds)
 
 
 @pytest.mark.slow
@@ -309,7 +319,7 @@ def test_conditions_that_share_several_inputs_have_no_bound():
     ("env_id", "text"),
     [(CUBIC_DISK, "scbf"), (CUBIC_DISK, "szcbf:alphas=2"), (STOCHASTIC, "szcbf:alphas=.1,.1")],
 )
-def test_the_estimated_bound_is_the_best_of_them(env_id, text):
+def test_the_bound_is_the_best_of_them(env_id, text):
     found = findings(env_id, text)
     starts, bound = draw_starts(found.formulas.problem, 64), estimated(env_id, text)
     for horizon in (0.1, 1.0):
@@ -317,7 +327,7 @@ def test_the_estimated_bound_is_the_best_of_them(env_id, text):
             (
                 b.value
                 for b in found.guarantee.applicable_bounds(starts, horizon)
-                if b.status == "estimated" and b.value is not None
+                if b.status in HOLDING and b.value is not None
             ),
             default=0.0,
         )

@@ -1,0 +1,291 @@
+"""The guarantee of the chains of barriers: which theorems apply, and what they are worth."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+
+import numpy as np
+
+from safe_envs.wrappers.verification import bounds
+from safe_envs.wrappers.verification.assumptions import (
+    JOINT,
+    above_shortfall,
+    above_suprema,
+    amount,
+    failures,
+    mismatch,
+    no_bound,
+    outside,
+    unbounded,
+)
+from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.proof import ChainProof
+from safe_envs.wrappers.verification.results import (
+    Bound,
+    Candidate,
+    Stages,
+    Status,
+    of_order_one,
+    of_stages,
+    surely_safe,
+)
+from safe_envs.wrappers.verification.safe_set import sample
+from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
+from safe_envs.wrappers.verification.search import largest
+
+_SAMPLES = 2048
+_EMPTY = "the sets C_j have no state in common"
+
+
+class ChainGuarantee:
+    """The bounds that the chains b_0, ..., b_(r-1) of the barriers give.
+
+    A search looks for counterexamples to their hypotheses and for the suprema and the shortfall in
+    them. The judge then proves the hypotheses and the numbers, or leaves some of them undecided:
+    bounds that need these are estimates.
+
+    Args:
+        formulas: the chains and conditions, compiled.
+        analysis: of the safe set, if there is one; made when it is needed otherwise.
+    """
+
+    def __init__(self, formulas: Formulas, analysis: SafeSetAnalysis | None = None) -> None:
+        self.formulas, self._given = formulas, analysis
+
+    @cached_property
+    def analysis(self) -> SafeSetAnalysis:
+        """What was found in the safe set."""
+        return self._given or SafeSetAnalysis(self.formulas)
+
+    @cached_property
+    def proof(self) -> ChainProof:
+        """What the judge proves of the hypotheses and numbers."""
+        shortfall, state = self.analysis.max_shortfall
+        return ChainProof(self.formulas, self.analysis.suprema.tolist(), shortfall, state[None])
+
+    @property
+    def statements(self) -> list[tuple[str, Verdict]]:
+        """The hypotheses with the judge's word; none where no theorem applies."""
+        return (
+            []
+            if no_bound(self.formulas) or self.analysis.invariant_set is None
+            else self.proof.statements
+        )
+
+    @property
+    def note(self) -> str | None:
+        """Why there is no bound, the first of several reasons; None if there is one."""
+        return self._reason or None
+
+    @cached_property
+    def _reason(self) -> str:
+        # What needs no search comes first.
+        reason = no_bound(self.formulas) or mismatch(self.formulas)
+        if not reason and self.analysis.invariant_set is None:
+            reason = _EMPTY
+        if not reason:
+            against = (*failures(self.analysis), self._unbounded, *self._unverified)
+            reason = next(filter(None, against), "")
+        if not reason and self.formulas.certain and not self._certain_up_to_a_time:
+            reason = self.remark
+        return reason
+
+    @property
+    def _unbounded(self) -> str:
+        """Which supremum is infinite, where one matters, in words; may be empty."""
+        proved = all(math.isfinite(c) for c in self.stages.suprema)
+        return "" if proved else unbounded(self.analysis)
+
+    @property
+    def _unverified(self) -> list[str]:
+        """The assumptions that neither the search nor the judge establishes, in words."""
+        found = [] if self.proof.bounded.word == "proved" else [self.analysis.limits]
+        if not self.formulas.joint and math.isinf(self.proof.shortfall.value):
+            found.append(JOINT)
+        return [reason for reason in found if reason]
+
+    @property
+    def remark(self) -> str:
+        """Why the bound is weak: where no action meets the condition; may be empty."""
+        shortfall = self.analysis.max_shortfall[0]
+        return f"no action meets the condition somewhere, {amount(shortfall)}" * bool(shortfall)
+
+    @property
+    def word(self) -> Status:
+        """Whether the bound that `at` returns is proved or estimated."""
+        allowed = any(self.stages.shortfalls)
+        return "proved" if self.proof.word_of(allowed)[0] == "proved" else "estimated"
+
+    @cached_property
+    def stages(self) -> Stages:
+        """The stages of all barriers."""
+        rates, shortfalls = [], []
+        shortfall = self.proof.shortfall.value
+        if math.isinf(shortfall):
+            shortfall = self.analysis.max_shortfall[0]
+        for condition, stage in zip(self.formulas.conditions, self.formulas.stages, strict=True):
+            degree = stage.stop - stage.start
+            rates += condition.chain_rates(degree) or (math.nan,) * degree
+            shortfalls += [*[0.0] * (degree - 1), shortfall]
+        # Where every path is safe, no supremum matters.
+        suprema = (1.0,) * len(rates) if self.formulas.certain else self._suprema
+        return Stages(tuple(rates), tuple(suprema), tuple(shortfalls))
+
+    @property
+    def _suprema(self) -> list[float]:
+        """The suprema that are proved or, where none is, those that the search found."""
+        pairs = zip(self.proof.suprema, self.analysis.suprema.tolist(), strict=True)
+        return [n.value if math.isfinite(n.value) else found for n, found in pairs]
+
+    @property
+    def _certain_up_to_a_time(self) -> bool:
+        """Whether a shortfall, if there is one, is known not to matter up to some time."""
+        noisy, stages = self.formulas.noisy, self.stages
+        return not any(stages.shortfalls) or not (noisy or any(map(math.isnan, stages.rates)))
+
+    def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
+        """Return the largest bound on P(safe up to the horizon) whose hypotheses hold.
+
+        Args:
+            starts: states, shape (B, n).
+            horizon: T in s.
+
+        Returns:
+            Values in [0, 1], shape (B,); 0 where there is no bound.
+        """
+        b = self.formulas.chain(np.asarray(starts, dtype=np.float64))
+        return np.zeros(len(b)) if self.note else self._candidates(b, horizon)[-1].values
+
+    def contradiction(
+        self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
+    ) -> str:
+        """Say what states contradict in the numbers of the bound; "" if nothing.
+
+        Args:
+            reached: states that were reached, starts among them, shape (B, n).
+            violated: states where the filter violated its conditions, shape (E, n).
+            actions: what it executed there, shape (E, m).
+            slack: by how much it reports to have violated them, shape (E,); the actions themselves
+                tell how much of it is a sampling margin.
+
+        Returns:
+            A text.
+        """
+        if self.note:
+            return ""
+        return above_suprema(self.formulas, self.stages.suprema, reached) or above_shortfall(
+            self.formulas, max(self.stages.shortfalls), violated, actions
+        )
+
+    def applicable_bounds(self, starts: np.ndarray, horizon: float) -> list[Bound]:
+        """Return the results that suit the conditions, at a start or on average over several.
+
+        P(safe) from a random start is the mean of P(safe) over it, so that the mean of a bound is a
+        bound.
+
+        Args:
+            starts: states, shape (B, n).
+            horizon: T in s.
+        """
+        formulas = self.formulas
+        nothing = no_bound(formulas)
+        if not nothing and self.analysis.invariant_set is not None:
+            nothing = self._unbounded
+        if nothing or self.analysis.invariant_set is None:
+            return [Bound("all of them", None, "no bound", nothing or _EMPTY)]
+        b = formulas.chain(starts)
+        inside = (b > 0.0).all(axis=1)
+        if not inside.any():
+            return [Bound("all of them", None, "hypothesis fails", outside(formulas, b))]
+        share = f"{100 * (1 - inside.mean()):.1f} %"
+        partly = [f"0 at the {share} of the starts that are outside some C_j"] * (not inside.all())
+        found = [self._judged(candidate, partly) for candidate in self._candidates(b, horizon)]
+        high = above_suprema(formulas, self.stages.suprema, starts)
+        return [bound.without(high) for bound in found]
+
+    def _judged(self, candidate: Candidate, partly: list[str]) -> Bound:
+        """Return the mean of a result over the starts, with what is against it."""
+        infeasible = "" if candidate.allows_shortfall else self._infeasible
+        broken = [*failures(self.analysis), *filter(None, [infeasible])]
+        unproved = [*self._unverified, *filter(None, [candidate.gap])]
+        status, open_ = self._status(candidate, bool(broken), bool(unproved))
+        values = candidate.values
+        reason = "; ".join([*broken, *unproved, *filter(None, [open_]), *partly])
+        error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+        return Bound(candidate.name, float(values.mean()), status, reason, candidate.forever, error)
+
+    def _status(self, candidate: Candidate, broken: bool, unproved: bool) -> tuple[Status, str]:
+        """Return what a result is worth, and what the judge leaves undecided of it."""
+        if broken or unproved:
+            return "hypothesis fails" if broken else "not established", ""
+        word, reason = self.proof.word_of(candidate.allows_shortfall)
+        if word == "refuted":
+            return "hypothesis fails", reason
+        return ("proved", "") if word == "proved" else ("estimated", f"undecided: {reason}")
+
+    @cached_property
+    def _infeasible(self) -> str:
+        """Where the conditions cannot be met, in words; may be empty."""
+        formulas, analysis = self.formulas, self.analysis
+        shortfall, infeasible = analysis.max_shortfall[0], analysis.infeasible
+        if not shortfall:
+            return ""
+        share = f"{100 * infeasible:.2g} % of" if infeasible else "a thin part of"
+        where = "C" if formulas.first_order else "the intersection of the C_j"
+        conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
+        return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
+
+    def _candidates(self, b: np.ndarray, horizon: float) -> list[Candidate]:
+        """Return the results that suit the conditions; the last one has the weakest hypotheses.
+
+        Args:
+            b: b_0..b_(r-1) of every barrier at the starts, shape (B, sum of the r).
+            horizon: T in s.
+        """
+        stages = self.stages
+        if self.formulas.certain:
+            found = [Candidate(self._name_of_certainty, (b > 0.0).all(axis=1).astype(float), True)]
+            if any(stages.shortfalls) and self._certain_up_to_a_time:
+                name = "no noise, in spite of the shortfall: safe up to T"
+                values = surely_safe(stages, b, horizon)
+                found.append(Candidate(name, values, allows_shortfall=True))
+            return found
+        found = (
+            of_order_one(b[:, 0], stages, horizon)
+            if b.shape[1] == 1
+            else of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
+        )
+        if any(stages.shortfalls):
+            name = f"repaired for the shortfall m = {max(stages.shortfalls):.4g}, up to T"
+            values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
+            found.append(Candidate(name, values, allows_shortfall=True))
+        return found
+
+    @property
+    def _name_of_certainty(self) -> str:
+        noisy = self.formulas.noisy
+        return "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: no path leaves"
+
+    def best_start(self, seed: int = 0) -> np.ndarray | None:
+        """Return the state (n,) where the printed bound is largest; None without such a bound.
+
+        Args:
+            seed: of the search.
+        """
+        formulas, analysis = self.formulas, self.analysis
+        if (
+            analysis.invariant_set is None
+            or formulas.certain
+            or no_bound(formulas)
+            or self._unbounded
+        ):
+            return None
+        level, region, rng = formulas.invariant_level, analysis.region, np.random.default_rng(seed)
+        points = sample("the intersection of the C_j", level, region, _SAMPLES, rng).points
+
+        def printed(x: np.ndarray) -> np.ndarray:
+            return bounds.theorem_4_2_10_printed(formulas.chain(x), self.stages.suprema)
+
+        return largest(printed, points, region, rng)[1]
