@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_envs.dynamics.first_order_forms import Form
+from safe_envs.wrappers.verification.bisection import axis_of, middle_of
 from safe_envs.wrappers.verification.statement import Enclosures, Statement
 
 _BATCH = 4096
@@ -129,7 +129,7 @@ class BranchAndBound:
         value = np.where(likely, -found.claim.center, -np.inf)
         chosen = np.argsort(-value)[:_TRIED]
         chosen = chosen[open_[chosen]]
-        middle = _middle(low[:, chosen], high[:, chosen])
+        middle = middle_of(low[:, chosen], high[:, chosen])
         if self.tried(middle):
             return ""
         if found.zeros:
@@ -210,7 +210,7 @@ class BranchAndBound:
             (zero,) = self._program(ends, ends).zeros
             if zero.range.low[0] > 0.0 and zero.range.high[1] < 0.0:
                 self.best = float(-found.claim.range.high[i])
-                self.best_state = _middle(low[:, [i]], high[:, [i]])[:, 0]
+                self.best_state = middle_of(low[:, [i]], high[:, [i]])[:, 0]
                 return True
         return False
 
@@ -224,9 +224,10 @@ class BranchAndBound:
     ) -> str:
         """Put the halves of boxes back; return why that is of no use, in words."""
         low, high, upper = low[:, open_], high[:, open_], upper[open_]
-        axis = self._axis(low, high, found, open_)
+        forms = (found.claim, *found.region, *found.zeros)
+        axis = axis_of(low, high, self._width, forms, open_)
         at = np.arange(len(axis))
-        middle = _middle(low, high)[axis, at]
+        middle = middle_of(low, high)[axis, at]
         stuck = (middle <= low[axis, at]) | (middle >= high[axis, at]) | (np.abs(middle) > _FAR)
         with np.errstate(invalid="ignore"):
             narrow = ((high - low) <= _NARROW * np.minimum(self._width, 1.0)[:, None]).all(axis=0)
@@ -258,43 +259,13 @@ class BranchAndBound:
         )
         if rough or not smooth:
             return (
-                f"{name}: not twice continuously differentiable near {near}, where evaluation meets"
-                " a kink, a pole, or the edge of a domain"
+                f"{name}: not {self._asked} near {near}, where evaluation meets a kink, a jump, a"
+                " pole, or the edge of a domain"
             )
         if not np.isfinite(high - low).all() or max(abs(low).max(), abs(high).max()) > _FAR:
             return f"{name}: the region has no end, {near}"
         return f"{name}: equal to rounding near {near}; a larger margin would tell"
 
-    def _axis(
-        self, low: np.ndarray, high: np.ndarray, found: Enclosures, open_: np.ndarray
-    ) -> np.ndarray:
-        """Return the axis to bisect of each box, shape (B,)."""
-        with np.errstate(all="ignore"):
-            share = (high - low) / np.where(np.isfinite(self._width), self._width, 1.0)[:, None]
-            share = np.where(np.isfinite(share), share, 1e30)
-            share = share / share.sum(axis=0)
-            score = 1e-3 * share
-            for form in (found.claim, *found.region, *found.zeros):
-                score = score + _variation(form, open_, share)
-        return np.where(np.isfinite(score), score, 0.0).argmax(axis=0)
-
-
-def _variation(form: Form, open_: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the part of a range that each axis makes, shape (n, B)."""
-    slopes, radius = np.abs(form.slopes[:, open_]), form.radius[open_]
-    total = slopes.sum(axis=0) + radius
-    part = (slopes + share * radius) / total
-    return np.where(np.isfinite(part) & (total > 0.0), part, share)
-
-
-def _middle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return midpoints; where an end is infinite, numbers that are far beyond the other one."""
-    with np.errstate(invalid="ignore"):
-        middle = 0.5 * low + 0.5 * high
-    middle = np.where(np.isneginf(low) & np.isposinf(high), 0.0, middle)
-    middle = np.where(
-        np.isfinite(low) & np.isposinf(high), np.maximum(2.0 * low, low + 1.0), middle
-    )
-    return np.where(
-        np.isneginf(low) & np.isfinite(high), np.minimum(2.0 * high, high - 1.0), middle
-    )
+    @property
+    def _asked(self) -> str:
+        return "twice continuously differentiable" if self._statement.smooth else "continuous"

@@ -16,7 +16,7 @@ import sympy as sp
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.input_terms import largest_input_term
+from safe_envs.wrappers.verification.input_terms import largest_input_term, not_polynomial
 from safe_envs.wrappers.verification.judge import Verdict, judge, supremum
 from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
 
@@ -105,6 +105,13 @@ class CertificateStatements:
             polynomials=self.polynomials,
         )
 
+    def coefficients(self) -> Statement:
+        """Return the statement that f, g and sigma are continuous on G."""
+        plant = self.plant
+        entries = (*plant.drift, *itertools.chain(*plant.input_matrix, *plant.diffusion))
+        statement = self.statement("f, g and sigma are continuous on G", sp.Integer(1))
+        return replace(statement, continuous=not_polynomial(entries, plant.states))
+
     @property
     def value(self) -> sp.Symbol:
         """The symbol of psi."""
@@ -183,6 +190,7 @@ def judged(
         parts.statement("psi <= c", c - parts.value),
         parts.statement("A psi >= -a psi - m", parts.generator + m),
         *parts.edges(),
+        parts.coefficients(),
     ]
     return [(statement.name, judge(statement, budget)) for statement in statements]
 

@@ -41,8 +41,8 @@ class Statement:
     """A claim: an expression is at least 0 at every state of a region.
 
     The region is where all of `positive` are above 0, all of `nonnegative` at least 0 and all of
-    `zeros` are 0, within a box. Where `smooth` is given the statement says besides that these
-    expressions are twice continuously differentiable there.
+    `zeros` are 0, within a box. Where `smooth` or `continuous` are given the statement says besides
+    that these expressions are twice continuously differentiable there, or continuous.
 
     Attributes:
         name: in words.
@@ -54,6 +54,7 @@ class Statement:
         nonnegative: at least 0 in the region.
         zeros: 0 in the region, or not continuous: there the sign may change without a zero.
         smooth: to be twice continuously differentiable.
+        continuous: to be continuous, and so to have a value.
         polynomials: what symbols in the expressions stand for.
         witnesses: symbols that may be chosen on each box, such as an input that meets a claim.
         witness: which chooses them.
@@ -67,6 +68,7 @@ class Statement:
     nonnegative: tuple[sp.Expr, ...] = ()
     zeros: tuple[sp.Expr, ...] = ()
     smooth: tuple[sp.Expr, ...] = ()
+    continuous: tuple[sp.Expr, ...] = ()
     polynomials: Mapping[sp.Symbol, PolynomialPart] = field(default_factory=dict)
     witnesses: tuple[sp.Symbol, ...] = ()
     witness: Witness | None = None
@@ -98,7 +100,7 @@ class Enclosures(NamedTuple):
         outside: whether the region has no state in the box, shape (B,).
         inside: whether the whole box lies in the region, shape (B,); where there are `zeros`, apart
             from these.
-        smooth: whether all that has to be smooth is, shape (B,).
+        smooth: whether all that has to be smooth or continuous is, shape (B,).
     """
 
     claim: Form
@@ -128,9 +130,8 @@ class StatementProgram:
         self._program = ExpressionProgram(
             symbols, [sp.sympify(e) for e in expressions], FormOperations(self._n)
         )
-        self._zeros = ExpressionProgram(
-            symbols, [sp.sympify(e) for e in s.zeros], ContinuousOperations(self._n)
-        )
+        continuous = [sp.sympify(e) for e in (*s.zeros, *s.continuous)]
+        self._continuous = ExpressionProgram(symbols, continuous, ContinuousOperations(self._n))
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosures:
         """Return what is known on boxes.
@@ -153,7 +154,8 @@ class StatementProgram:
                 )
             values = [found[symbol] for symbol in (*s.states, *s.polynomials, *s.witnesses)]
             forms = [_broadcast(form, self._n, boxes) for form in self._program(values)]
-            zeros = tuple(_broadcast(form, self._n, boxes) for form in self._zeros(values))
+            others = [_broadcast(form, self._n, boxes) for form in self._continuous(values)]
+        zeros, continuous = tuple(others[: len(s.zeros)]), others[len(s.zeros) :]
         rest = iter(forms[1:])
         positive, nonnegative, smooth = (
             tuple(itertools.islice(rest, len(part)))
@@ -169,7 +171,7 @@ class StatementProgram:
         for form in zeros:
             outside |= form.smooth & ((form.range.high < 0.0) | (form.range.low > 0.0))
         regular = np.ones(boxes, dtype=bool)
-        for form in smooth:
+        for form in (*smooth, *continuous):
             regular &= form.smooth
         region = (*positive, *nonnegative)
         return Enclosures(forms[0], region, zeros, outside, inside, regular)
