@@ -65,9 +65,7 @@ class ChebyshevBasis:
     def jets(self, x: np.ndarray) -> Jets:
         """Return all members with their derivatives at states, shape (B, n)."""
         n = len(self.states)
-        each = [
-            [part[:, self.exponents[:, i]] for part in self._along(x, i)] for i in range(n)
-        ]
+        each = [[part[:, self.exponents[:, i]] for part in self._along(x, i)] for i in range(n)]
 
         def product(orders: list[int]) -> np.ndarray:
             found = each[0][orders[0]]

@@ -168,7 +168,7 @@ class Domain:
         center, scale = (np.array([float(v) for v in part]) for part in self.frame)
         along = math.ceil(count ** (1.0 / n))
         place = (((x - center) / scale + 1.0) / 2.0 * along).astype(int).clip(0, along - 1)
-        return np.ravel_multi_index(tuple(place.T), (along,) * n)
+        return np.asarray(np.ravel_multi_index(tuple(place.T), (along,) * n))
 
     def _rays(
         self, count: int, rng: np.random.Generator
@@ -176,6 +176,13 @@ class Domain:
         """Return starts of rays in C, where they leave it, and which do so within the workspace."""
         x = self.bank[rng.integers(len(self.bank), size=count)]
         direction = rng.standard_normal(x.shape) * np.array([float(s) for s in self.frame[1]])
+        # A quarter of the rays lies in the ends of the workspace, where a polynomial may be large.
+        i, upper = rng.integers(x.shape[1], size=count), rng.random(count) < 0.5
+        moved, each = x.copy(), np.arange(count)
+        moved[each, i] = np.where(upper, self.high[i], self.low[i])
+        ends = (rng.random(count) < 0.25) & self.inside(moved) & (x.shape[1] > 1)
+        x = np.where(ends[:, None], moved, x)
+        direction[each[ends], i[ends]] = 0.0
         with np.errstate(divide="ignore", invalid="ignore"):
             ahead = np.where(direction > 0.0, self.high - x, self.low - x) / direction
         longest = np.nanmin(np.where(direction == 0.0, np.inf, ahead), axis=1)

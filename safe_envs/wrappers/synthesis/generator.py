@@ -71,9 +71,10 @@ class Generator:
         if p.policy:
             drift, effect = drift + effect * sp.Matrix(p.policy), sp.zeros(len(p.states), 0)
         sigma = sp.Matrix(p.diffusion) if p.diffusion[0] else sp.zeros(len(p.states), 1)
-        return tuple(
-            compile_function(p.states, list(part), "arrays") if len(part) else None
-            for part in (drift, effect, sigma * sigma.T)
+        return (
+            compile_function(p.states, list(drift), "arrays"),
+            compile_function(p.states, list(effect), "arrays") if len(effect) else None,
+            compile_function(p.states, list(sigma * sigma.T), "arrays"),
         )
 
     def fields(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -107,9 +108,7 @@ class Generator:
         jets = basis.jets(x)
         rates = np.einsum("bn,bnk->bk", drift, jets.gradients)
         rates += 0.5 * np.einsum("bij,bijk->bk", covariance, jets.hessians)
-        return Samples(
-            x, jets.values, rates, np.einsum("bnm,bnk->bmk", effect, jets.gradients)
-        )
+        return Samples(x, jets.values, rates, np.einsum("bnm,bnk->bmk", effect, jets.gradients))
 
     def largest_rate(self, samples: Samples, coefficients: np.ndarray) -> np.ndarray:
         """Return the largest A psi along inputs within the bounds, shape (B,).
@@ -122,9 +121,7 @@ class Generator:
         low, high = self.bounds.T
         return samples.drift @ coefficients + np.maximum(low * effect, high * effect).sum(axis=1)
 
-    def best_inputs(
-        self, samples: Samples, coefficients: np.ndarray, band: float
-    ) -> np.ndarray:
+    def best_inputs(self, samples: Samples, coefficients: np.ndarray, band: float) -> np.ndarray:
         """Return inputs within the bounds that raise psi most, or nearly.
 
         They are continuous: inputs that jump where L_g psi changes its sign let a linear program

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +32,9 @@ _BANDS = (0.2, 0.1, 0.05, 0.02)
 _MOST_CUTS = 5
 """Linear programs with the same given inputs."""
 
+_FEWEST = 4
+"""Linear programs of a degree, with time or without: the first ones know too few states."""
+
 _NEAR_ONE = 0.7
 """Part of the supremum from which states may become the largest."""
 
@@ -53,7 +58,12 @@ class Improvement:
     extra: np.ndarray | None = None
 
     def best(
-        self, basis: ChebyshevBasis, bound: Bound, first: Witness | Candidate, rounds: int
+        self,
+        basis: ChebyshevBasis,
+        bound: Bound,
+        first: Witness | Candidate,
+        rounds: int,
+        deadline: float = math.inf,
     ) -> Candidate | None:
         """Return the best barrier of some rounds.
 
@@ -62,6 +72,7 @@ class Improvement:
             bound: to maximise.
             first: inputs for the first linear program, or a barrier that they are to raise most.
             rounds: linear programs to solve at most.
+            deadline: time, as of `time.monotonic`, after which few more are begun.
 
         Returns:
             The best one; nothing where no linear program has a solution.
@@ -74,6 +85,8 @@ class Improvement:
                 break
             if found is None or candidate.mean > found.mean:
                 found = candidate
+            if time.monotonic() > deadline and done >= _FEWEST:
+                break
             if planes.references > 1 and found.program - found.mean < self.settings.tolerance:
                 break
         return found
@@ -93,7 +106,11 @@ class _CuttingPlanes:
     """
 
     def __init__(
-        self, improvement: Improvement, basis: ChebyshevBasis, bound: Bound, first: Witness | Candidate
+        self,
+        improvement: Improvement,
+        basis: ChebyshevBasis,
+        bound: Bound,
+        first: Witness | Candidate,
     ) -> None:
         self._all, self._basis, self._bound = improvement, basis, bound
         self._rng = np.random.default_rng([improvement.settings.seed, basis.degree])
@@ -140,9 +157,7 @@ class _CuttingPlanes:
         c, m = self._last, _ = solution
         value = bound.mean(self._starts @ c, m, 1.0)
         raw = Candidate(self._basis, c, bound, m, 1.0, 0.0, value, done)
-        pool = self._all.generator.samples(
-            self._basis, self._all.domain.draw(_POOL, self._rng)
-        )
+        pool = self._all.generator.samples(self._basis, self._all.domain.draw(_POOL, self._rng))
         rim = self._basis.values(self._all.domain.draw_edge(_RIM, self._rng))
         bad, bad_asked, cost = self._sharpened(pool, c, m)
         found = self._measured(

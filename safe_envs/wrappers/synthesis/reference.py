@@ -97,8 +97,9 @@ class Reference:
             begin = near.states[worst(-effect, cells, counts, 100 + 3 * len(c))]
             for level in _LEVELS if len(begin) else ():
 
-                def distance(x: np.ndarray, j: int = j, e: float = level * self.band / h) -> np.ndarray:
-                    return self.generator.samples(old.basis, x).inputs[:, [j]] @ c - e
+                def distance(x: np.ndarray, j: int = j, e: float = level / h) -> np.ndarray:
+                    own = self.generator.samples(old.basis, x).inputs[:, [j]]
+                    return own @ c - e * self.band
 
                 moved = towards_zero(distance, begin, self.domain.region)
                 found.append(moved[self.domain.inside(moved)])

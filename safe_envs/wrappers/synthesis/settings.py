@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from safe_envs.errors import ConfigurationError, require_whole, shown
 
-_MOST_DEGREE = 40
+_MOST_DEGREE = 20
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SynthesisSettings:
 
     degrees: tuple[int, ...] = ()
     rates: tuple[float, ...] = ()
-    rounds: int = 8
+    rounds: int = 16
     starts: int = 4000
     tolerance: float = 2e-3
     seconds: float = 25.0

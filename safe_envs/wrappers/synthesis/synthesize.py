@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sympy as sp
@@ -15,15 +15,15 @@ from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
 from safe_envs.wrappers.synthesis.candidate import Candidate
 from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.generator import Generator
-from safe_envs.wrappers.synthesis.candidate import Improvement
+from safe_envs.wrappers.synthesis.improvement import Improvement
 from safe_envs.wrappers.synthesis.linear_program import Bound
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.synthesis.witnesses import Witness, witnesses_of
 
 Progress = Callable[[float], None]
 
-_DEGREES = {1: (8, 16, 24), 2: (6, 10, 14, 16), 3: (4, 6, 8), 4: (3, 4, 5)}
-_LAST_DEGREES = (2, 3)
+_DEGREES = {1: (8, 14, 20), 2: (6, 10, 14, 16), 3: (4, 6, 8), 4: (2, 4)}
+_LAST_DEGREES = (2,)
 _MOST_MEMBERS = 800
 """Members of a basis up to which linear programs are fast enough."""
 
@@ -31,8 +31,11 @@ _RATES = (0.0, 0.1, 0.5, 1.0)
 """Rates that are tried, for 1/T."""
 
 _FIRST_ROUNDS = 3
-_NOTHING = 1e-4
+_NOTHING = 1e-3
 """Mean bound from which a barrier is one."""
+
+_NEAR, _STEP = 64, 0.01
+"""States drawn near one where the inequality fails, and how far, for the width of C 2."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +63,21 @@ class Attempt:
 
     Attributes:
         degree: total degree.
+        members: coefficients that the linear programs find.
         candidate: the barrier; nothing where none was found with a bound above 0.
         inputs: what the first linear program took for the input.
         seconds: of computing.
     """
 
     degree: int
+    members: int
     candidate: Candidate | None
     inputs: str
     seconds: float
 
 
-def synthesize(
-    task: Task, settings: SynthesisSettings, progress: Progress | None = None
-) -> tuple[Attempt, ...]:
-    """Return the best barrier of each degree, whose numbers hold where states were sampled.
+class Synthesis:
+    """Barriers of a task by linear programs, whose numbers hold where states were sampled.
 
     The input, for which a linear program needs a formula, is the one that raises the barrier of the
     program before it most: so each program can keep the last barrier, but for the states added.
@@ -82,53 +85,91 @@ def synthesize(
     Args:
         task: what is asked for.
         settings: of the search.
-        progress: called with the part of the work that is done.
 
-    Returns:
-        Attempts of increasing degree; fewer than the settings list where the time is over.
+    Attributes:
+        domain: the safe set.
 
     Raises:
         ConfigurationError: There are too many states, or no state of C was found, or the workspace
             is unbounded.
         NumericalError: The system has no finite value at a state of C.
     """
-    begin = time.monotonic()
-    domain = Domain.of(task.plant, task.closed, settings.seed)
-    generator = Generator(task.plant)
-    improvement = Improvement(domain, generator, task.starts, settings)
-    witnesses: dict[str, Witness | Candidate] = dict(
-        witnesses_of(generator, domain, task.nominal)
-    )
-    degrees = degrees_of(task.plant, settings)
-    bounds = [
-        Bound(rate, task.horizon)
-        for rate in settings.rates or [r / task.horizon for r in _RATES]
-    ]
-    found: list[Attempt] = []
-    last, name = None, ""
-    for k, degree in enumerate(degrees):
-        started = time.monotonic()
-        if found and started - begin > settings.seconds:
-            break
-        basis = ChebyshevBasis(task.plant.states, *domain.frame, degree, domain.even)
-        if last is None:
-            tried = [
-                (improvement.best(basis, bound, first, _FIRST_ROUNDS), own)
-                for bound in bounds
-                for own, first in witnesses.items()
-            ]
-            best, name = max(tried, key=lambda each: _mean(each[0]))
-            if best is not None and len(degrees) == 1:
-                best = _better(best, improvement.best(basis, best.bound, best, settings.rounds))
-        else:
-            best = improvement.best(basis, last.bound, last, settings.rounds)
-        if _mean(best) < _NOTHING:
-            best = None
-        found.append(Attempt(degree, best, name, time.monotonic() - started))
-        last = best if best is not None else last
-        if progress is not None:
-            progress((k + 1) / len(degrees))
-    return tuple(found)
+
+    def __init__(self, task: Task, settings: SynthesisSettings) -> None:
+        self._task, self._settings = task, settings
+        self._degrees = degrees_of(task.plant, settings)
+        self.domain = Domain.of(task.plant, task.closed, settings.seed)
+        generator = Generator(task.plant)
+        self._improvement = Improvement(self.domain, generator, task.starts, settings)
+        self._laws = witnesses_of(generator, self.domain, task.nominal)
+        rates = settings.rates or [float(f"{r / task.horizon:.6g}") for r in _RATES]
+        self._bounds = [Bound(rate, task.horizon) for rate in rates]
+
+    def attempts(self, progress: Progress | None = None) -> tuple[Attempt, ...]:
+        """Return the best barrier of each degree.
+
+        Args:
+            progress: called with the part of the work that is done.
+
+        Returns:
+            Attempts of increasing degree; fewer than the settings list where the time is over.
+        """
+        begin, found = time.monotonic(), list[Attempt]()
+        last, name = None, ""
+        for k, degree in enumerate(self._degrees):
+            started = time.monotonic()
+            if found and started - begin > self._settings.seconds:
+                break
+            basis = ChebyshevBasis(
+                self._task.plant.states, *self.domain.frame, degree, self.domain.even
+            )
+            deadline = begin + self._settings.seconds
+            if last is None:
+                best, name = self._begun(basis)
+            else:
+                best = self._improvement.best(
+                    basis, last.bound, last, self._settings.rounds, deadline
+                )
+            best = best if _mean(best) > _NOTHING else None
+            if k + 1 == len(self._degrees) and last is None and best is not None:
+                more = self._improvement.best(
+                    basis, best.bound, best, self._settings.rounds, deadline
+                )
+                best = max(best, more, key=_mean)
+            seconds = time.monotonic() - started
+            found.append(Attempt(degree, len(basis.exponents), best, name, seconds))
+            last = best if best is not None else last
+            if progress is not None:
+                progress((k + 1) / len(self._degrees))
+        return tuple(found)
+
+    def repaired(self, candidate: Candidate, worst: np.ndarray) -> Candidate | None:
+        """Return a better barrier, where the inequality is asked near a state too.
+
+        Args:
+            candidate: the barrier.
+            worst: state where its inequality fails, shape (n,).
+        """
+        rng = np.random.default_rng(self._settings.seed)
+        scale = np.array([float(s) for s in self.domain.frame[1]])
+        near = worst + _STEP * scale * rng.standard_normal((_NEAR, len(worst)))
+        if self.domain.even:
+            near = np.concatenate([near, -near])
+        extra = np.concatenate([worst[None], near[self.domain.inside(near)]])
+        improvement = replace(self._improvement, extra=extra)
+        return improvement.best(
+            candidate.basis, candidate.bound, candidate, self._settings.rounds, time.monotonic()
+        )
+
+    def _begun(self, basis: ChebyshevBasis) -> tuple[Candidate | None, str]:
+        """Return the best barrier over all rates and first inputs, and the name of the latter."""
+        laws: dict[str, Witness] = self._laws
+        tried = [
+            (self._improvement.best(basis, bound, law, _FIRST_ROUNDS), name)
+            for bound in self._bounds
+            for name, law in laws.items()
+        ]
+        return max(tried, key=lambda each: _mean(each[0]))
 
 
 def degrees_of(plant: Plant, settings: SynthesisSettings) -> tuple[int, ...]:
@@ -146,16 +187,11 @@ def degrees_of(plant: Plant, settings: SynthesisSettings) -> tuple[int, ...]:
     members = sp.binomial(n + degrees[-1], n)
     if members > _MOST_MEMBERS:
         raise ConfigurationError(
-            f"a polynomial of {n} states and degree {degrees[-1]} has {members} coefficients; linear"
-            f" programs up to {_MOST_MEMBERS} are solved: give a lower degree"
-            + ("" if settings.degrees else ", or take a system of fewer states")
+            f"a polynomial of {n} states and degree {degrees[-1]} has {members} coefficients;"
+            f" linear programs up to {_MOST_MEMBERS} are solved: give a lower degree"
         )
     return degrees
 
 
 def _mean(candidate: Candidate | None) -> float:
     return -1.0 if candidate is None else candidate.mean
-
-
-def _better(a: Candidate, b: Candidate | None) -> Candidate:
-    return a if b is None or a.mean >= b.mean else b
