@@ -111,8 +111,8 @@ def _require_formula(policy: str, problem: SafetyProblem) -> None:
 
     make_policy(policy, problem)  # An unknown one is an error.
     raise ConfigurationError(
-        f"the policy {policy!r} has no formula of the state from which a bound could be proved; give"
-        " --policy nominal, or leave it out for a bound that holds for every policy under psi's"
+        f"the policy {policy!r} has no formula of the state to prove a bound of; give --policy"
+        " nominal, or leave it out for a bound that holds for every policy under psi's"
         " constraint"
     )
 

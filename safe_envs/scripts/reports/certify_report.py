@@ -147,10 +147,11 @@ def _result_lines(answer: CertifyAnswer) -> list[str]:
     ]
     best = next(x for x in found.attempts if x.degree == _degree(found))
     gap = (best.candidate.program if best.candidate else 0.0) - found.mean
-    lines.append(
-        f"The linear program of this degree has {100 * gap:.2g} % more, at sampled states: better"
-        " bounds need higher degrees or other inputs"
-    )
+    if gap > 0.0:
+        lines.append(
+            f"The linear program of this degree has {100 * gap:.2g} % more, at sampled states:"
+            " better bounds need higher degrees, or other inputs in the program"
+        )
     if answer.upper is not None:
         lines.append(
             f"No policy is safer than {percent(answer.upper)} with the env's own held input"
@@ -179,8 +180,11 @@ def _missing_lines(found: Certification) -> list[str]:
         for j in found.judgements
         if j.numbers.reason
     ]
-    if found.attempts and found.attempts[-1].candidate and found.certificate is None:
-        lines.append("Note: the barriers found hold at the sampled states only.")
+    lines += [
+        f"Note: the numbers of degree {j.degree} may be far from the least ones: {j.numbers.note}."
+        for j in found.judgements
+        if j.numbers.note and not j.numbers.reason
+    ]
     return lines
 
 

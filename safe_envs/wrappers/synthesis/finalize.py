@@ -26,6 +26,7 @@ _EDGE_MARGIN, _TOP_TOLERANCE, _RATE_TOLERANCE = 1e-3, 5e-4, 1e-3
 """Parts of the bound that gaps between proved and true extrema may cost."""
 
 _RIM, _TRIES = 20_000, 4
+_THIN = sp.Rational(1, 10**6)
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class ProofNumbers:
         worst: state where the generator inequality takes m, shape (n,), if one was met.
         boxes: that the judge has looked at.
         reason: why there is no proof, in words; empty where there is one.
+        note: why its numbers may be larger than they have to be, in words; empty where they are
+            not by much.
     """
 
     psi: Polynomial
@@ -47,6 +50,7 @@ class ProofNumbers:
     worst: np.ndarray | None
     boxes: int
     reason: str = ""
+    note: str = ""
 
 
 def finalize(candidate: Candidate, domain: Domain, budget: Budget | None = None) -> ProofNumbers:
@@ -76,7 +80,8 @@ def finalize(candidate: Candidate, domain: Domain, budget: Budget | None = None)
     if failed or not top.upper > 0.0:
         return ProofNumbers(psi, zero, zero, lack.state, boxes, failed or "psi is nowhere above 0")
     m, c = _above(max(lack.upper, 0.0)), _above(top.upper)
-    return ProofNumbers(psi, m, c, lack.state, boxes)
+    note = top.reason or lack.reason
+    return ProofNumbers(psi, m, c, lack.state, boxes, note=note)
 
 
 def exact_decimal(value: float) -> Fraction:
@@ -121,7 +126,9 @@ def _edges(domain: Domain, psi: Polynomial, rate: Fraction, excess: Fraction) ->
         )
     for i in np.flatnonzero(domain.closed).tolist():
         for end in plant.workspace[i]:
-            within = (*plant.workspace[:i], (end, end), *plant.workspace[i + 1 :])
+            # A little wider than the end, which no box of floats is exactly.
+            ends = (end - _THIN, end + _THIN)
+            within = (*plant.workspace[:i], ends, *plant.workspace[i + 1 :])
             found.append(
                 Statement(
                     f"psi <= 0 at {plant.states[i]} = {end}",

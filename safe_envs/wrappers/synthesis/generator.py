@@ -62,7 +62,7 @@ class Generator:
         """Lower and upper bounds of the inputs, shape (m, 2); of none where there is a policy."""
         if self.plant.policy:
             return np.zeros((0, 2))
-        return np.array([[float(e) for e in pair] for pair in self.plant.bounds])
+        return np.array([[float(e) for e in pair] for pair in self.plant.bounds]).reshape(-1, 2)
 
     @cached_property
     def _parts(self) -> tuple[Any, Any, Any]:
@@ -72,9 +72,9 @@ class Generator:
             drift, effect = drift + effect * sp.Matrix(p.policy), sp.zeros(len(p.states), 0)
         sigma = sp.Matrix(p.diffusion) if p.diffusion[0] else sp.zeros(len(p.states), 1)
         return (
-            compile_function(p.states, list(drift), "arrays"),
-            compile_function(p.states, list(effect), "arrays") if len(effect) else None,
-            compile_function(p.states, list(sigma * sigma.T), "arrays"),
+            compile_function(p.states, drift.flat(), "arrays"),
+            compile_function(p.states, effect.flat(), "arrays") if len(effect) else None,
+            compile_function(p.states, (sigma * sigma.T).flat(), "arrays"),
         )
 
     def fields(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -87,7 +87,7 @@ def _regulator(generator: Generator, domain: Domain) -> Witness | None:
     b = effect[0] * half / scale[:, None]
     try:
         jacobian = sp.Matrix(plant.drift).jacobian(list(plant.states))
-        slopes = at_states(compile_function(plant.states, list(jacobian), "arrays"), best[None])
+        slopes = at_states(compile_function(plant.states, jacobian.flat(), "arrays"), best[None])
         a = slopes.reshape(len(scale), -1) * scale / scale[:, None]
         cost = solve_continuous_are(a, b, np.eye(len(scale)), np.eye(len(half)))
     except (LinAlgError, ValueError, SystemDefinitionError):
