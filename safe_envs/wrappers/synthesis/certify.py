@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -120,7 +120,7 @@ def certify(
     task = Task(plant, float(horizon), starts, closed, () if policy else laws)
     synthesis = Synthesis(task, settings)
     attempts = synthesis.attempts(progress and (lambda done: progress(_SEARCHED * done)))
-    judgements = _judged(synthesis, attempts, starts)
+    judgements = _judged(synthesis, attempts)
     if progress is not None:
         progress(1.0)
     best = max(judgements, key=lambda each: each.mean, default=None)
@@ -140,7 +140,9 @@ def certify(
     )
     # Other starts than those for which psi was chosen.
     x = np.stack(draw_starts(problem, _STARTS, settings.seed + 1), axis=1)
-    bounds = certificate.bounds_at(x)
+    x = synthesis.domain.wrapped(x)
+    # psi says nothing outside of C and of the workspace.
+    bounds = np.where(synthesis.domain.inside(x), certificate.bounds_at(x), 0.0)
     return Certification(
         certificate,
         attempts,
@@ -172,9 +174,7 @@ def nominal_laws(problem: SafetyProblem) -> tuple[sp.Expr, ...]:
     return tuple(found)
 
 
-def _judged(
-    synthesis: Synthesis, attempts: tuple[Attempt, ...], starts: np.ndarray
-) -> tuple[Judgement, ...]:
+def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[Judgement, ...]:
     """Judge the barriers, the best one first, until no other can have a larger bound."""
     order = sorted(
         (a for a in attempts if a.candidate is not None), key=lambda a: -_sampled(a.candidate)
@@ -184,26 +184,29 @@ def _judged(
         candidate = attempt.candidate
         if candidate is None or any(done.mean >= candidate.mean for done in found):
             break
-        judgement = _judgement(synthesis, attempt.degree, candidate, starts)
+        judgement = _judgement(synthesis, attempt.degree, candidate)
         worst = judgement.numbers.worst
         if candidate.mean - judgement.mean > _LOST and worst is not None:
             again = synthesis.repaired(candidate, worst)
             if again is not None and again.mean > judgement.mean:
-                second = _judgement(synthesis, attempt.degree, again, starts)
+                second = _judgement(synthesis, attempt.degree, again)
                 judgement = max(judgement, second, key=lambda each: each.mean)
         found.append(judgement)
     return tuple(found)
 
 
-def _judgement(
-    synthesis: Synthesis, degree: int, candidate: Candidate, starts: np.ndarray
-) -> Judgement:
+def _judgement(synthesis: Synthesis, degree: int, candidate: Candidate) -> Judgement:
     begin = time.monotonic()
     numbers = finalize(candidate, synthesis.domain, _BUDGET)
     mean = 0.0
     if not numbers.reason:
-        psi, m, c = numbers.psi.values(starts), float(numbers.shortfall), float(numbers.supremum)
-        mean = candidate.bound.mean(psi, m, c)
+        psi = numbers.psi.values(synthesis.starts)
+        m, c = float(numbers.shortfall), float(numbers.supremum)
+        if psi.max() > c:
+            reason = f"psi is {psi.max():.6g} at a start, which contradicts c = {c:.6g}"
+            numbers = replace(numbers, reason=reason)
+        else:
+            mean = candidate.bound.mean(psi, m, c)
     return Judgement(degree, numbers, mean, time.monotonic() - begin)
 
 

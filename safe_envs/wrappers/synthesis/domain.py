@@ -136,6 +136,11 @@ class Domain:
         within = ((x >= self.low) & (x <= self.high)).all(axis=1)
         return within & (self.level(x) >= 0.0)
 
+    def wrapped(self, x: np.ndarray) -> np.ndarray:
+        """Return states (B, n) whose angles are in the one period that the workspace holds."""
+        period = self.high - self.low
+        return np.where(self.closed, self.low + (x - self.low) % period, x)
+
     def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw states of C, more of them near its edge; shape (B, n), B <= count."""
         x, end, _ = self._rays(count, rng)

@@ -88,10 +88,11 @@ class Synthesis:
 
     Attributes:
         domain: the safe set.
+        starts: those of the task that are in it, their angles within the period.
 
     Raises:
-        ConfigurationError: There are too many states, or no state of C was found, or the workspace
-            is unbounded.
+        ConfigurationError: There are too many states, or no state of C was found, or no start is in
+            it, or the workspace is unbounded.
         NumericalError: The system has no finite value at a state of C.
     """
 
@@ -100,7 +101,11 @@ class Synthesis:
         self._degrees = degrees_of(task.plant, settings)
         self.domain = Domain.of(task.plant, task.closed, settings.seed)
         generator = Generator(task.plant)
-        self._improvement = Improvement(self.domain, generator, task.starts, settings)
+        starts = self.domain.wrapped(task.starts)
+        self.starts = starts[self.domain.inside(starts)]
+        if not len(self.starts):
+            raise ConfigurationError("no start is in the safe set and in the workspace")
+        self._improvement = Improvement(self.domain, generator, self.starts, settings)
         self._laws = witnesses_of(generator, self.domain, task.nominal)
         rates = settings.rates or [float(f"{r / task.horizon:.6g}") for r in _RATES]
         self._bounds = [Bound(rate, task.horizon) for rate in rates]

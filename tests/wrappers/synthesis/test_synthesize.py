@@ -12,10 +12,12 @@ import sympy as sp
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.wrappers.certificates.checker import check
+from safe_envs.wrappers.certificates.statements import plant_of
 from safe_envs.wrappers.synthesis.certify import Named, certify, nominal_laws
+from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.finalize import finalize
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
-from safe_envs.wrappers.synthesis.synthesize import Synthesis, degrees_of
+from safe_envs.wrappers.synthesis.synthesize import Synthesis, Task, degrees_of
 from tests.wrappers.synthesis.systems import brownian, survival
 
 HORIZON = 1.0
@@ -123,3 +125,28 @@ def test_a_polynomial_with_too_many_coefficients_is_refused():
     plant = make_problem("safe_envs/Quadrotor-v0").plant
     with pytest.raises(ConfigurationError, match="coefficients"):
         degrees_of(plant, SynthesisSettings(degrees=(5,)))
+
+
+def test_starts_are_taken_within_the_period_of_an_angle():
+    problem = make_problem("safe_envs/StochasticDubins-v0")
+    plant = plant_of(problem)
+    task = Task(plant, 1.0, np.array([[0.5, 0.5, 7.0], [0.5, 0.5, -4.0]]), (False, False, True))
+    starts = Synthesis(task, SynthesisSettings(degrees=(2,))).starts
+    np.testing.assert_allclose(starts[:, 2], [7.0 - 2 * np.pi, 2 * np.pi - 4.0])
+
+
+def test_starts_outside_of_the_safe_set_have_no_bound():
+    inside = brownian(HORIZON, starts=(1.0, -0.5, 3.5))
+    assert Synthesis(inside, SynthesisSettings(degrees=(2,))).starts.tolist() == [[1.0]]
+    with pytest.raises(ConfigurationError, match="no start"):
+        Synthesis(brownian(HORIZON, starts=(-0.5,)), SynthesisSettings(degrees=(2,)))
+
+
+def test_a_state_on_the_edge_is_on_it():
+    problem = make_problem("safe_envs/CubicSDE-v0")
+    domain = Domain.of(plant_of(problem), (False, False))
+    edge = domain.draw_edge(500, np.random.default_rng(0))
+    assert len(edge) > 100
+    assert np.abs(domain.level(edge)).max() < 1e-9
+    # Its corners with the ends of the workspace are among them.
+    assert edge[:, 0].min() == -6.0
