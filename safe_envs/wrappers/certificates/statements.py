@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import sympy as sp
 
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
@@ -37,21 +38,12 @@ def plant_of(
     """
     system = problem.plant if knowledge == "plant" else problem.model
 
-    def exact(expression: Any) -> sp.Expr:
-        found = system.exact(sp.sympify(expression))
-        floats = {e: sp.Rational(str(e)) for e in found.atoms(sp.Float)}
-        # The checkers know these two, and exp.
-        found = found.xreplace(floats).replace(sp.tan, lambda x: sp.sin(x) / sp.cos(x))
-        return found.replace(sp.sinh, lambda x: (sp.exp(x) - sp.exp(-x)) / 2).replace(
-            sp.cosh, lambda x: (sp.exp(x) + sp.exp(-x)) / 2
-        )
-
     drift, barriers, law = (
-        tuple(exact(e) for e in expressions)
+        tuple(exact_in(system, e) for e in expressions)
         for expressions in (system.drift, (b.expression for b in problem.barriers), policy)
     )
     matrices = [
-        tuple(tuple(exact(matrix[i, j]) for j in range(matrix.cols)) for i in range(matrix.rows))
+        tuple(tuple(exact_in(system, e) for e in line) for line in matrix.tolist())
         for matrix in (system.input_matrix, system.diffusion)
     ]
     used = (*drift, *barriers, *law, *(e for matrix in matrices for line in matrix for e in line))
@@ -65,6 +57,22 @@ def plant_of(
         diffusion=matrices[1],
         barriers=barriers,
         policy=law,
+    )
+
+
+def exact_in(system: ControlAffineSDE, expression: Any) -> sp.Expr:
+    """Return an expression in exact numbers and functions that the checkers know.
+
+    Args:
+        system: whose parameters it has.
+        expression: of states and parameters.
+    """
+    found = system.exact(sp.sympify(expression))
+    # A text of SymPy has 15 digits, and the number of the env 17.
+    floats = {e: _rational(float(e)) for e in found.atoms(sp.Float)}
+    found = found.xreplace(floats).replace(sp.tan, lambda x: sp.sin(x) / sp.cos(x))
+    return found.replace(sp.sinh, lambda x: (sp.exp(x) - sp.exp(-x)) / 2).replace(
+        sp.cosh, lambda x: (sp.exp(x) + sp.exp(-x)) / 2
     )
 
 
