@@ -34,8 +34,8 @@ class ChebyshevBasis:
 
     Attributes:
         states: symbols x_1, ..., x_n.
-        center: of the box on which z is in [-1, 1].
-        scale: half of its width.
+        center: of the states for which z is in [-1, 1].
+        scale: half of the width of their range, each > 0.
         degree: largest total degree, at least 0.
         even: only members of even total degree, which are the same at z and -z.
     """
@@ -63,7 +63,11 @@ class ChebyshevBasis:
         return found
 
     def jets(self, x: np.ndarray) -> Jets:
-        """Return all members with their derivatives at states, shape (B, n)."""
+        """Return all members with their derivatives at states.
+
+        Args:
+            x: states, shape (B, n).
+        """
         n = len(self.states)
         each = [[part[:, self.exponents[:, i]] for part in self._along(x, i)] for i in range(n)]
 

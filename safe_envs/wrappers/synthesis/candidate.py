@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
-from safe_envs.wrappers.synthesis.linear_program import Bound
+from safe_envs.wrappers.synthesis.linear_program import MeanBound
 
 
 @dataclass(frozen=True)
-class Candidate:
+class BarrierCandidate:
     """A barrier psi whose numbers hold at many states, which proves nothing.
 
     Attributes:
@@ -27,7 +27,7 @@ class Candidate:
 
     basis: ChebyshevBasis
     coefficients: np.ndarray
-    bound: Bound
+    bound: MeanBound
     shortfall: float
     supremum: float
     mean: float

@@ -14,7 +14,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.certificates.statements import plant_of
-from safe_envs.wrappers.synthesis.candidate import Candidate
+from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.finalize import ProofNumbers, exact_decimal, finalize
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.synthesis.synthesize import Attempt, Progress, Synthesis, Task
@@ -34,7 +34,7 @@ _BUDGET = Budget(boxes=1_000_000, seconds=20.0)
 
 
 @dataclass(frozen=True)
-class Judgement:
+class BarrierProof:
     """What the judge makes of the barrier of a degree.
 
     Attributes:
@@ -66,7 +66,7 @@ class Certification:
 
     certificate: BarrierCertificate | None
     attempts: tuple[Attempt, ...]
-    judgements: tuple[Judgement, ...]
+    judgements: tuple[BarrierProof, ...]
     mean: float
     starts: int
     margin: float
@@ -174,12 +174,12 @@ def nominal_laws(problem: SafetyProblem) -> tuple[sp.Expr, ...]:
     return tuple(found)
 
 
-def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[Judgement, ...]:
+def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[BarrierProof, ...]:
     """Judge the barriers, the best one first, until no other can have a larger bound."""
     order = sorted(
         (a for a in attempts if a.candidate is not None), key=lambda a: -_sampled(a.candidate)
     )
-    found: list[Judgement] = []
+    found: list[BarrierProof] = []
     for attempt in order:
         candidate = attempt.candidate
         if candidate is None or any(done.mean >= candidate.mean for done in found):
@@ -195,7 +195,7 @@ def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[Judgem
     return tuple(found)
 
 
-def _judgement(synthesis: Synthesis, degree: int, candidate: Candidate) -> Judgement:
+def _judgement(synthesis: Synthesis, degree: int, candidate: BarrierCandidate) -> BarrierProof:
     begin = time.monotonic()
     numbers = finalize(candidate, synthesis.domain, _BUDGET)
     mean = 0.0
@@ -207,8 +207,8 @@ def _judgement(synthesis: Synthesis, degree: int, candidate: Candidate) -> Judge
             numbers = replace(numbers, reason=reason)
         else:
             mean = candidate.bound.mean(psi, m, c)
-    return Judgement(degree, numbers, mean, time.monotonic() - begin)
+    return BarrierProof(degree, numbers, mean, time.monotonic() - begin)
 
 
-def _sampled(candidate: Candidate | None) -> float:
+def _sampled(candidate: BarrierCandidate | None) -> float:
     return 0.0 if candidate is None else candidate.mean

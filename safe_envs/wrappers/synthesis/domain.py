@@ -142,14 +142,30 @@ class Domain:
         return np.where(self.closed, self.low + (x - self.low) % period, x)
 
     def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw states of C, more of them near its edge; shape (B, n), B <= count."""
+        """Draw states of C, more of them near its edge.
+
+        Args:
+            count: of draws, some of which may be outside.
+            rng: of the draws.
+
+        Returns:
+            Shape (B, n), B <= count.
+        """
         x, end, _ = self._rays(count, rng)
         share = 1.0 - rng.random(len(x)) ** 2
         found = x + share[:, None] * (end - x)
         return found[self.inside(found)]
 
     def draw_edge(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw states of C where an h is 0, or at an end where no episode ends; shape (B, n)."""
+        """Draw states of C where an h is 0, or at an end where no episode ends.
+
+        Args:
+            count: of draws, some of which may leave the workspace instead.
+            rng: of the draws.
+
+        Returns:
+            Shape (B, n).
+        """
         _, end, leaves = self._rays(count, rng)
         found = [end[leaves]]
         for i in np.flatnonzero(self.closed).tolist():

@@ -12,7 +12,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.wrappers.certificates.certificate import Plant
-from safe_envs.wrappers.synthesis.candidate import Candidate
+from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.domain import Domain, at_states
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.certificate_statements import CertificateStatements
@@ -53,7 +53,9 @@ class ProofNumbers:
     note: str = ""
 
 
-def finalize(candidate: Candidate, domain: Domain, budget: Budget | None = None) -> ProofNumbers:
+def finalize(
+    candidate: BarrierCandidate, domain: Domain, budget: Budget | None = None
+) -> ProofNumbers:
     """Return proved numbers for a barrier.
 
     Args:

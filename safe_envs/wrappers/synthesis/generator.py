@@ -103,7 +103,12 @@ class Generator:
         return found
 
     def samples(self, basis: ChebyshevBasis, x: np.ndarray) -> Samples:
-        """Return a basis and its generator at states (B, n)."""
+        """Return a basis and its generator at states.
+
+        Args:
+            basis: whose members are taken.
+            x: states, shape (B, n).
+        """
         drift, effect, covariance = self.fields(x)
         jets = basis.jets(x)
         rates = np.einsum("bn,bnk->bk", drift, jets.gradients)

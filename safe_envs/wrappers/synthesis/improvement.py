@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
-from safe_envs.wrappers.synthesis.candidate import Candidate
+from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.generator import Generator, Samples
-from safe_envs.wrappers.synthesis.linear_program import Bound, Claims, solve
-from safe_envs.wrappers.synthesis.reference import Asked, Reference, worst
+from safe_envs.wrappers.synthesis.linear_program import Claims, MeanBound, solve
+from safe_envs.wrappers.synthesis.reference import AskedClaims, Reference, worst
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.synthesis.witnesses import Witness
 
@@ -60,11 +60,11 @@ class Improvement:
     def best(
         self,
         basis: ChebyshevBasis,
-        bound: Bound,
-        first: Witness | Candidate,
+        bound: MeanBound,
+        first: Witness | BarrierCandidate,
         rounds: int,
         deadline: float = math.inf,
-    ) -> Candidate | None:
+    ) -> BarrierCandidate | None:
         """Return the best barrier of some rounds.
 
         Args:
@@ -109,8 +109,8 @@ class _CuttingPlanes:
         self,
         improvement: Improvement,
         basis: ChebyshevBasis,
-        bound: Bound,
-        first: Witness | Candidate,
+        bound: MeanBound,
+        first: Witness | BarrierCandidate,
     ) -> None:
         self._all, self._basis, self._bound = improvement, basis, bound
         self._rng = np.random.default_rng([improvement.settings.seed, basis.degree])
@@ -126,7 +126,7 @@ class _CuttingPlanes:
         self.references, self._cuts = 0, 0
         self._refer(first, x)
 
-    def _refer(self, given: Witness | Candidate, states: np.ndarray) -> None:
+    def _refer(self, given: Witness | BarrierCandidate, states: np.ndarray) -> None:
         """Take other inputs as given."""
         band = _BANDS[min(self.references, len(_BANDS) - 1)] / self._bound.spent
         self._reference = Reference(self._all.generator, self._all.domain, given, band)
@@ -135,7 +135,7 @@ class _CuttingPlanes:
         self._asked = self._reference.asked(self._basis, self._points)
         self.references, self._cuts = self.references + 1, 0
 
-    def solved(self, done: int) -> Candidate | None:
+    def solved(self, done: int) -> BarrierCandidate | None:
         """Solve a linear program, and add what it does not meet; nothing where it has no solution.
 
         Args:
@@ -156,7 +156,7 @@ class _CuttingPlanes:
             return None
         c, m = self._last, _ = solution
         value = bound.mean(self._starts @ c, m, 1.0)
-        raw = Candidate(self._basis, c, bound, m, 1.0, 0.0, value, done)
+        raw = BarrierCandidate(self._basis, c, bound, m, 1.0, 0.0, value, done)
         pool = self._all.generator.samples(self._basis, self._all.domain.draw(_POOL, self._rng))
         rim = self._basis.values(self._all.domain.draw_edge(_RIM, self._rng))
         bad, bad_asked, cost = self._sharpened(pool, c, m)
@@ -185,7 +185,7 @@ class _CuttingPlanes:
         above = order[excess[order] > 0.1 * self._all.settings.tolerance]
         self._edge = np.concatenate([self._edge, rim[above]])
 
-    def _cost(self, samples: Samples, asked: Asked, c: np.ndarray, m: float) -> np.ndarray:
+    def _cost(self, samples: Samples, asked: AskedClaims, c: np.ndarray, m: float) -> np.ndarray:
         """Return the part of the bound that violations at states cost, shape (B,)."""
         psi, effect = samples.values @ c, samples.inputs @ c
         rate = samples.drift @ c + (asked.inputs * effect).sum(axis=1) + self._bound.rate * psi
@@ -194,7 +194,7 @@ class _CuttingPlanes:
 
     def _sharpened(
         self, pool: Samples, c: np.ndarray, m: float
-    ) -> tuple[Samples, Asked, np.ndarray]:
+    ) -> tuple[Samples, AskedClaims, np.ndarray]:
         """Return the worst states of many, moved to worse ones near them, and their costs."""
         domain, generator, basis = self._all.domain, self._all.generator, self._basis
         asked = self._reference.asked(basis, pool)
@@ -217,7 +217,9 @@ class _CuttingPlanes:
             cost = np.concatenate([cost[~better], costs.ravel()[best]])
         return found, asked, cost
 
-    def _measured(self, given: Candidate, pool: Samples, edge: np.ndarray) -> Candidate:
+    def _measured(
+        self, given: BarrierCandidate, pool: Samples, edge: np.ndarray
+    ) -> BarrierCandidate:
         """Return a barrier lowered so that its bound at many states is largest."""
         c, bound = given.coefficients, given.bound
         psi = pool.values @ c

@@ -27,7 +27,7 @@ class Claims:
 
 
 @dataclass(frozen=True)
-class Bound:
+class MeanBound:
     """psi(x_0) e^(-a T) - m (1 - e^(-a T))/a, for c = 1.
 
     Attributes:
@@ -61,7 +61,7 @@ class Bound:
         return float(values.clip(0.0, 1.0).mean())
 
 
-def solve(claims: Claims, bound: Bound, weights: np.ndarray) -> tuple[np.ndarray, float] | None:
+def solve(claims: Claims, bound: MeanBound, weights: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return the coefficients and the shortfall m of the largest mean bound.
 
     Args:

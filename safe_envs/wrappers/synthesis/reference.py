@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
-from safe_envs.wrappers.synthesis.candidate import Candidate
+from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.generator import Generator, Samples
 from safe_envs.wrappers.synthesis.witnesses import Witness
@@ -18,7 +18,7 @@ _LEVELS = (-1.0, 0.0, 1.0)
 """Effects of an input for its band, at which states are taken along the sign change of L_g psi."""
 
 
-class Asked(NamedTuple):
+class AskedClaims(NamedTuple):
     """What a linear program asks at states.
 
     Attributes:
@@ -29,13 +29,13 @@ class Asked(NamedTuple):
     inputs: np.ndarray
     generator: np.ndarray
 
-    def only(self, chosen: np.ndarray) -> Asked:
+    def only(self, chosen: np.ndarray) -> AskedClaims:
         """Return what is asked at the states that a mask or indices choose."""
-        return Asked(self.inputs[chosen], self.generator[chosen])
+        return AskedClaims(self.inputs[chosen], self.generator[chosen])
 
-    def joined(self, other: Asked) -> Asked:
+    def joined(self, other: AskedClaims) -> AskedClaims:
         """Return what is asked at the states of both."""
-        return Asked(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+        return AskedClaims(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +54,10 @@ class Reference:
 
     generator: Generator
     domain: Domain
-    given: Witness | Candidate
+    given: Witness | BarrierCandidate
     band: float
 
-    def asked(self, basis: ChebyshevBasis, samples: Samples) -> Asked:
+    def asked(self, basis: ChebyshevBasis, samples: Samples) -> AskedClaims:
         """Return what is asked at states.
 
         Args:
@@ -65,15 +65,15 @@ class Reference:
             samples: states.
         """
         old = self.given
-        if not isinstance(old, Candidate):
-            return Asked(old(samples.states), np.ones(len(samples.states), dtype=bool))
+        if not isinstance(old, BarrierCandidate):
+            return AskedClaims(old(samples.states), np.ones(len(samples.states), dtype=bool))
         if basis != old.basis:
             samples = self.generator.samples(old.basis, samples.states)
         psi = samples.values @ old.coefficients
         rate = self.generator.largest_rate(samples, old.coefficients)
         met = rate + old.bound.rate * psi + old.shortfall >= 0.0
         inputs = self.generator.best_inputs(samples, old.coefficients, self.band)
-        return Asked(inputs, (psi > 0.0) | met)
+        return AskedClaims(inputs, (psi > 0.0) | met)
 
     def sign_changes(self, states: np.ndarray) -> np.ndarray:
         """Return states of G near those where an input changes its sign; none for a law.
@@ -84,7 +84,7 @@ class Reference:
             states: of C, to begin at, shape (B, n).
         """
         old, found = self.given, [states[:0]]
-        if not isinstance(old, Candidate):
+        if not isinstance(old, BarrierCandidate):
             return found[0]
         c, half = old.coefficients, np.diff(self.generator.bounds, axis=1)[:, 0] / 2.0
         near = self.generator.samples(old.basis, states)

@@ -12,11 +12,11 @@ import sympy as sp
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.certificates.certificate import Plant
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
-from safe_envs.wrappers.synthesis.candidate import Candidate
+from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.generator import Generator
 from safe_envs.wrappers.synthesis.improvement import Improvement
-from safe_envs.wrappers.synthesis.linear_program import Bound
+from safe_envs.wrappers.synthesis.linear_program import MeanBound
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.synthesis.witnesses import Witness, witnesses_of
 
@@ -71,7 +71,7 @@ class Attempt:
 
     degree: int
     members: int
-    candidate: Candidate | None
+    candidate: BarrierCandidate | None
     inputs: str
     seconds: float
 
@@ -108,7 +108,7 @@ class Synthesis:
         self._improvement = Improvement(self.domain, generator, self.starts, settings)
         self._laws = witnesses_of(generator, self.domain, task.nominal)
         rates = settings.rates or [float(f"{r / task.horizon:.6g}") for r in _RATES]
-        self._bounds = [Bound(rate, task.horizon) for rate in rates]
+        self._bounds = [MeanBound(rate, task.horizon) for rate in rates]
 
     def attempts(self, progress: Progress | None = None) -> tuple[Attempt, ...]:
         """Return the best barrier of each degree.
@@ -148,7 +148,7 @@ class Synthesis:
                 progress((k + 1) / len(self._degrees))
         return tuple(found)
 
-    def repaired(self, candidate: Candidate, worst: np.ndarray) -> Candidate | None:
+    def repaired(self, candidate: BarrierCandidate, worst: np.ndarray) -> BarrierCandidate | None:
         """Return a better barrier, where the inequality is asked near a state too.
 
         Args:
@@ -166,7 +166,7 @@ class Synthesis:
             candidate.basis, candidate.bound, candidate, self._settings.rounds, time.monotonic()
         )
 
-    def _begun(self, basis: ChebyshevBasis) -> tuple[Candidate | None, str]:
+    def _begun(self, basis: ChebyshevBasis) -> tuple[BarrierCandidate | None, str]:
         """Return the best barrier over all rates and first inputs, and the name of the latter."""
         laws: dict[str, Witness] = self._laws
         tried = [
@@ -198,5 +198,5 @@ def degrees_of(plant: Plant, settings: SynthesisSettings) -> tuple[int, ...]:
     return degrees
 
 
-def _mean(candidate: Candidate | None) -> float:
+def _mean(candidate: BarrierCandidate | None) -> float:
     return -1.0 if candidate is None else candidate.mean
