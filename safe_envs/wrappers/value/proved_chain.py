@@ -28,6 +28,7 @@ class ProvedChain:
         small: the problem.
         leaving: see `ValueSettings`.
         grid: of its coordinates.
+        refined: see `ProvedSmoothing`.
 
     Attributes:
         grid: the grid.
@@ -39,7 +40,7 @@ class ProvedChain:
         ConfigurationError: Nothing can be proved of such a problem.
     """
 
-    def __init__(self, small: ReducedProblem, leaving: str, grid: Grid) -> None:
+    def __init__(self, small: ReducedProblem, leaving: str, grid: Grid, refined: int = 1) -> None:
         _require_provable(small, grid)
         self.grid, self.step, self.box = grid, Step(small), small.box
         for axis, blur in zip(grid.axes, self.step.blur, strict=True):
@@ -49,7 +50,7 @@ class ProvedChain:
                     f" {axis.period:g}; tables are checked up to {_WIDEST:g} periods"
                 )
         self.sets = ProvedSets(small, leaving, grid, self.step.blur)
-        self._smoothing = ProvedSmoothing(grid, self.step.blur)
+        self._smoothing = ProvedSmoothing(grid, self.step.blur, refined)
         self._weights = ProvedWeights(self.step.noise)
 
     def ahead(self, values: np.ndarray, counts: np.ndarray, sign: int) -> Bordered:
@@ -71,7 +72,7 @@ class ProvedChain:
 
         Args:
             ends: least and largest coordinates, n arrays (B,) each.
-            inputs: boxes of inputs, shape (U, m, 2).
+            inputs: boxes of inputs, shape (U, m, 2), or (B, U, m, 2) with others for each box.
         """
         return ProvedImages(self.step, self._smoothing.means, ends, inputs, self.sets.widening)
 

@@ -58,14 +58,22 @@ class ProvedSmoothing:
     Args:
         grid: of the values.
         blur: standard deviation of the noise along each axis, to `SIZE_ERROR` of it; 0 for none.
+        refined: parts of a cell of the means along each axis with noise. Bounds for several of them
+            are closer than one for all.
 
     Attributes:
         means: the grid of means.
         beyond: chance to reach the grid from means outside of that of the means, at most.
     """
 
-    def __init__(self, grid: Grid, blur: Sequence[float]) -> None:
-        self.means = Smoothing(grid, blur).means
+    def __init__(self, grid: Grid, blur: Sequence[float], refined: int = 1) -> None:
+        axes = Smoothing(grid, blur).means.axes
+        self.means = Grid(
+            tuple(
+                axis.refined(refined) if size else axis
+                for axis, size in zip(axes, blur, strict=True)
+            )
+        )
         self._shape = grid.shape
         self._blocks = [
             (i, bool(axis.period), _blocks(axis, self.means.axes[i], size))

@@ -79,7 +79,8 @@ class ProvedImages:
         means: grid of the means.
         low: least coordinates of the boxes, n arrays (B,).
         high: largest coordinates.
-        inputs: boxes of inputs, shape (U, m, 2), from which those of a box are taken by number.
+        inputs: boxes of inputs, shape (U, m, 2), or (B, U, m, 2) with others for each box, from
+            which they are taken by number.
         widening: of images along each axis.
     """
 
@@ -93,7 +94,8 @@ class ProvedImages:
     ) -> None:
         self._means, self._inputs, self._widening = means, inputs, widening
         self._affine = step.is_affine
-        self._images: StepImages = step.images(*ends, inputs[None])
+        given = inputs if inputs.ndim == 4 else inputs[None]
+        self._images: StepImages = step.images(*ends, given)
         self.shape = (self._images.images.shape[2], self._images.images.shape[3])
 
     def windows(self, numbers: np.ndarray, chosen: np.ndarray) -> Windows:
@@ -108,12 +110,16 @@ class ProvedImages:
         own = images[numbers, 0] if self._affine else images[numbers, chosen]
         low, high = own[..., 0], own[..., 1]
         if self._affine:
-            low, high = self._moved(low, high, effects[numbers], self._inputs[chosen])
+            low, high = self._moved(low, high, effects[numbers], self._inputs_of(numbers, chosen))
         if any(self._widening):
             strip = np.asarray(self._widening)
             low = low - (strip + 2.0 * _UNIT * np.abs(low))
             high = high + (strip + 2.0 * _UNIT * np.abs(high))
         return windows_of(self._means, low.reshape(-1, n), high.reshape(-1, n))
+
+    def _inputs_of(self, numbers: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        own = self._inputs.ndim == 4
+        return self._inputs[numbers, chosen] if own else self._inputs[chosen]
 
     @staticmethod
     def _moved(

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from safe_envs.wrappers.value.proved_chain import ProvedChain
 from safe_envs.wrappers.value.proved_sweeps import Deficit, Progress, ProvedSweeps
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.table import ValueTable
+from safe_envs.wrappers.value.table_files import load_table
 
 TOLERANCE = 1e-6
 """Largest e_k of a table that is not refused."""
@@ -100,6 +102,31 @@ def check_table(
         assumed="" if problem.frame is None or small.note else "the frame that is declared",
         seconds=time.perf_counter() - begun,
     )
+
+
+def check_table_file(
+    path: Path | str,
+    problem: SafetyProblem,
+    upper: bool = True,
+    progress: Progress | None = None,
+) -> TableCheck:
+    """Prove the envelopes of a table in a file; see `check_table`.
+
+    Args:
+        path: of the file.
+        problem: whose values it holds.
+        upper: whether the upper envelope is checked as well.
+        progress: called with the part of the work that is done.
+
+    Returns:
+        What is to be taken off the lower envelope, and added to the upper one.
+
+    Raises:
+        ValueFileError: The file is damaged, or holds no table of the problem.
+        TableRefusedError: An inequality fails on a cell by more than `TOLERANCE`.
+        ConfigurationError: Such tables are not checked.
+    """
+    return check_table(load_table(path, problem), problem, upper, progress)
 
 
 def _required(envelope: str, found: list[Deficit], table: ValueTable) -> list[float]:

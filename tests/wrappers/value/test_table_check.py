@@ -14,7 +14,8 @@ from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.wrappers.value import table_check
 from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.proved_starts import ProvedStarts
-from safe_envs.wrappers.value.table_check import TableRefusedError, check_table
+from safe_envs.wrappers.value.table_check import TableRefusedError, check_table, check_table_file
+from safe_envs.wrappers.value.table_files import save_table
 from tests.wrappers.value.systems import scalar, solved, u, x, y
 
 
@@ -148,6 +149,16 @@ def test_a_grid_that_misses_safe_states_has_no_upper_envelope():
     )
     cut = replace(table, grid=grid, lower=0 * table.lower[:, :-4], upper=table.upper[:, :-4])
     assert "outside of the grid" in check_table(cut, problem).unchecked
+
+
+def test_a_file_is_checked(tmp_path):
+    problem = scalar()
+    table = solved(problem, 20, inputs=3)
+    save_table(table, tmp_path / "table.npz")
+    found = check_table_file(tmp_path / "table.npz", problem)
+    assert replace(found, seconds=0) == replace(check_table(table, problem), seconds=0)
+    with pytest.raises(ConfigurationError, match=r"table\.npz"):
+        check_table_file(tmp_path / "table.npz", scalar(s=0.5))
 
 
 def test_other_problems_and_tables_are_refused():
