@@ -90,11 +90,11 @@ def print_best(console: Console, answer: BestAnswer) -> None:
             "Note: this grid is too coarse to say anything; the shorter the control period, the"
             " narrower cells have to be. More of them are asked for by --cells.",
         )
-    for line in _word_lines(found):
+    for line in _word_lines(found, problem):
         say(console, line)
 
 
-def _word_lines(found: AttainableSafety) -> list[str]:
+def _word_lines(found: AttainableSafety, problem: SafetyProblem) -> list[str]:
     """Return what kind of bounds the ends are."""
     check = found.check
     if check is None:
@@ -111,6 +111,8 @@ def _word_lines(found: AttainableSafety) -> list[str]:
     lines = [told]
     if not both:
         lines.append(f"Note: upper is {COMPUTED}, and not checked: {check.unchecked}.")
+    if problem.starts[problem.start].uniforms:
+        lines.append("Note: the mean over the starts is from drawn ones, and holds with 99.99 %.")
     if check.assumed:
         lines.append(
             f"Note: taken for granted is {check.assumed}, which is checked at random states."

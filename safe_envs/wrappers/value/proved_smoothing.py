@@ -164,6 +164,7 @@ def _unrolled(axis: Axis, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     turns = axis.period * np.arange(-copies, copies + 1)
     edges = (axis.edges[:-1] + turns[:, None]).ravel()
     numbers = np.tile(np.arange(axis.count), len(turns))
-    # The period is the float next to the true one; a turn's last edge is the next one's first.
+    # The period is the float next to the true one; a turn's last edge is the next one's first. What
+    # lies between the two is narrower than these errors, also for means.
     errors = 4.0 * _UNIT * (np.abs(edges) + axis.period * (copies + 1))
     return edges, numbers, errors

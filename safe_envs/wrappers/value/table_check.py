@@ -86,6 +86,13 @@ def check_table(
         raise ConfigurationError(
             f"the table has {table.steps} steps, and {problem.name} has {small.steps}"
         )
+    for values in (table.lower, table.upper):
+        # NaN is not <= 1.
+        if values.shape[1] != table.grid.cells or not (values.min() >= 0.0 and values.max() <= 1.0):
+            raise TableRefusedError(
+                f"the table of {table.problem} is refused: its values are not in [0, 1], one for"
+                " each cell; compute it again"
+            )
     sweeps = ProvedSweeps(table, ProvedChain(small, settings.leaving, table.grid))
     share = 0.5 if upper else 1.0
     losses = _required("lower", sweeps.lower(_scaled(progress, 0.0, share)), table)

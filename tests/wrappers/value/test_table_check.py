@@ -70,51 +70,39 @@ def _inner(values: np.ndarray, sign: int) -> tuple[int, int]:
     return k, int(cells[len(cells) // 2])
 
 
-def exact_deficits(table, low_of_c: float) -> list[Any]:
-    """Return e_k of dx = u dt + .4 dW with steps of .1, C = (low_of_c, 2), cell by cell."""
+def exact_deficit(table, cell: int, low_of_c: float) -> Any:
+    """Return L_0 - max E L_1 on a cell of dx = u dt + .4 dW with steps of .1, C = (low_of_c, 2)."""
     with mpmath.workdps(30):
-        axis = table.grid.axes[0]
-        edges = [mpmath.mpf(float(e)) for e in axis.edges]
-        counts = [e >= low_of_c for e in edges[:-1]]
+        edges = [mpmath.mpf(float(e)) for e in table.grid.axes[0].edges]
+        values = [
+            mpmath.mpf(float(value)) * (e >= low_of_c)
+            for value, e in zip(table.lower[1], edges[:-1], strict=True)
+        ]
         step, size = mpmath.mpf(0.1), mpmath.mpf(0.4) * mpmath.sqrt(mpmath.mpf(0.1))
-
-        def least(values, low, high):
+        bounds = []
+        for u in map(float, table.inputs[:, 0]):
+            low, high = (edges[i] + step * u for i in (cell, cell + 1))
             total, last = mpmath.mpf(0), mpmath.mpf(0)
             for value, e in zip([*values, 0], edges, strict=True):
                 rise = value - last
                 total += rise * mpmath.ncdf(((low if rise > 0 else high) - e) / size)
                 last = value
-            return total
-
-        found = []
-        for k in range(len(table.lower) - 1):
-            values = [
-                mpmath.mpf(float(v)) * c for v, c in zip(table.lower[k + 1], counts, strict=True)
-            ]
-            short = [mpmath.mpf(0)]
-            for i, wanted in enumerate(table.lower[k]):
-                if wanted > 0 and counts[i]:
-                    bounds = [
-                        least(values, edges[i] + step * a, edges[i + 1] + step * a)
-                        for a in map(mpmath.mpf, map(float, table.inputs[:, 0]))
-                    ]
-                    short.append(mpmath.mpf(float(wanted)) - max(bounds))
-            found.append(max(short))
-        return found
+            bounds.append(total)
+        return mpmath.mpf(float(table.lower[0, cell])) - max(bounds)
 
 
 def test_deficits_are_no_less_than_those_of_exact_arithmetic(monkeypatch):
     monkeypatch.setattr(table_check, "TOLERANCE", 1.0)
     problem = scalar(barriers=x - sp.Rational(1, 64), horizon=0.2)
-    table = solved(problem, 30, inputs=3)
+    table = solved(problem, 200, inputs=3)
     lower = np.array(table.lower)
-    lower[0, 10:13] += np.float32(0.25)
-    true = exact_deficits(replace(table, lower=lower), 1 / 64)
-    found = check_table(replace(table, lower=lower), problem, upper=False)
-    assert true[0] > 0.1
-    assert true[1] == 0
-    # The means' grid loses a little besides.
-    assert sum(true) <= found.lower <= 0.2500002
+    cell = int(np.abs(lower[0] - 0.5).argmin())
+    lower[0, cell] += np.float32(0.25)
+    raised = replace(table, lower=lower)
+    true, found = exact_deficit(raised, cell, 1 / 64), check_table(raised, problem, upper=False)
+    # The means' grid loses a little besides, and so did the table.
+    assert 0.15 < true <= found.lower < 0.2500002
+    assert found.lower - true == pytest.approx(-exact_deficit(table, cell, 1 / 64), abs=1e-6)
 
 
 def test_starts_are_certified_by_a_proved_step_of_look_ahead():
@@ -181,6 +169,11 @@ def test_other_problems_and_tables_are_refused():
     )
     with pytest.raises(ConfigurationError, match=r"known in advance \(y\)"):
         check_table(solved(moving, 20, inputs=3), moving)
+    for value in (1.5, np.nan, -0.5):
+        upper = np.array(table.upper)
+        upper[-1, 3] = value
+        with pytest.raises(TableRefusedError, match="not in"):
+            check_table(replace(table, upper=upper), problem)
     short = replace(table, first=0, lower=table.lower[1:], upper=table.upper[1:])
     with pytest.raises(ConfigurationError, match="steps"):
         check_table(short, problem)
