@@ -31,6 +31,7 @@ from safe_envs.wrappers.value.proved_steps import ProvedImages
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.smoothing import rounded_down
+from safe_envs.wrappers.value.starts import draw_starts, margin
 from safe_envs.wrappers.value.step_images import Step
 from safe_envs.wrappers.value.suitable_grid import suitable_grid
 
@@ -40,6 +41,7 @@ _PARTS = 4
 _REFINED = 4
 """Parts of a cell of the means along each axis."""
 
+_STARTS = 20_000
 _AT_ONCE = 4_000_000
 
 
@@ -79,6 +81,19 @@ class ClosedLoopTable:
             bound = self.chain.bounds(ahead, images, np.arange(len(found)), chosen)
             found = np.minimum(found, bound)
         return np.where(inside, found, 0.0).clip(0.0, 1.0)
+
+    def mean_over_starts(self, problem: SafetyProblem, seed: int = 0) -> float:
+        """Return a lower bound of the probability of a safe episode from the problem's starts.
+
+        It is certified where all episodes begin in one state; where starts are drawn, it holds with
+        99.99 % for the draw.
+
+        Args:
+            problem: with the starts.
+            seed: of the starts that are drawn.
+        """
+        found = self.start_bounds(draw_starts(problem, _STARTS, seed))
+        return max(0.0, float(found.mean()) - margin(found))
 
 
 def closed_loop_table(

@@ -72,7 +72,7 @@ def start_values(
     count = next((n for most, n in _STARTS.items() if boxes <= most), _FEWEST)
     x = draw_starts(problem, min(count, most or count), seed)
     lower, upper = look_ahead.start_bounds(x)
-    below, above = _margin(lower), _margin(upper)
+    below, above = margin(lower), margin(upper)
     return StartValues(
         max(0.0, float(lower.mean()) - below),
         min(1.0, float(upper.mean()) + above),
@@ -117,8 +117,12 @@ def draw_starts(problem: SafetyProblem, count: int, seed: int) -> Components:
     )
 
 
-def _margin(values: np.ndarray) -> float:
-    """Return how far the mean of all values in [0, 1] may be from that of a sample, one-sided."""
+def margin(values: np.ndarray) -> float:
+    """Return how far the mean of all values in [0, 1] may be from that of a sample, one-sided.
+
+    Args:
+        values: of the sample, shape (n,).
+    """
     n = len(values)
     if n == 1:
         return 0.0

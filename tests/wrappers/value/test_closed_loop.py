@@ -58,6 +58,7 @@ def test_two_coordinates():
     points = (np.array([0.0, 0.3]), np.array([0.0, -0.4]))
     assert (anything.start_bounds(points) <= nominal.start_bounds(points)).all()
     assert anything.start_bounds(points).min() > 0.9
+    assert 0.3 < nominal.mean_over_starts(problem) < nominal.lower[0].max()
 
 
 def test_several_inputs_are_refused():

@@ -16,7 +16,7 @@ from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.proved_starts import ProvedStarts
 from safe_envs.wrappers.value.table_check import TableRefusedError, check_table, check_table_file
 from safe_envs.wrappers.value.table_files import save_table
-from tests.wrappers.value.systems import scalar, solved, u, x, y
+from tests.wrappers.value.systems import quadrature, scalar, solved, u, x, y
 
 
 def plane(sigma=((0.3, 0), (0, 0.2)), **options):
@@ -116,6 +116,20 @@ def test_starts_are_certified_by_a_proved_step_of_look_ahead():
     assert (certified[1] >= computed[1] - 1e-7).all()
     assert np.abs(np.array(certified) - computed).max() < 1e-6
     assert (certified[0][starts[0] ** 2 + starts[1] ** 2 > 0.9] == 0).all()
+
+
+@pytest.mark.parametrize("drift", [0, sp.sin(3 * x)])
+def test_certified_bounds_are_around_the_value(drift):
+    problem = scalar(drift)
+    table = solved(problem, 160, inputs=5)
+    q, exact = quadrature(problem, np.linspace(-1, 1, 5), (0.0, 2.0))
+    _, most = quadrature(problem, np.linspace(-1, 1, 33), (0.0, 2.0))
+    look = LookAhead(table, problem)
+    proved = ProvedStarts(table, problem, check_table(table, problem), look)
+    lower, upper = proved.start_bounds((q,))
+    assert (lower <= exact[0] + 1e-9).all()
+    assert (upper >= most[0] - 1e-9).all()
+    assert (upper - lower).mean() < 0.1
 
 
 def test_an_upper_envelope_is_not_checked_where_it_cannot_be():
