@@ -210,7 +210,7 @@ class _Numbers:
             statement: with the claim.
             tolerance: by how much it may be too large.
         """
-        return self.bound(statement, sp.Max(0, -statement.claim), tolerance)
+        return self.bound(statement, sp.Max(0, -statement.claim, evaluate=False), tolerance)
 
     def without_bound(self) -> HeldBound:
         """Return a bound that says why there is none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
@@ -17,6 +17,9 @@ from safe_envs.wrappers.certificates.certificate import Plant
 from safe_envs.wrappers.certificates.gaussian_moments import Order
 from safe_envs.wrappers.certificates.held_step import HeldStep
 from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
+
+_NEAR = 0.05
+"""Distance from the edge of C, in half widths of B, within which the slope of psi is of use."""
 
 
 @dataclass
@@ -80,7 +83,7 @@ class HeldStatements:
         Where h <= 0, psi <= psi - l h for any l >= 0. With l the slope of psi across the edge of C,
         which is chosen on each box, this does not change across the edge.
         """
-        states, box, parts = self.plant.states, self.box, self._parts(self.value)
+        states, box, parts = self.plant.states, self.box, self._own
         found = []
         for barrier in self.plant.barriers:
             slope: Any = sp.Dummy("slope", real=True)
@@ -104,13 +107,20 @@ class HeldStatements:
                     found.append(Statement(name, states, slab, -self.value, polynomials=parts))
         return found
 
-    def region(self, name: str, claim: Any, further: tuple[sp.Symbol, ...] = ()) -> Statement:
+    def region(
+        self,
+        name: str,
+        claim: Any,
+        further: tuple[sp.Symbol, ...] = (),
+        polynomials: Mapping[sp.Symbol, PolynomialPart] | None = None,
+    ) -> Statement:
         """Return a statement about G, where psi and all h are above 0 in B and in the workspace.
 
         Args:
             name: in words.
             claim: that is to be at least 0.
             further: symbols that take all values: inputs, or `scaled_input`.
+            polynomials: what symbols in the claim stand for, if others than `value` do.
         """
         plant = self.plant
         ends = {self.scaled_input: (sp.Integer(-1), sp.Integer(1))}
@@ -122,7 +132,7 @@ class HeldStatements:
             (*self.kept_box, *(ends[symbol] for symbol in further)),
             claim,
             positive=positive,
-            polynomials=self._parts(claim, *positive),
+            polynomials=self._own if polynomials is None else polynomials,
         )
 
     def step_claims(self, shortfall: Any, sag: Any) -> list[Statement]:
@@ -138,7 +148,8 @@ class HeldStatements:
         """
         if self.plant.policy:
             gain = self.step.gain(self.plant.policy, self.symbol_of)
-            return [self.region("E psi(X') >= psi - m along the policy", gain + shortfall)]
+            name = "E psi(X') >= psi - m along the policy"
+            return [self.region(name, gain + shortfall, polynomials=self.polynomials)]
         by_input = self.step.gain_by_input(self.symbol_of)
         ends = [sum(c * v**j for j, c in enumerate(by_input)) for v in (-1, 1)]
         v = self.scaled_input
@@ -147,8 +158,17 @@ class HeldStatements:
             c * sum(v ** (2 * k + j % 2) for k in range(j // 2)) for j, c in enumerate(by_input)
         )
         return [
-            self.region("E psi(X') >= psi - m at an end of the bounds", sp.Max(*ends) + shortfall),
-            self.region("E psi(X') above its chord over the bounds", above + sag, (v,)),
+            self.region(
+                "E psi(X') >= psi - m at an end of the bounds",
+                sp.Max(*ends, evaluate=False) + shortfall,
+                polynomials=self.polynomials,
+            ),
+            self.region(
+                "E psi(X') above its chord over the bounds",
+                above + sag,
+                (v,),
+                polynomials=self.polynomials,
+            ),
         ]
 
     def moves(self) -> list[tuple[Statement, Any]]:
@@ -163,9 +183,9 @@ class HeldStatements:
             found.append((self.region("the mean of X'", sp.Integer(0), further), away))
         return found
 
-    def _parts(self, *expressions: Any) -> dict[sp.Symbol, PolynomialPart]:
-        symbols = set().union(*(sp.sympify(e).free_symbols for e in expressions))
-        return {symbol: part for symbol, part in self.polynomials.items() if symbol in symbols}
+    @property
+    def _own(self) -> dict[sp.Symbol, PolynomialPart]:
+        return {self.value: self.polynomials[self.value]}
 
 
 def _slope_across(psi: Polynomial, barrier: Any) -> Callable[[np.ndarray], np.ndarray]:
@@ -173,6 +193,7 @@ def _slope_across(psi: Polynomial, barrier: Any) -> Callable[[np.ndarray], np.nd
     slopes = [sp.diff(barrier, s) for s in psi.states]
     values = compile_function(psi.states, [sp.N(e, 17) for e in (barrier, *slopes)], "arrays")
     gradient = [psi.derivative(i) for i in range(psi.n)]
+    reach = _NEAR * float(min(psi.scale))
 
     def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found = stacked(values(*np.ascontiguousarray(x.T)), len(x))
@@ -180,12 +201,17 @@ def _slope_across(psi: Polynomial, barrier: Any) -> Callable[[np.ndarray], np.nd
         return h, slopes, (slopes**2).sum(axis=1) + 1e-300
 
     def slope(x: np.ndarray) -> np.ndarray:
+        h, edge = at(x)[0], x
         # Two steps of Newton's method lead to the edge, where psi and h are near 0 together.
         for _ in range(2):
-            h, slopes, square = at(x)
-            x = x - slopes * (h / square)[:, None]
-        _, slopes, square = at(x)
-        across = sum(p.values(x) * slopes[:, i] for i, p in enumerate(gradient)) / square
-        return np.nan_to_num(np.maximum(across, 0.0), posinf=0.0)[:, None]
+            level, slopes, square = at(edge)
+            edge = edge - slopes * (level / square)[:, None]
+        _, slopes, square = at(edge)
+        across = sum(p.values(edge) * slopes[:, i] for i, p in enumerate(gradient)) / square
+        # Below the edge no more than what keeps psi - l h below 0, and nothing farther away.
+        with np.errstate(all="ignore"):
+            across = np.where(h < 0.0, np.minimum(across, psi.values(x) / h), across)
+        near = np.maximum(0.0, 1.0 - np.abs(h) / np.sqrt(square) / reach)
+        return np.nan_to_num(near * np.maximum(across, 0.0), posinf=0.0)[:, None]
 
     return slope
