@@ -23,7 +23,7 @@ def polynomial(degree: int, size: int) -> Polynomial:
     return Polynomial((X, Y), center, scale, dict(zip(keys, values, strict=True)))
 
 
-def exact(p: Polynomial, order: tuple[int, int], x: Fraction, y: Fraction) -> Fraction:
+def exact(p: Polynomial, order: tuple[int, ...], x: Fraction, y: Fraction) -> Fraction:
     for i, times in enumerate(order):
         for _ in range(times):
             p = p.derivative(i)

@@ -104,7 +104,7 @@ def test_second_order_term_of_a_known_case() -> None:
         (X,),
         ((-sp.oo, sp.oo),),
         (U,),
-        ((-1, 1),),
+        ((sp.Integer(-1), sp.Integer(1)),),
         (sp.Integer(0),),
         ((sp.Integer(1),),),
         ((s,),),
