@@ -55,7 +55,7 @@ class Statement:
         zeros: 0 in the region, or not continuous: there the sign may change without a zero.
         smooth: to be twice continuously differentiable.
         continuous: to be continuous, and so to have a value.
-        polynomials: what symbols in the expressions stand for.
+        polynomials: what symbols in the expressions stand for, of some or all of the states.
         witnesses: symbols that may be chosen on each box, such as an input that meets a claim.
         witness: which chooses them.
     """
@@ -144,7 +144,11 @@ class StatementProgram:
         with np.errstate(all="ignore"):
             found = dict(zip(s.states, variables(low, high), strict=True))
             for expanded, symbols, orders in self._parts:
-                found.update(zip(symbols, expanded.forms(low, high, orders), strict=True))
+                own = [s.states.index(state) for state in expanded.polynomial.states]
+                forms = expanded.forms(low[own], high[own], orders)
+                if own != list(range(self._n)):
+                    forms = [_placed(form, own, self._n) for form in forms]
+                found.update(zip(symbols, forms, strict=True))
             if s.witness is not None:
                 middle = np.nan_to_num(0.5 * low + 0.5 * high).T
                 chosen = np.asarray(s.witness(middle), dtype=float).T
@@ -188,6 +192,13 @@ def _by_polynomial(
         symbols.append(symbol)
         orders.append(part.order)
     return list(groups.values())
+
+
+def _placed(form: Form, own: list[int], n: int) -> Form:
+    """Return the form over n states of a function of some of them."""
+    slopes = np.zeros((n, form.slopes.shape[1]))
+    slopes[own] = form.slopes
+    return form._replace(slopes=slopes)
 
 
 def _broadcast(form: Form, n: int, boxes: int) -> Form:
