@@ -38,8 +38,8 @@ ROW_KEYS = [
     "curve",
     "withheld",
     "outside_rate",
-    "estimated_bound",
-    "bound_note",
+    "continuous_bound",
+    "continuous_note",
     "posterior_bound",
     "learning",
 ]
@@ -354,8 +354,8 @@ def test_bounds_are_shown_where_there_are_any():
 
     bounded = printed(
         {},
-        {"estimated_bound": None, "bound_note": "it ignores the noise"},
-        {"estimated_bound": 0.492, "bound_note": ""},
+        {"continuous_bound": None, "continuous_note": "it ignores the noise"},
+        {"continuous_bound": 0.492, "continuous_note": ""},
     )
     lines = {
         line.split()[0]: line
@@ -369,8 +369,10 @@ def test_bounds_are_shown_where_there_are_any():
     assert "Note: no bound for hocbf: it ignores the noise\n" in bounded
     assert bounded.count("no bound for") == 1
     assert bounded.count("Note: a bound is estimated: ") == 1
-    nothing = {"estimated_bound": None, "bound_note": "it ignores the noise"}
-    below = printed({}, nothing, vars(judged(replace(answer.rows[2], estimated_bound=0.999), 0.98)))
+    nothing = {"continuous_bound": None, "continuous_note": "it ignores the noise"}
+    below = printed(
+        {}, nothing, vars(judged(replace(answer.rows[2], continuous_bound=0.999), 0.98))
+    )
     assert (
         "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below"
         " 99.9 %" in below

@@ -1,4 +1,6 @@
-"""The bounds of a filter, averaged over starts, unless the episodes contradict them."""
+"""The bounds of a filter for continuous control, averaged over starts, unless the episodes
+contradict them.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.contradiction import by_states, withheld
-from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
+from safe_envs.agents.evaluation.contradiction import by_states, without_continuous
+from safe_envs.agents.evaluation.rows import BoundSummary, ContinuousWord, PosteriorSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.statistics import share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
@@ -18,6 +20,7 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
+from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
 
@@ -26,7 +29,9 @@ _SIZES = ("delta", "supremum", "shortfall", "bias")
 
 
 class GuaranteeAverager:
-    """The estimated bound on P(safe up to the horizon) of conditions, averaged over the starts.
+    """The bound on P(safe up to the horizon) of conditions, averaged over the starts.
+
+    It is of conditions that are met at every instant.
 
     For conditions that are robust over a posterior it is a bound of its own; see
     `safe_envs.wrappers.verification.posterior_guarantee`.
@@ -65,7 +70,7 @@ class GuaranteeAverager:
     ) -> None:
         try:
             self._found = guarantee_of(problem, conditions, knowledge)
-            self._why_none = self._found.note
+            self._why_none = self._found.note or _refuted(self._found) or None
         except SafeEnvsError as error:
             # The search covers the whole safe set, where the episodes may never be.
             self._why_none = str(error)
@@ -90,15 +95,19 @@ class GuaranteeAverager:
         """
         bound, note = self._mean()
         found = BoundSummary(
-            outside_rate=share(self._lost, self._starts), estimated_bound=bound, bound_note=note
+            outside_rate=share(self._lost, self._starts),
+            continuous_bound=bound,
+            continuous_word=self._word if bound is not None else "none",
+            continuous_note=note,
         )
         if self._of_posterior:
             of_posterior = isinstance(self._found, PosteriorGuarantee)
             sizes = {name: getattr(self._found, name) for name in _SIZES} if of_posterior else {}
             found = replace(
                 found,
-                estimated_bound=None,
-                bound_note="the condition is learned: see its bound over the posterior",
+                continuous_bound=None,
+                continuous_word="none",
+                continuous_note="the condition is learned: see its bound over the posterior",
                 posterior_bound=PosteriorSummary(bound, note, **sizes),
             )
         reason = (
@@ -106,17 +115,38 @@ class GuaranteeAverager:
             if bound is None or self._found is None
             else self._against or by_states(self._found, [visited])
         )
-        return withheld(found, reason) if reason else found
+        return without_continuous(found, reason) if reason else found
+
+    @property
+    def _word(self) -> ContinuousWord:
+        """What the bound is worth."""
+        found = self._found
+        proved = isinstance(found, ChainGuarantee) and found.word == "proved"
+        return "proved" if proved else "estimated"
 
     def _mean(self) -> tuple[float | None, str | None]:
         if self._found is None or self._why_none:
             return None, self._why_none
         mean, remark = share(self._total.total, self._count), self._found.remark
-        return (
-            (mean, remark)
-            if mean
-            else (None, remark or "it is 0 at these starts up to this horizon")
-        )
+        if not mean:
+            return None, remark or "it is 0 at these starts up to this horizon"
+        return mean, "; ".join(filter(None, [remark, _undecided(self._found)]))
+
+
+def _refuted(found: Guarantee) -> str:
+    """Return what the judge refutes of a bound; "" if nothing."""
+    if found.note or not isinstance(found, ChainGuarantee):
+        return ""
+    word, reason = found.proof.word_of(any(found.stages.shortfalls))
+    return reason * (word == "refuted")
+
+
+def _undecided(found: Guarantee) -> str:
+    """Return what the judge leaves undecided of a bound; "" if nothing."""
+    if not isinstance(found, ChainGuarantee):
+        return ""
+    word, reason = found.proof.word_of(any(found.stages.shortfalls))
+    return f"undecided: {reason}" * (word == "undecided")
 
 
 def _outside_of(
@@ -179,4 +209,4 @@ def together(summaries: Sequence[BoundSummary]) -> BoundSummary:
         if key == "probability" or all(getattr(c, key) is not None for c in found)
     }
     merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, **mean))
-    return withheld(merged, reason) if reason else merged
+    return without_continuous(merged, reason) if reason else merged

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from safe_envs.agents.evaluation.safety_curve import Curve
+
+HeldWord = Literal["proved", "certified", "computed", "withheld", "none"]
+"""What a bound for the env's own steps is worth: the judge proved it; it is of a table that was
+checked by outward-rounded arithmetic; it is of a table of floating-point numbers; episodes or a
+table contradict it; or there is none."""
+
+ContinuousWord = Literal["proved", "estimated", "withheld", "none"]
+"""What a bound for continuous control is worth: the judge proved all hypotheses and numbers; it
+left one undecided, which a search did not find to fail; episodes contradict it; or there is
+none."""
 
 
 @dataclass(frozen=True)
@@ -150,19 +160,34 @@ class PosteriorSummary:
 class BoundSummary:
     """The bounds of a filter, averaged over starts, unless the episodes contradict them.
 
+    They are two claims: one is of the env's own steps, where the input is held between control
+    instants, and one of conditions that are met at every instant.
+
     Attributes:
         withheld: how the episodes contradict a bound, which is withheld then.
-        outside_rate: share of the starts in the safe set outside the sets C_j, which no bound
-            covers; None without a filter, and where the sets are not known.
-        estimated_bound: on the probability of being safe; None where there is none.
-        bound_note: why there is none, or why it is weak.
+        outside_rate: share of the starts in the safe set outside the sets C_j, which no bound of
+            continuous control covers; None without a filter, and where the sets are not known.
+        held_bound: on the probability of being safe in the env's own steps; None where there is
+            none.
+        held_word: what it is worth.
+        held_note: what it is of, or why there is none.
+        held_error: its standard error as the mean over all starts; 0 for one start.
+        continuous_bound: on the probability of being safe in continuous control; None where there
+            is none.
+        continuous_word: what it is worth.
+        continuous_note: why there is none, or why it is weak or not proved.
         posterior_bound: that over the posterior; None where the filter is not robust over one.
     """
 
     withheld: str | None = None
     outside_rate: float | None = None
-    estimated_bound: float | None = None
-    bound_note: str | None = None
+    held_bound: float | None = None
+    held_word: HeldWord = "none"
+    held_note: str | None = None
+    held_error: float = 0.0
+    continuous_bound: float | None = None
+    continuous_word: ContinuousWord = "none"
+    continuous_note: str | None = None
     posterior_bound: PosteriorSummary | None = None
 
 

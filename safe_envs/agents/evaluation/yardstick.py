@@ -26,7 +26,9 @@ from safe_envs.agents.evaluation.attainable import (
     attainable_safety,
     contradicted,
     of_table,
+    withheld,
 )
+from safe_envs.agents.evaluation.contradiction import Bounded, above_attainable, without_held
 from safe_envs.agents.evaluation.countings import leaves_safely
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
@@ -131,6 +133,47 @@ def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> Attai
     """
     judging = [r for r in rows if r.learning is None or r.learning.repeats == 1]
     return contradicted(best, [(row.filter, row.safe, row.episodes) for row in judging])
+
+
+def chained(
+    best: AttainableSafety | None, rows: Sequence[EvaluationRow]
+) -> tuple[AttainableSafety | None, list[EvaluationRow]]:
+    """Return what stands in the chain bound <= rate <= attainable, without what contradicts it.
+
+    Where a bound for the env's own steps is above the attainable upper bound, a table is wrong: the
+    attainable safety is withheld, and so is a bound that is only computed.
+
+    Args:
+        best: attainable safety, if it is known.
+        rows: of an evaluation.
+    """
+    if best is None:
+        return None, list(rows)
+    upper, found = best.upper, []
+    best = held_against(best, rows)
+    for row in rows:
+        best, judged = against_attainable(best, upper, row.filter, row)
+        found.append(judged)
+    return best, found
+
+
+def against_attainable(
+    best: AttainableSafety, upper: float | None, name: str, row: Bounded
+) -> tuple[AttainableSafety, Bounded]:
+    """Return both without what contradicts the other; see `chained`.
+
+    Args:
+        best: attainable safety, maybe withheld by now.
+        upper: its upper end.
+        name: of the filter.
+        row: with its bounds.
+    """
+    reason = above_attainable(row, upper)
+    if not reason:
+        return best, row
+    if best.upper is not None:
+        best = withheld(best, f"{name}: {reason}")
+    return best, without_held(row, reason) if row.held_word == "computed" else row
 
 
 def best_document(

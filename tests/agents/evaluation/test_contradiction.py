@@ -65,17 +65,17 @@ def credulous(monkeypatch):
 def test_false_bounds_are_not_estimated(make, text, reason):
     (row,) = evaluate(make(), filters=text, episodes=40).rows
     assert row.safety_rate < 0.2
-    assert row.estimated_bound is None
-    assert row.bound_note.startswith(reason)
+    assert row.continuous_bound is None
+    assert row.continuous_note.startswith(reason)
 
 
 @pytest.mark.parametrize(("make", "text", "reason"), [(*case[:2], case[3]) for case in FALSE])
 @pytest.mark.usefixtures("credulous")
 def test_what_the_search_misses_the_episodes_contradict(make, text, reason):
     (row,) = evaluate(make(), filters=text, episodes=40).rows
-    assert row.estimated_bound is None
+    assert row.continuous_bound is None
     assert row.withheld.startswith(reason)
-    assert row.bound_note == f"withheld: {row.withheld}"
+    assert row.continuous_note == f"withheld: {row.withheld}"
 
 
 def test_margins_of_first_order_that_conflict_leave_no_bound():
@@ -83,7 +83,7 @@ def test_margins_of_first_order_that_conflict_leave_no_bound():
         false_bounds.corridor(), filters="cbf:alpha=10:sampling_margin=first-order", episodes=2
     ).rows
     assert (row.infeasible_rate, row.safe) == (1.0, 0)
-    assert (row.estimated_bound, row.bound_note) == (
+    assert (row.continuous_bound, row.continuous_note) == (
         None,
         "the shortfall of several conditions together is not established",
     )
@@ -160,7 +160,7 @@ def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
 
 def test_a_rate_with_a_smaller_period_withholds_too():
     (row,) = evaluate("Scalar-v0", filters="scbf", episodes=2, bounds=False).rows
-    row = replace(row, estimated_bound=0.5, bound_note="")
+    row = replace(row, continuous_bound=0.5, continuous_note="")
     finer = [
         SimpleNamespace(row=lambda name, high=high: SimpleNamespace(ci_high=high))
         for high in (0.6, 0.4)
@@ -187,7 +187,7 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
         nominal=-5,
     )
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
-    assert (row.estimated_bound, row.withheld) == (
+    assert (row.continuous_bound, row.withheld) == (
         pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3),
         None,
     )
@@ -203,14 +203,14 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
 def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, reason):
     assert reason in by_rate(bound, high)
     assert bool(by_rate(bound, high)) == bool(reason)
-    row = BoundSummary(estimated_bound=bound, bound_note="")
+    row = BoundSummary(continuous_bound=bound, continuous_note="")
     assert (judged(row, high) == row) == (not reason)
 
 
 def test_a_posterior_keeps_its_numbers_where_its_bound_is_withheld():
     bound = PosteriorSummary(0.9, "", delta=0.1)
-    row = BoundSummary(bound_note="learned", posterior_bound=bound)
+    row = BoundSummary(continuous_note="learned", posterior_bound=bound)
     found = judged(row, 0.2)
     note = f"withheld: {found.withheld}"
     assert found.posterior_bound == PosteriorSummary(None, note, delta=0.1)
-    assert found.bound_note == "learned"
+    assert found.continuous_note == "learned"

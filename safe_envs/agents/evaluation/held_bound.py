@@ -1,0 +1,153 @@
+"""Bounds for the env's own steps: the input is held, and safety is judged at control instants.
+
+Each is a lower bound on the probability of a safe episode of every policy under a filter, and is
+made by one of `MAKERS`, which know what filters are made of: a table of a promise filter, or a
+certificate of the step. What makes a new kind of bound is added there, and nowhere else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Literal, Protocol
+
+import numpy as np
+
+from safe_envs.agents.evaluation.contradiction import without_held
+from safe_envs.agents.evaluation.promise_bound import promise_bound
+from safe_envs.agents.evaluation.resolved import FilterParts
+from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.agents.evaluation.running_sum import RunningSum
+from safe_envs.agents.evaluation.spec import EvaluationSpec
+from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.problem.problem import SafetyProblem
+
+
+class HeldBound(Protocol):
+    """A lower bound on the probability of a safe episode, in the env's own steps."""
+
+    @property
+    def word(self) -> Literal["proved", "certified", "computed"]:
+        """What it is worth; see `safe_envs.agents.evaluation.rows.HeldWord`."""
+        ...
+
+    @property
+    def note(self) -> str:
+        """What it is of, in words."""
+        ...
+
+    @property
+    def why_none(self) -> str:
+        """Why there is none at any start; "" where there may be one."""
+        ...
+
+    @property
+    def nowhere(self) -> str:
+        """What to say where it is 0 at all starts."""
+        ...
+
+    def at(self, starts: np.ndarray) -> np.ndarray:
+        """Return the bound up to the problem's horizon at starts (B, n): values in [0, 1], (B,)."""
+        ...
+
+    def contradiction(self, visited: VisitedStates) -> str:
+        """Return how states of episodes contradict it; "" if they do not."""
+        ...
+
+
+Maker = Callable[[FilterParts, SafetyProblem, str], HeldBound | None]
+"""From what a filter is made of, a problem, and what the filter knows ("model" or "plant"), to its
+bound; None where such a bound is not for such filters."""
+
+MAKERS: tuple[Maker, ...] = (promise_bound,)
+"""All that makes such bounds, the best one first."""
+
+NO_FILTER = "there is no filter"
+NO_MAKER = "neither a table nor a certificate of the env's own step is known for it"
+_BETWEEN = "it is of control instants, not of the time between them"
+
+
+def held_bound_of(
+    parts: FilterParts,
+    problem: SafetyProblem,
+    knowledge: str,
+    makers: Sequence[Maker] | None = None,
+) -> HeldBound | str:
+    """Return the bound of a filter for the env's own steps, or why there is none.
+
+    Args:
+        parts: of the filter.
+        problem: what is simulated.
+        knowledge: of the filter, "model" or "plant".
+        makers: of bounds; by default all.
+    """
+    if not parts:
+        return NO_FILTER
+    made = (make(parts, problem, knowledge) for make in (MAKERS if makers is None else makers))
+    found = [bound for bound in made if bound is not None]
+    if not found:
+        return NO_MAKER
+    best = next((bound for bound in found if not bound.why_none), found[0])
+    return best.why_none or best
+
+
+class HeldAverager:
+    """Averages the bound of a filter for the env's own steps over the starts of episodes.
+
+    Args:
+        bound: of the filter, or why there is none.
+    """
+
+    def __init__(self, bound: HeldBound | str) -> None:
+        self._bound = bound
+        self._total, self._squares, self._count = RunningSum(), RunningSum(), 0
+
+    def add(self, starts: np.ndarray) -> None:
+        """Add the starts of a batch, shape (E, n)."""
+        if not isinstance(self._bound, str):
+            values = self._bound.at(starts)
+            self._total.add(values)
+            self._squares.add(values**2)
+            self._count += len(values)
+
+    def put_in(self, summary: BoundSummary, visited: VisitedStates) -> BoundSummary:
+        """Return a summary with the mean of the bound, or with why there is none.
+
+        Args:
+            summary: of the other bounds.
+            visited: states of the episodes; where they contradict the bound, it is withheld.
+        """
+        bound = self._bound
+        if isinstance(bound, str):
+            return replace(summary, held_note=bound)
+        if not self._count or not self._total.total:
+            return replace(summary, held_note=bound.nowhere)
+        reason = bound.contradiction(visited)
+        if reason:
+            return without_held(summary, reason)
+        mean, rest = self._total.total / self._count, max(self._count - 1, 1)
+        variance = max(self._squares.total - self._count * mean**2, 0.0) / rest
+        # What rounding leaves of the variance of equal values is none.
+        error = math.sqrt(variance / self._count) if variance > 1e-12 * mean**2 else 0.0
+        return replace(
+            summary, held_bound=mean, held_word=bound.word, held_note=bound.note, held_error=error
+        )
+
+
+def held_averager_of(
+    parts: FilterParts, problem: SafetyProblem, spec: EvaluationSpec, why_not: str | None
+) -> HeldAverager:
+    """Return what averages the bound of a filter for the env's own steps.
+
+    Args:
+        parts: of the filter.
+        problem: what is simulated.
+        spec: what is asked for.
+        why_not: why not to look for a bound at all, if so.
+    """
+    if parts and spec.monitoring == "continuous":
+        why_not = why_not or _BETWEEN
+    return HeldAverager(
+        why_not if parts and why_not else held_bound_of(parts, problem, spec.knowledge)
+    )
