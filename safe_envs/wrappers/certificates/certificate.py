@@ -43,6 +43,11 @@ class Plant:
     barriers: tuple[sp.Expr, ...]
     policy: tuple[sp.Expr, ...] = ()
 
+    @property
+    def angles(self) -> tuple[bool, ...]:
+        """Which states are angles, of which the workspace is one period."""
+        return tuple(sp.expand(high - low) == 2 * sp.pi for low, high in self.workspace)
+
 
 @dataclass(frozen=True)
 class BarrierCertificate:
@@ -50,7 +55,8 @@ class BarrierCertificate:
 
     It is a proof where a sound check of its statements passes: on G, where psi and all h_i are
     positive and the workspace is not left, psi <= c and A psi >= -a psi - m along some input within
-    the bounds (along the policy if there is one); and psi <= 0 where an h_i is 0.
+    the bounds (along the policy if there is one); psi <= 0 where an h_i is 0; and psi <= 0 at the
+    ends of the period of an angle, unless psi does not depend on it.
 
     Attributes:
         env_id: of the registered env, with its options; empty for other systems.
@@ -72,16 +78,31 @@ class BarrierCertificate:
     supremum: Fraction
     horizon: Fraction
 
-    def bounds_at(self, starts: np.ndarray) -> np.ndarray:
-        """Return the bound at starts in C, where psi <= 0 it is 0.
+    def bounds_at(self, starts: np.ndarray, horizon: float | None = None) -> np.ndarray:
+        """Return the bound at starts in C; where psi <= 0 it is 0.
 
         Args:
             starts: states, shape (B, n).
+            horizon: T in s; by default that of the certificate.
 
         Returns:
             Values in [0, 1], shape (B,).
         """
-        a, m, c, horizon = map(float, (self.rate, self.shortfall, self.supremum, self.horizon))
-        spent = -math.expm1(-a * horizon) / a if a else horizon
-        values = self.psi.values(starts) * math.exp(-a * horizon) - m * spent
+        a, m, c = map(float, (self.rate, self.shortfall, self.supremum))
+        time = float(self.horizon) if horizon is None else horizon
+        spent = -math.expm1(-a * time) / a if a else time
+        values = self.values(starts) * math.exp(-a * time) - m * spent
         return np.clip(values / c, 0.0, 1.0)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Return psi, with angles taken back to the period of the workspace.
+
+        Args:
+            x: states, shape (B, n).
+
+        Returns:
+            Shape (B,).
+        """
+        low = np.array([float(ends[0]) for ends in self.plant.workspace])
+        turned = low + np.mod(x - low, 2.0 * math.pi)
+        return self.psi.values(np.where(self.plant.angles, turned, x))

@@ -106,8 +106,12 @@ class CertificateStatements:
         return self._parts[0]
 
     def edges(self) -> list[Statement]:
-        """Return the statements that psi is not above 0 where an h_i is 0 and no other below."""
-        found = []
+        """Return the statements that psi is not above 0 on the edge of C, and where an angle jumps.
+
+        The edge of C is where an h_i is 0 and no other is below. An angle jumps at the ends of its
+        period, where a polynomial would too.
+        """
+        found = self._jumps()
         for i, barrier in enumerate(self.plant.barriers):
             # Where psi is h_i itself there is nothing to show.
             if sp.expand(self.psi.expression - barrier) == 0:
@@ -124,6 +128,27 @@ class CertificateStatements:
                     polynomials=self.polynomials,
                 )
             )
+        return found
+
+    def _jumps(self) -> list[Statement]:
+        found = []
+        for i, angle in enumerate(self.plant.angles):
+            if not angle or not any(
+                key[i] for key, value in self.psi.coefficients.items() if value
+            ):
+                continue
+            for end in self.plant.workspace[i]:
+                box = (*self.plant.workspace[:i], (end, end), *self.plant.workspace[i + 1 :])
+                found.append(
+                    Statement(
+                        "psi <= 0 where an angle jumps",
+                        self.plant.states,
+                        box,
+                        -self.value,
+                        positive=self.plant.barriers,
+                        polynomials=self.polynomials,
+                    )
+                )
         return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
 from safe_envs.wrappers.verification.assumptions import RELATIVE, kinked, reaches, violated_by
+from safe_envs.wrappers.verification.posterior_proof import PosteriorNumbers, proved_numbers_of
+from safe_envs.wrappers.verification.results import Status
 from safe_envs.wrappers.verification.safe_set import (
     draw_starts,
     in_workspace,
@@ -36,14 +39,15 @@ _STARTS = 64
 
 @dataclass(frozen=True)
 class PosteriorGuarantee:
-    """(1 - delta) (h_0 - (m + e) T)/c, estimated for P(safe on [0, T]) of a robust `BayesianSCBF`.
+    """(1 - delta) (h_0 - (m + e) T)/c, a bound on P(safe on [0, T]) of a robust `BayesianSCBF`.
 
     With probability 1 - delta of the posterior, A h of the true system is at least -(m + e)
     wherever X is in C and in the workspace, and h/c less what that costs is then a lower bound
     (`safe_envs.wrappers.verification.bounds.stage_bound`). The posterior takes the prior, the
-    features and constant Gaussian noise for granted; c and m are found by sampling C and by a
-    search, so that they are estimates from below, and e is of first order in the length of the
-    steps: so the whole is an estimate.
+    features and constant Gaussian noise for granted. The judge proves c and m or, where it cannot,
+    they are what a search found, which is an estimate from below; e, of first order in the length
+    of the steps, is an estimate too. So the bound is proved, given the posterior, where both
+    numbers are and e is 0.
 
     Attributes:
         delta: probability that the identification is outside its regions, delta_theta +
@@ -54,6 +58,7 @@ class PosteriorGuarantee:
         bias: e, by how much the length of the steps in the data may shift A h, in the units of h
             per s; see `safe_envs.wrappers.verification.step_bias.rate_bias`.
         remark: what weakens it, in words; may be empty.
+        word: "proved" or "estimated".
     """
 
     delta: float
@@ -61,6 +66,7 @@ class PosteriorGuarantee:
     shortfall: float
     bias: float
     remark: str
+    word: Status
     _barrier: Any
     _workspace: tuple[np.ndarray, np.ndarray]
     note: None = None
@@ -136,6 +142,10 @@ def posterior_guarantee(
     _require_smooth(problem, expression, level, points, region, np.random.default_rng([seed, 4]))
     highest, _ = largest(level, points, region, np.random.default_rng([seed, 2]))
     shortfall, _ = largest(shortfall_at, points, region, np.random.default_rng([seed, 3]))
+    highest, shortfall, unproved = _judged(
+        proved_numbers_of(problem, robust, expression, (highest, max(shortfall, 0.0))),
+        (highest, shortfall),
+    )
     bias = rate_bias(posterior, expression, np.array(problem.box), points)
     remarks = [f"no action meets the robust condition somewhere, by up to {shortfall:.3g}"] * (
         shortfall > 0.0
@@ -143,10 +153,22 @@ def posterior_guarantee(
     remarks += [
         f"steps of {posterior.dt:g} s in the data may shift the rate of h by up to {bias:.3g}"
     ] * (bias > 0.0)
+    unproved = unproved or "the length of the steps in the data" * (bias > 0.0)
+    remarks += [f"not proved: {unproved}"] * bool(unproved)
+    word: Status = "estimated" if unproved else "proved"
     delta, ends = credible.miss_probability, workspace_of(problem)
     return PosteriorGuarantee(
-        delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), barrier, ends
+        delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), word, barrier, ends
     )
+
+
+def _judged(proved: PosteriorNumbers, found: tuple[float, float]) -> tuple[float, float, str]:
+    """Return c and m, proved where they are, and why one of them is not."""
+    c, m = (
+        number if math.isfinite(number) else searched
+        for number, searched in zip((proved.supremum, proved.shortfall), found, strict=True)
+    )
+    return c, m, proved.reason
 
 
 def _require_smooth(

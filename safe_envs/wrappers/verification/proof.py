@@ -19,12 +19,13 @@ from safe_envs.wrappers.verification.input_terms import exact_number, largest_in
 from safe_envs.wrappers.verification.judge import Verdict, Word, judge, supremum
 from safe_envs.wrappers.verification.statement import Statement
 
-BUDGET = Budget(boxes=1_000_000, seconds=4.0)
-"""Of each statement of a bound, so that an evaluation does not wait for it."""
+BUDGET = Budget(boxes=300_000, seconds=60.0)
+"""Of each statement of a bound: a second or two, so that an evaluation does not wait for it, and
+counted in boxes, so that its numbers do not depend on the machine."""
 
 _RELATIVE = 1e-3
 _SMALL = 1e-7
-_QUICK = 1.0
+_QUICK = 0.3
 _WIDTHS = (1e1, 1e2, 1e4, 1e6)
 
 
@@ -79,6 +80,11 @@ class ChainProof:
             for v, angle in zip(self._formulas.problem.states, periodic, strict=True)
         )
 
+    @property
+    def _quick(self) -> Budget:
+        """Of what either takes few boxes or fails."""
+        return replace(self._budget, boxes=round(_QUICK * self._budget.boxes))
+
     @cached_property
     def bounded(self) -> Verdict:
         """Whether G is bounded."""
@@ -103,9 +109,10 @@ class ChainProof:
             if (side > 0 and high != sp.oo) or (side < 0 and low != -sp.oo):
                 continue
             box = (*self._region.box[:i], beyond, *self._region.box[i + 1 :])
-            quick = replace(self._budget, seconds=min(1.0, self._budget.seconds))
             name = f"C is bounded in {self._region.states[i]}"
-            verdict = judge(replace(self._region, name=name, box=box, claim=sp.Integer(-1)), quick)
+            verdict = judge(
+                replace(self._region, name=name, box=box, claim=sp.Integer(-1)), self._quick
+            )
             if verdict.word != "proved":
                 reason = f"{name} is not established"
                 return Verdict("undecided", verdict.boxes, box=verdict.box, reason=reason)
@@ -161,8 +168,7 @@ class ChainProof:
         if self._formulas.independent:
             best = sp.Min(*[self._best(row) for row in rows])
             # Where the claim is 0 somewhere no budget suffices, but a small shortfall is proved.
-            quick = replace(self._budget, seconds=min(_QUICK, self._budget.seconds))
-            return judge(replace(self._region, name=name, claim=best), quick, self._hints)
+            return judge(replace(self._region, name=name, claim=best), self._quick, self._hints)
         inputs = self._formulas.system.inputs
         claims = [
             sum(a * u for a, u in zip(self._coefficients(row), inputs, strict=True))
@@ -177,8 +183,11 @@ class ChainProof:
             witness=self._common_input,
         )
         verdict = judge(statement, self._budget)
-        # The input that fails is one of many: only that some input does not is known.
-        return verdict if verdict.word != "refuted" else verdict._replace(word="undecided")
+        if verdict.word != "refuted":
+            return verdict
+        # The input that fails is one of many.
+        reason = f"no input was found that meets all conditions: {verdict.reason}"
+        return Verdict("undecided", verdict.boxes, box=verdict.box, reason=reason)
 
     @cached_property
     def shortfall(self) -> JudgedNumber:
@@ -238,7 +247,8 @@ class ChainProof:
         found.append(("the condition can be met everywhere on G", self.feasible))
         if self.feasible.word != "proved":
             number = self.shortfall
-            found.append((f"it is violated by at most {number.value:.6g}", number.verdict))
+            amount = f" by at most {number.value:.6g}" * math.isfinite(number.value)
+            found.append((f"the best input violates it{amount}", number.verdict))
         return found
 
     def word_of(self, allows_shortfall: bool) -> tuple[Word, str]:

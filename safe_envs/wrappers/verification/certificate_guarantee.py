@@ -1,0 +1,82 @@
+"""The guarantee of a barrier certificate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from safe_envs.dynamics.tables import tabulated
+from safe_envs.wrappers.certificates.certificate import BarrierCertificate
+from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
+from safe_envs.wrappers.verification.branch_and_bound import Budget
+from safe_envs.wrappers.verification.certificate_statements import judged
+from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.results import Bound, Status
+
+_BUDGET = Budget(boxes=2_000_000, seconds=120.0)
+_NAME = "barrier certificate: (psi_0 e^(-a T) - m (1 - e^(-a T))/a)/c"
+
+
+@dataclass(frozen=True)
+class CertificateGuarantee:
+    """The bound of a barrier certificate, once the judge has proved its statements.
+
+    Attributes:
+        certificate: with psi and the numbers.
+    """
+
+    certificate: BarrierCertificate
+    remark: str = ""
+
+    @cached_property
+    def verdicts(self) -> list[tuple[str, Verdict]]:
+        """The statements of the certificate, with the judge's word."""
+        return judged(self.certificate, _BUDGET)
+
+    @property
+    def note(self) -> str | None:
+        """Why there is no bound; None if there is one."""
+        refuted = (v.reason for _, v in self.verdicts if v.word == "refuted")
+        return next(refuted, None)
+
+    @property
+    def word(self) -> Status:
+        """Whether the bound is proved or estimated."""
+        proved = all(verdict.word == "proved" for _, verdict in self.verdicts)
+        return "proved" if proved else "estimated"
+
+    def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
+        """Return the bound at starts; see `ChainGuarantee.at`."""
+        starts = np.asarray(starts, dtype=np.float64)
+        if self.note:
+            return np.zeros(len(starts))
+        return np.where(self._inside(starts), self.certificate.bounds_at(starts, horizon), 0.0)
+
+    def _inside(self, x: np.ndarray) -> np.ndarray:
+        """Return which states are in C and in the workspace, shape (B,)."""
+        plant = self.certificate.plant
+        with np.errstate(all="ignore"):
+            barriers = tabulated(plant.states, list(plant.barriers))(x)
+        low, high = np.array([[float(end) for end in ends] for ends in plant.workspace]).T
+        within = ((x >= low) & (x <= high)) | np.array(plant.angles)
+        return (barriers > 0.0).all(axis=1) & within.all(axis=1)
+
+    def contradiction(
+        self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
+    ) -> str:
+        """Say what states contradict in c; see `ChainGuarantee.contradiction`."""
+        psi = self.certificate.values(reached[self._inside(reached)])
+        highest, c = float(psi.max(initial=-math.inf)), float(self.certificate.supremum)
+        return reaches("psi", highest, c) if highest > c * (1.0 + RELATIVE) else ""
+
+    def applicable_bounds(self, starts: np.ndarray, horizon: float) -> list[Bound]:
+        """Return the bound on average over starts; see `ChainGuarantee.applicable_bounds`."""
+        if self.note:
+            return [Bound(_NAME, None, "hypothesis fails", self.note)]
+        values = self.at(starts, horizon)
+        error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
+        undecided = (v.reason for _, v in self.verdicts if v.word == "undecided")
+        return [Bound(_NAME, float(values.mean()), self.word, next(undecided, ""), False, error)]
