@@ -38,7 +38,12 @@ ROW_KEYS = [
     "curve",
     "withheld",
     "outside_rate",
+    "held_bound",
+    "held_word",
+    "held_note",
+    "held_error",
     "continuous_bound",
+    "continuous_word",
     "continuous_note",
     "posterior_bound",
     "learning",
@@ -341,6 +346,11 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
     assert "90 % band" in picture
 
 
+def line_of(text, name):
+    """Return the row of a filter in a table."""
+    return next(line for line in text.splitlines() if line.startswith(f"{name} "))
+
+
 def test_bounds_are_shown_where_there_are_any():
     answer = evaluate(
         DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5
@@ -352,35 +362,40 @@ def test_bounds_are_shown_where_there_are_any():
         print_evaluation(console, replace(answer, rows=rows))
         return console.file.getvalue()
 
-    bounded = printed(
-        {},
-        {"continuous_bound": None, "continuous_note": "it ignores the noise"},
-        {"continuous_bound": 0.492, "continuous_note": ""},
-    )
-    lines = {
-        line.split()[0]: line
-        for line in bounded.splitlines()
-        if line.startswith(("none", "hocbf", "scbf"))
+    nothing = {
+        "continuous_bound": None,
+        "continuous_word": "none",
+        "continuous_note": "it ignores the noise",
     }
-    assert " 49.2 % " in lines["scbf"]
-    assert not re.search("≥|>=|proved|guaranteed", bounded.replace("{b_j >= 0}", ""))
-    assert "] none " in " ".join(lines["hocbf"].split())
-    assert "] - " in " ".join(lines["none"].split())
-    assert "Note: no bound for hocbf: it ignores the noise\n" in bounded
-    assert bounded.count("no bound for") == 1
-    assert bounded.count("Note: a bound is estimated: ") == 1
-    nothing = {"continuous_bound": None, "continuous_note": "it ignores the noise"}
-    below = printed(
-        {}, nothing, vars(judged(replace(answer.rows[2], continuous_bound=0.999), 0.98))
-    )
+    given = {"continuous_bound": 0.4929, "continuous_word": "estimated", "continuous_note": ""}
+    bounded = printed({}, nothing, given)
+    assert " 49.2 % est. " in line_of(bounded, "scbf")
+    assert not re.search("≥|>=|guaranteed", bounded.replace("{b_j >= 0}", ""))
+    assert [line_of(bounded, name).split()[1] for name in ("none", "hocbf", "scbf")] == ["-"] * 3
+    assert "] - " in " ".join(line_of(bounded, "hocbf").split())
+    assert "] - " in " ".join(line_of(bounded, "none").split())
+    assert "Note: no bound, continuous control, for hocbf: it ignores the noise\n" in bounded
+    assert bounded.count("no bound, continuous control, for") == 1
+    assert "Note: no bound, held input, for hocbf, scbf: neither a table" in bounded
+    assert bounded.count("Note: continuous control, est.: ") == 1
+    proved = printed({}, nothing, {**given, "continuous_word": "proved"})
+    assert " >= 49.2 % " in line_of(proved, "scbf")
+    assert "est.: " not in proved
+    assert proved.count("Note: continuous control, >=: proved for these starts") == 1
+    held = {"held_bound": 0.4929, "held_word": "proved", "held_note": "of a certificate"}
+    chain = printed({}, {**nothing, **held, "held_word": "computed"}, {**nothing, **held})
+    assert line_of(chain, "hocbf").split()[1:4] == ["49.2", "%", "comp."]
+    assert line_of(chain, "scbf").split()[1:4] == [">=", "49.2", "%"]
+    assert "Note: held input, scbf: proved, of a certificate\n" in chain
+    assert chain.count("from left to right, for the env's own steps") == 1
+    refuted = judged(replace(answer.rows[2], **{**given, "continuous_bound": 0.999}), 0.98)
+    below = printed({}, nothing, vars(refuted))
     assert (
-        "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below"
-        " 99.9 %" in below
+        "Note: no bound, continuous control, for scbf: withheld: the interval of the measured rate"
+        " ends at 98.0 %, below 99.9 %" in below
     )
-    assert "] withheld " in " ".join(
-        next(line for line in below.splitlines() if line.startswith("scbf")).split()
-    )
-    assert "a bound is estimated" not in below
+    assert "] withheld " in " ".join(line_of(below, "scbf").split())
+    assert "est.: " not in below
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):

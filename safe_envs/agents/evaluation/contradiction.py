@@ -131,4 +131,5 @@ def without_continuous(row: Bounded, reason: str) -> Bounded:
     row = replace(row, withheld=row.withheld or reason, continuous_bound=None)
     if posterior is None:
         return replace(row, continuous_word="withheld", continuous_note=note)
-    return replace(row, posterior_bound=replace(posterior, probability=None, note=note))
+    none = replace(posterior, probability=None, note=note, word="withheld")
+    return replace(row, posterior_bound=none)

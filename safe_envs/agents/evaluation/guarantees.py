@@ -1,6 +1,4 @@
-"""The bounds of a filter for continuous control, averaged over starts, unless the episodes
-contradict them.
-"""
+"""The bounds of a filter for continuous control, averaged over starts."""
 
 from __future__ import annotations
 
@@ -20,12 +18,17 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
+from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
 from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
+from safe_envs.wrappers.verification.judge import Word
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""
+
+_OPEN = ("refuted", "undecided")
+"""The judge's words for what is not proved, the worst one first."""
 
 
 class GuaranteeAverager:
@@ -94,10 +97,11 @@ class GuaranteeAverager:
             visited: states of the episodes; where they contradict the bound, it is withheld.
         """
         bound, note = self._mean()
+        word = "none" if bound is None else self._word
         found = BoundSummary(
             outside_rate=share(self._lost, self._starts),
             continuous_bound=bound,
-            continuous_word=self._word if bound is not None else "none",
+            continuous_word=word,
             continuous_note=note,
         )
         if self._of_posterior:
@@ -108,7 +112,7 @@ class GuaranteeAverager:
                 continuous_bound=None,
                 continuous_word="none",
                 continuous_note="the condition is learned: see its bound over the posterior",
-                posterior_bound=PosteriorSummary(bound, note, **sizes),
+                posterior_bound=PosteriorSummary(bound, note, word, **sizes),
             )
         reason = (
             ""
@@ -120,9 +124,7 @@ class GuaranteeAverager:
     @property
     def _word(self) -> ContinuousWord:
         """What the bound is worth."""
-        found = self._found
-        proved = isinstance(found, ChainGuarantee) and found.word == "proved"
-        return "proved" if proved else "estimated"
+        return "proved" if self._found and self._found.word == "proved" else "estimated"
 
     def _mean(self) -> tuple[float | None, str | None]:
         if self._found is None or self._why_none:
@@ -133,19 +135,28 @@ class GuaranteeAverager:
         return mean, "; ".join(filter(None, [remark, _undecided(self._found)]))
 
 
+def _judgement(found: Guarantee | CertificateGuarantee) -> tuple[Word, str]:
+    """Return what the judge says of all that a bound asks for, and why it is not proved."""
+    if isinstance(found, ChainGuarantee):
+        return found.proof.word_of(any(found.stages.shortfalls))
+    if isinstance(found, CertificateGuarantee):
+        open_ = [v for w in _OPEN for _, v in found.verdicts if v.word == w]
+        return (open_[0].word, open_[0].reason) if open_ else ("proved", "")
+    # That of a posterior says so in its remark.
+    return "proved", ""
+
+
 def _refuted(found: Guarantee) -> str:
     """Return what the judge refutes of a bound; "" if nothing."""
-    if found.note or not isinstance(found, ChainGuarantee):
+    if found.note:
         return ""
-    word, reason = found.proof.word_of(any(found.stages.shortfalls))
+    word, reason = _judgement(found)
     return reason * (word == "refuted")
 
 
 def _undecided(found: Guarantee) -> str:
     """Return what the judge leaves undecided of a bound; "" if nothing."""
-    if not isinstance(found, ChainGuarantee):
-        return ""
-    word, reason = found.proof.word_of(any(found.stages.shortfalls))
+    word, reason = _judgement(found)
     return f"undecided: {reason}" * (word == "undecided")
 
 
@@ -208,5 +219,7 @@ def together(summaries: Sequence[BoundSummary]) -> BoundSummary:
         for key in ("probability", *_SIZES)
         if key == "probability" or all(getattr(c, key) is not None for c in found)
     }
-    merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, **mean))
+    proved = all(c.word == "proved" for c in found)
+    word: ContinuousWord = "proved" if proved else "estimated"
+    merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, word=word, **mean))
     return without_continuous(merged, reason) if reason else merged

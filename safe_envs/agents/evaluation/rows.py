@@ -134,7 +134,8 @@ class PosteriorSummary:
 
     Attributes:
         probability: the bound; None where there is none.
-        note: why there is none, or why it is weak.
+        note: why there is none, or why it is weak or not proved.
+        word: what it is worth, given the posterior.
         delta: probability that the identification does not contain the system; None, as those
             below, where no bound was looked for.
         supremum: c.
@@ -144,6 +145,7 @@ class PosteriorSummary:
 
     probability: float | None
     note: str | None
+    word: ContinuousWord = "none"
     delta: float | None = None
     supremum: float | None = None
     shortfall: float | None = None
@@ -152,7 +154,7 @@ class PosteriorSummary:
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON-able data, less the numbers that are not there."""
         given = asdict(self)
-        head = {name: given.pop(name) for name in ("probability", "note")}
+        head = {name: given.pop(name) for name in ("probability", "note", "word")}
         return head | {name: value for name, value in given.items() if value is not None}
 
 

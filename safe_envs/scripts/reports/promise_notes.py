@@ -17,14 +17,11 @@ def computed_notes(names: Iterable[str]) -> list[str]:
     found = [name for name in names if names_promise(name)]
     if not found:
         return []
-    which = (
-        f"held input: the bound of {found[0]} is"
-        if len(found) == 1
-        else "held input: the bounds of promise filters are"
-    )
+    which = f"the bound of {found[0]} is" if len(found) == 1 else "bounds of promise filters are"
     notes = [
-        f"{which} computed, not proved: the mean of p_0 over the starts, which the filter keeps"
-        " for every policy up to the horizon, in the floating-point numbers of its table."
+        f"held input, comp.: {which} computed, not proved: the mean of p_0 over the starts, which"
+        " the filter keeps for every policy up to the horizon, in the floating-point numbers of its"
+        " table."
     ]
     tasks = [name for name in found if PromiseSettings.of_text(name).specification]
     if tasks:

@@ -48,7 +48,8 @@ class VerifyAnswer:
         if self.verification.invariant_set is None:
             return []
         found = self.verification.guarantee.proof.statements
-        return [(_without_infinity(text), verdict) for text, verdict in found]
+        # Where no number is proved, none is finite.
+        return [(text.replace("<= inf", "is finite"), verdict) for text, verdict in found]
 
     @property
     def problem(self) -> SafetyProblem:
@@ -95,13 +96,6 @@ class VerifyAnswer:
                 "chain": self.chain.as_dict(),
             }
         )
-
-
-def _without_infinity(text: str) -> str:
-    """Return a statement on a number; where none is proved, that it is finite."""
-    if text.endswith("<= inf"):
-        return f"{text.removesuffix('<= inf')}is finite"
-    return text.replace("at most inf", "a finite amount")
 
 
 def _measured(found: Measurement) -> dict[str, Any]:
