@@ -138,7 +138,7 @@ def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> Attai
 def chained(
     best: AttainableSafety | None, rows: Sequence[EvaluationRow]
 ) -> tuple[AttainableSafety | None, list[EvaluationRow]]:
-    """Return what stands in the chain bound <= rate <= attainable, without what contradicts it.
+    """Return the attainable safety and the rows, without what breaks bound <= rate <= attainable.
 
     Where a bound for the env's own steps is above the attainable upper bound, a table is wrong: the
     attainable safety is withheld, and so is a bound that is only computed.

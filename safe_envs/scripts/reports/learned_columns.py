@@ -66,9 +66,10 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
         if bound and bound.note:
             notes.append(f"bound of {name} over the posterior: {bound.note}")
         if bound and bound.delta is not None:
+            word = "" if bound.probability is None else f" {bound.word} given the posterior,"
             notes.append(
-                f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,"
-                f" {bound.word} given the posterior, with probability delta = {bound.delta:.3g} that the identification"
+                f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,{word}"
+                f" with probability delta = {bound.delta:.3g} that the identification"
                 f" does not contain the system, shortfall m = {bound.shortfall:.3g}, bias of the"
                 f" steps e = {bound.bias:.3g}, c = {bound.supremum:.3g}."
             )
