@@ -245,9 +245,14 @@ class ControlAffineSDE:
 
 @lru_cache(maxsize=1024)
 def _numeric(expression: Any, parameters: tuple[tuple[sp.Symbol, float], ...]) -> Any:
-    found = expression.subs(
-        {p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in parameters}
-    )
+    used = expression.free_symbols
+    numbers = {
+        p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v))
+        for p, v in parameters
+        if p in used
+    }
+    # SymPy may take a second to find nothing in a long expression.
+    found = expression.subs(numbers) if numbers else expression
     if found.has(sp.zoo, sp.nan, sp.oo, -sp.oo):
         values = ", ".join(f"{p} = {v:g}" for p, v in parameters)
         raise ConfigurationError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from safe_envs.scripts.benchmark import benchmark
 from safe_envs.scripts.best import best
+from safe_envs.scripts.check import check
 from safe_envs.scripts.demo import demo
 from safe_envs.scripts.doctor import doctor
 from safe_envs.scripts.evaluate import evaluate
@@ -27,6 +28,7 @@ app = make_app(
         "leaderboard": leaderboard,
         "best": best,
         "verify": verify,
+        "check": check,
         "frontier": frontier,
         "render": render,
         "reproduce": reproduce,

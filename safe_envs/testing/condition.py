@@ -166,7 +166,8 @@ class _Constraint:
         a = self._compiled(found.coefficient)(x)
         for j, column in enumerate(self._columns(model.input_matrix, x)):
             self._agree(f"coefficient of {model.inputs[j]}", a[:, j], _along(last, x, column))
-        for j in range(len(found.chain)):
+        # A barrier of its own is no derivative of h.
+        for j in range(len(found.chain) if self._condition.differentiates else 0):
             self._check_level(j, x)
         if found.change is not None:
             row = found.offset - (found.demand or 0)

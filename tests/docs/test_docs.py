@@ -62,7 +62,7 @@ def test_every_env_and_condition_has_a_page(pages_in_navigation: list[str]):
     assert {f"envs/{env_id.split('/')[1].removesuffix('-v0')}.md" for env_id in ENV_IDS} <= set(
         pages_in_navigation
     )
-    for name in (*CONDITIONS, *LEARNED):
+    for name in (*CONDITIONS, *LEARNED, "certified"):
         assert f"filters/{name}.md" in pages_in_navigation
         assert (DOCS / "filters" / f"{name}.md").is_file()
 
@@ -75,7 +75,7 @@ def test_every_page_is_in_the_navigation(pages_in_navigation: list[str]):
     assert {page for page in pages_in_navigation if not page.startswith("envs/")} <= written | made
 
 
-@pytest.mark.parametrize("name", [*CONDITIONS, *LEARNED])
+@pytest.mark.parametrize("name", [*CONDITIONS, *LEARNED, "certified"])
 def test_page_of_a_condition_has_equation_guarantee_and_example(name: str, hook: Any):
     text = (DOCS / "filters" / f"{name}.md").read_text()
     assert text.startswith(f"# {name}\n\n$$")

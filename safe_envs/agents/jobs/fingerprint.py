@@ -55,7 +55,7 @@ def source_checksum(scripts: bool = True) -> str:
     """
     digest = hashlib.sha256()
     root = Path(str(files("safe_envs")))
-    for path in sorted((*root.rglob("*.py"), *root.rglob("*.yaml"))):
+    for path in sorted(each for kind in ("py", "yaml", "json") for each in root.rglob(f"*.{kind}")):
         if scripts or not path.is_relative_to(root / "scripts"):
             digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes())
     return digest.hexdigest()

@@ -19,6 +19,7 @@ FILTERS = (
     "learned-hocbf",
     "ddscbf",
     "bayesian-scbf",
+    "certified",
     "promise",
 )
 """Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""

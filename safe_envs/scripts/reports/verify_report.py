@@ -38,10 +38,12 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
     )
     say(console, Text.assemble((answer.title, "bold"), told))
     _section(console, "Safe set", _set_lines(found, answer.starts))
-    for barrier in found.barriers:
+    for barrier, condition in zip(found.barriers, found.formulas.conditions, strict=True):
+        # A barrier of its own, in the place of h, takes the input in its first derivative.
+        order = f"relative degree {barrier.degree} " if condition.differentiates else ""
         _section(
             console,
-            f"Barrier {barrier.name}: relative degree {barrier.degree} with {barrier.condition}",
+            f"Barrier {barrier.name}: {order}with {barrier.condition}",
             _barrier_lines(found, barrier),
         )
     conditions = "conditions" if len(found.barriers) > 1 else "condition"

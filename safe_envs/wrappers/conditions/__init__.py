@@ -3,6 +3,7 @@
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
+from safe_envs.wrappers.conditions.certified import Certified
 from safe_envs.wrappers.conditions.class_k import ClassK, power
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
@@ -29,6 +30,7 @@ __all__ = [
     "SZCBF",
     "AffineConstraint",
     "BayesianSCBF",
+    "Certified",
     "ClassK",
     "Condition",
     "LearnedCondition",

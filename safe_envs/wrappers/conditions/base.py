@@ -60,6 +60,7 @@ class Condition(ABC):
         corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a
             filter that knows the plant.
         method: by which the models that it needs are learned; None if it needs none.
+        differentiates: whether it differentiates the barrier, which has to be smooth then.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the constraint.
 
     Raises:
@@ -71,6 +72,7 @@ class Condition(ABC):
     almost_sure: ClassVar[bool] = False
     corrects_model: ClassVar[bool] = False
     method: ClassVar[str | None] = None
+    differentiates: ClassVar[bool] = True
 
     sampling_margin: str | float = field(default="none", kw_only=True)
 
@@ -176,7 +178,8 @@ def _sympified(found: Any, inputs: int) -> AffineConstraint:
     if len(found.coefficient) != inputs:
         raise ValueError(f"{len(found.coefficient)} coefficients for {inputs} inputs")
     coefficient, chain = (tuple(map(sp.sympify, e)) for e in (found.coefficient, found.chain))
-    return replace(found, coefficient=coefficient, offset=sp.sympify(found.offset), chain=chain)
+    offset, domain = sp.sympify(found.offset), tuple(map(sp.sympify, found.domain))
+    return replace(found, coefficient=coefficient, offset=offset, chain=chain, domain=domain)
 
 
 def is_nonnegative(value: Any) -> bool:
@@ -194,7 +197,7 @@ def _constraint(
     found = _sympified(condition.derived(model, barrier), model.m)
     # The generator differentiates twice each time; only the last derivative may jump.
     times = len(found.chain) + (condition.sampling_margin == FIRST_ORDER)
-    if not pieces_fit(
+    if condition.differentiates and not pieces_fit(
         barrier.expression,
         model.states,
         (2 if condition.stochastic and model.noisy else 1) * times - 1,

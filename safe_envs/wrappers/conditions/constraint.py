@@ -74,6 +74,8 @@ class AffineConstraint:
         demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no
             meaning elsewhere. There a u + b is the rate of h, and all that is left is to make that
             as large as the other constraints allow.
+        domain: expressions that are all positive where the demand has a meaning, of a certificate's
+            constraint for example; h, by more than its rounding, where none are given.
         change: rate of the constraint while the input is held, an expression of states and inputs,
             where a margin of first order is asked for.
         uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
@@ -88,6 +90,7 @@ class AffineConstraint:
     change: sp.Expr | None = None
     uncertainty: tuple[sp.Expr, ...] | None = None
     terms: Terms | None = None
+    domain: tuple[sp.Expr, ...] = ()
 
     @classmethod
     def after(

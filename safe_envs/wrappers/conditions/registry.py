@@ -11,6 +11,7 @@ from safe_envs.object_import import load_object, place_of
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
+from safe_envs.wrappers.conditions.certified import Certified
 from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
@@ -25,7 +26,11 @@ LEARNED: dict[str, type[LearnedCondition]] = {
 }
 """Conditions that need a learned model."""
 
-_BUILT_IN: dict[str, type[Condition]] = {**CONDITIONS, **LEARNED}
+_BUILT_IN: dict[str, type[Condition]] = {
+    **CONDITIONS,
+    **LEARNED,
+    Certified.name: Certified,
+}
 
 
 PROMISE = "promise"

@@ -16,6 +16,7 @@ from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shorten
 from safe_envs.number_text import real_or_complex
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.certified import Certified
 from safe_envs.wrappers.conditions.registry import condition_class, name_of
 from safe_envs.wrappers.conditions.text_parts import ConditionText, part_of, parts_of
 from safe_envs.wrappers.learning import LearnedModel, load_learned
@@ -38,7 +39,8 @@ def parse_conditions(
 
     Args:
         text: one for all barriers, or one for each with "+" between; see `parse_condition`.
-            `ddscbf:file=FILE` reads the learned model from a file of `safe-envs identify`.
+            `ddscbf:file=FILE` reads the learned model from a file of `safe-envs identify`,
+            `certified:file=FILE` a certificate of `safe-envs certify`.
         problem: problem whose barriers and gains are taken.
         learned: models for the conditions that name no file.
 
@@ -131,7 +133,9 @@ def _parsed(
     found: list[Condition] = []
     for i, part in enumerate(parts * count if len(parts) == 1 else parts):
         condition, given = _settings(part)
-        if condition.method is not None:
+        if issubclass(condition, Certified):
+            found.append(_made(part, condition.for_problem, problem, **given))
+        elif condition.method is not None:
             learned = learned_for(condition, given.pop("file", None))
             found.append(_made(part, condition.from_learned, learned, problem.gains_of(i), **given))
         else:
@@ -142,7 +146,7 @@ def _parsed(
 def _of_model(
     part: ConditionText, condition: Any, given: dict[str, Any], gains: Sequence[float]
 ) -> Condition:
-    if condition.method is not None or set(given) <= {"sampling_margin"}:
+    if _reads_file(condition) or set(given) <= {"sampling_margin"}:
         return replace(_made(part, condition.for_gains, gains), **given)
     return _made(part, condition, **given)
 
@@ -179,9 +183,11 @@ def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
     """Return the class of a condition, and the arguments that its text sets."""
     condition = condition_class(part.name)
     parameters = dict(inspect.signature(condition).parameters)
-    if condition.method is not None:
+    if _reads_file(condition):
+        # What the file holds is no text.
         parameters.pop("learned", None)
-    names = [*parameters, *["file"] * (condition.method is not None)]
+        parameters.pop("certificate", None)
+    names = list(dict.fromkeys([*parameters, *["file"] * _reads_file(condition)]))
     given: dict[str, Any] = {}
     for setting in part.settings:
         key, _, value = setting.partition("=")
@@ -190,13 +196,25 @@ def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
         if key not in names:
             hint = _hint(key, names, given)
             raise ConfigurationError(f"filter {part.name} has no parameter {shown(key)}; {hint}")
-        given[key] = value if key == "file" else _value(part.text, parameters[key], value)
+        given[key] = (
+            value
+            if key == "file" and _reads_file(condition)
+            else _value(part.text, parameters[key], value)
+        )
     return condition, given
+
+
+def _reads_file(condition: type[Condition]) -> bool:
+    """Return whether a condition needs what a file holds: a learned model, or a certificate."""
+    return condition.method is not None or issubclass(condition, Certified)
 
 
 def _hint(key: str, names: Sequence[str], given: Mapping[str, Any]) -> str:
     if key == "sha256":
-        return "it stands for a learned model without a file: save it, and name that as file=FILE"
+        return (
+            "it stands for a learned model or a certificate without a file: save it, and name that"
+            " as file=FILE"
+        )
     if "file" in given:
         return (
             f"{nearest(key, names)}; a file whose name holds a colon is given by --learned, or read"

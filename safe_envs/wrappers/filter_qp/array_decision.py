@@ -8,6 +8,7 @@ from typing import Any
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
+from safe_envs.wrappers.filter_qp.compiled import domain_of
 from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
 from safe_envs.wrappers.filter_qp.qp import FilterQP
@@ -57,7 +58,8 @@ class ArrayDecision:
         self._b = [f"values[{i * width + self._m}]" for i in range(self._k)]
         self._growth = self._k * width
         self._h = self._growth + self._goal * width
-        self._forms = self._h + len(self._reciprocal)
+        self._levels = [len(domain_of(qp.constraints[i])) for i in self._reciprocal]
+        self._forms = self._h + sum(self._levels)
         self._finite: list[str] = []
 
     def source(self) -> Source:
@@ -124,12 +126,13 @@ class ArrayDecision:
         body = self._body
         if self._single:
             return
-        h = {i: f"values[{self._h + place}]" for place, i in enumerate(self._reciprocal)}
-        body.vector(
-            "inside",
-            [f"1.0 if {h[i]} > 0.0 else 0.0" if i in h else "1.0" for i in range(self._k)],
-        )
-        if h:
+        inside, start = ["1.0"] * self._k, self._h
+        for i, count in zip(self._reciprocal, self._levels, strict=True):
+            above = " and ".join(f"values[{start + j}] > 0.0" for j in range(count))
+            inside[i] = f"1.0 if {above} else 0.0"
+            start += count
+        body.vector("inside", inside)
+        if self._reciprocal:
             body.room("rise", self._m)
             body.call(aim_outwards, f"{self._m}, a, inside, low, high, w, rise, aim")
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -12,6 +14,7 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function, constants, finite
 from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp import dispatch, second_order_batch, second_order_constraint
@@ -35,6 +38,7 @@ class CompiledQP:
         self._m = qp.model.m
         self._count = len(qp.constraints)
         self._reciprocal = [i for i, c in enumerate(qp.constraints) if c.demand is not None]
+        self._domains = [domain_of(qp.constraints[i]) for i in self._reciprocal]
         self._sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
         arrays = flavour == "arrays"
@@ -84,19 +88,28 @@ class CompiledQP:
         """Take values apart.
 
         Returns:
-            a and b of each constraint, the goal's offset and coefficients, h of reciprocal
-            conditions less its rounding, and Q of uncertain constraints.
+            a and b of each constraint, the goal's offset and coefficients, what is positive in the
+            domains of reciprocal conditions, and Q of uncertain constraints.
         """
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
-        goal_end = forms_at - len(self._reciprocal)
+        goal_end = forms_at - sum(map(len, self._domains))
         forms = {
             i: values[forms_at + k * entries : forms_at + (k + 1) * entries]
             for k, i in enumerate(self._uncertain)
         }
-        goal, h = values[count * width : goal_end], values[goal_end:forms_at]
-        return [row[:-1] for row in rows], [row[-1] for row in rows], goal, h, forms
+        goal, levels = values[count * width : goal_end], values[goal_end:forms_at]
+        return [row[:-1] for row in rows], [row[-1] for row in rows], goal, levels, forms
+
+    def _inside(self, levels: Sequence[Any]) -> dict[int, Any]:
+        """Return whether each reciprocal condition is inside its domain, by its number."""
+        found, start = {}, 0
+        for i, domain in zip(self._reciprocal, self._domains, strict=True):
+            above = [level > 0.0 for level in levels[start : start + len(domain)]]
+            found[i] = functools.reduce(operator.and_, above)
+            start += len(domain)
+        return found
 
     def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
         """Return what a reciprocal condition demands; floats have no 1/h outside its domain."""
@@ -122,7 +135,7 @@ class CompiledQP:
         if p.clf is not None:
             growth, along = p.clf.growth(p.model)
             expressions += [growth, *along]
-        expressions += [_beyond_rounding(p.constraints[i].chain[0]) for i in self._reciprocal]
+        expressions += [level for domain in self._domains for level in domain]
         return [
             *expressions,
             *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ()),
@@ -144,6 +157,11 @@ class CompiledQP:
         return compile_function(
             (*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour
         )
+
+
+def domain_of(constraint: AffineConstraint) -> tuple[sp.Expr, ...]:
+    """Return what is positive where a constraint's demand has a meaning."""
+    return constraint.domain or (_beyond_rounding(constraint.chain[0]),)
 
 
 def _beyond_rounding(h: sp.Expr) -> sp.Expr:

@@ -15,8 +15,8 @@ class FilterDecision(NamedTuple):
     Attributes:
         action: executed input, shape (..., m), inside the input bounds.
         margin: of each constraint at the action, less what a sampling margin or a reciprocal
-            condition demands, shape (..., k); outside the domain of a reciprocal condition, the
-            rate of h.
+            condition demands, shape (..., k); outside the domain of such a condition, the rate of
+            h, and of a certificate's condition the left side of its inequality.
         active: constraints that bind or cannot be met, shape (..., k).
         feasible: whether some input within its bounds meets every constraint, shape (...). Where
             it is False, the action is the least-violating one.

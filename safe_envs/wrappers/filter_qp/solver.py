@@ -83,12 +83,12 @@ class FilterQPSolver(CompiledQP):
             UndefinedConstraintError: A constraint or the goal has no finite value.
         """
         x = self._with_terms(x)
-        a, b, goal, h, forms = self._split(self._values(*x))
+        a, b, goal, levels, forms = self._split(self._values(*x))
         target = u
         if goal:
             target = [0.0 * uj for uj in u]
             u = self._best(goal, target)
-        inside = dict(zip(self._reciprocal, [value > 0.0 for value in h], strict=True))
+        inside = self._inside(levels)
         self._require_finite([*b, *[aj for ai in a for aj in ai]])
         asked = [
             (

@@ -195,7 +195,7 @@ def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
             " for a torch layer"
         )
     reasons = {
-        "demand": "is reciprocal; use cbf, hocbf, scbf or szcbf",
+        "demand": "is reciprocal, or of a certificate; use cbf, hocbf, scbf or szcbf",
         "change": "has a sampling margin of first order; use a number or 'none'",
         "uncertainty": (
             "is uncertain; use a condition of a model, or a learned one without uncertainty"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.lie import has_kinks
+from safe_envs.wrappers.conditions import Certified
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import in_workspace, workspace_of
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
@@ -15,6 +16,8 @@ from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 
 def no_bound(formulas: Formulas) -> str:
     """Say why there is no bound whatever the numbers are; "" if there may be one."""
+    if any(isinstance(condition, Certified) for condition in formulas.conditions):
+        return "its bound is that of the certificate, and not one of the chain of h"
     if not formulas.noisy:
         return ""
     for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
@@ -74,6 +77,25 @@ def _undefined(analysis: SafeSetAnalysis) -> str:
     return (
         "the condition has no finite value at"
         f" {', '.join(f'{s.symbol} = {value:.3g}' for s, value in states)}"
+    )
+
+
+def outside(formulas: Formulas, b: np.ndarray) -> str:
+    """Say where the start is outside, by the value that is lowest.
+
+    Args:
+        formulas: of the chains.
+        b: values of all b_j at the starts, shape (B, sum of the r).
+
+    Returns:
+        A text.
+    """
+    if (b > 0.0).any(axis=0).all():
+        return "no start lies in all C_j at once"
+    j = int(b.max(axis=0).argmin())
+    stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
+    return f"the start is outside C_{stage}: {formulas.names[j]} = {b[:, j].max():.4g}" + (
+        " at most" if len(b) > 1 else ""
     )
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from safe_envs.dynamics.tables import tabulated
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
+from safe_envs.wrappers.certificates.matching import system_differences
+from safe_envs.wrappers.conditions import Certified, Condition
 from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.certificate_statements import judged
@@ -26,26 +30,30 @@ class CertificateGuarantee:
 
     Attributes:
         certificate: with psi and the numbers.
+        against: why its bound is not one of the filter, in words; empty where it is.
     """
 
     certificate: BarrierCertificate
-    remark: str = ""
+    against: str = ""
+    remark = ""
 
     @cached_property
-    def verdicts(self) -> list[tuple[str, Verdict]]:
+    def statements(self) -> list[tuple[str, Verdict]]:
         """The statements of the certificate, with the judge's word."""
         return judged(self.certificate, _BUDGET)
 
     @property
     def note(self) -> str | None:
         """Why there is no bound; None if there is one."""
-        refuted = (v.reason for _, v in self.verdicts if v.word == "refuted")
+        if self.against:
+            return self.against
+        refuted = (v.reason for _, v in self.statements if v.word == "refuted")
         return next(refuted, None)
 
     @property
     def word(self) -> Status:
         """Whether the bound is proved or estimated."""
-        proved = all(verdict.word == "proved" for _, verdict in self.verdicts)
+        proved = all(verdict.word == "proved" for _, verdict in self.statements)
         return "proved" if proved else "estimated"
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
@@ -54,6 +62,9 @@ class CertificateGuarantee:
         if self.note:
             return np.zeros(len(starts))
         return np.where(self._inside(starts), self.certificate.bounds_at(starts, horizon), 0.0)
+
+    def best_start(self, seed: int = 0) -> None:
+        """Return None: no printed formula has to be tried where it is largest."""
 
     def _inside(self, x: np.ndarray) -> np.ndarray:
         """Return which states are in C and in the workspace, shape (B,)."""
@@ -78,5 +89,25 @@ class CertificateGuarantee:
             return [Bound(_NAME, None, "hypothesis fails", self.note)]
         values = self.at(starts, horizon)
         error = float(values.std(ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else 0.0
-        undecided = (v.reason for _, v in self.verdicts if v.word == "undecided")
+        undecided = (v.reason for _, v in self.statements if v.word == "undecided")
         return [Bound(_NAME, float(values.mean()), self.word, next(undecided, ""), False, error)]
+
+
+def certificate_guarantee(
+    problem: SafetyProblem, conditions: Sequence[Condition]
+) -> CertificateGuarantee:
+    """Return the bound of a filter with the condition of a certificate.
+
+    Args:
+        problem: whose plant has to be that of the certificate.
+        conditions: one for each barrier, at least one of which is `Certified`.
+    """
+    first = next(c for c in conditions if isinstance(c, Certified))
+    against = ""
+    if any(condition != first for condition in conditions):
+        against = "other conditions act besides that of the certificate"
+    if not against:
+        differing = system_differences(first.certificate.plant, problem.plant)
+        parts = ", ".join(differing)
+        against = f"the plant differs from the system of the certificate in {parts}" * bool(parts)
+    return CertificateGuarantee(first.certificate, against)

@@ -16,9 +16,11 @@ from safe_envs.wrappers.verification.assumptions import (
     failures,
     mismatch,
     no_bound,
+    outside,
     unbounded,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.judge import Verdict
 from safe_envs.wrappers.verification.proof import ChainProof
 from safe_envs.wrappers.verification.results import (
     Bound,
@@ -62,6 +64,15 @@ class ChainGuarantee:
         """What the judge proves of the hypotheses and numbers."""
         shortfall, state = self.analysis.max_shortfall
         return ChainProof(self.formulas, self.analysis.suprema.tolist(), shortfall, state[None])
+
+    @property
+    def statements(self) -> list[tuple[str, Verdict]]:
+        """The hypotheses with the judge's word; none where no theorem applies."""
+        return (
+            []
+            if no_bound(self.formulas) or self.analysis.invariant_set is None
+            else self.proof.statements
+        )
 
     @property
     def note(self) -> str | None:
@@ -187,9 +198,9 @@ class ChainGuarantee:
         b = formulas.chain(starts)
         inside = (b > 0.0).all(axis=1)
         if not inside.any():
-            return [Bound("all of them", None, "hypothesis fails", _outside(formulas, b))]
-        outside = f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some"
-        partly = [] if inside.all() else [f"{outside} C_j"]
+            return [Bound("all of them", None, "hypothesis fails", outside(formulas, b))]
+        share = f"{100 * (1 - inside.mean()):.1f} %"
+        partly = [f"0 at the {share} of the starts that are outside some C_j"] * (not inside.all())
         found = [self._judged(candidate, partly) for candidate in self._candidates(b, horizon)]
         high = above_suprema(formulas, self.stages.suprema, starts)
         return [bound.without(high) for bound in found]
@@ -278,14 +289,3 @@ class ChainGuarantee:
             return bounds.theorem_4_2_10_printed(formulas.chain(x), self.stages.suprema)
 
         return largest(printed, points, region, rng)[1]
-
-
-def _outside(formulas: Formulas, b: np.ndarray) -> str:
-    """Say where the start is outside, by the value that is lowest."""
-    if (b > 0.0).any(axis=0).all():
-        return "no start lies in all C_j at once"
-    j = int(b.max(axis=0).argmin())
-    stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
-    return f"the start is outside C_{stage}: {formulas.names[j]} = {b[:, j].max():.4g}" + (
-        " at most" if len(b) > 1 else ""
-    )

@@ -10,7 +10,11 @@ import numpy as np
 
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition, spec_of
+from safe_envs.wrappers.conditions import Certified, Condition, spec_of
+from safe_envs.wrappers.verification.certificate_guarantee import (
+    CertificateGuarantee,
+    certificate_guarantee,
+)
 from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.extrema import (
     max_shortfall,
@@ -127,8 +131,10 @@ class Verification:
         return self.analysis.region
 
     @cached_property
-    def guarantee(self) -> ChainGuarantee:
-        """The bounds of the conditions, with the suprema and the shortfall that were found."""
+    def guarantee(self) -> ChainGuarantee | CertificateGuarantee:
+        """The bounds of the conditions, with what the judge proves of them."""
+        if any(isinstance(c, Certified) for c in self.formulas.conditions):
+            return certificate_guarantee(self.formulas.problem, self.formulas.conditions)
         return ChainGuarantee(self.formulas, self.analysis)
 
 

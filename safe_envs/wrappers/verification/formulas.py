@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import sympy as sp
 
 from safe_envs.dynamics.lie import quadratic_variation_rate
 from safe_envs.dynamics.tables import tabulated
@@ -23,6 +22,7 @@ _EDGE = 1e-9
 _ZERO = 1e-12
 _EPSILONS = 64 * np.finfo(float).eps
 _SIZES_LOG2 = 10
+_STEP, _NEARLY = 1e-6, 1e-6
 
 
 class Formulas:
@@ -168,14 +168,26 @@ class Formulas:
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)
 
+    def _changes(self, x: np.ndarray) -> np.ndarray:
+        """Return the change of each a over states that rounding cannot tell apart, (B, k, m).
+
+        It is of first order, with slopes from central differences.
+        """
+        found, width = 0.0, self.region.high - self.region.low
+        for step in np.diag(_STEP * width):
+            ahead, behind = (self._entries(x + sign * step)[:, :, :-1] for sign in (1.0, -1.0))
+            slope = np.nan_to_num(abs(ahead - behind), posinf=0.0)
+            found = found + slope * (_EPSILONS / (2.0 * _STEP))
+        return np.asarray(found)
+
+    def _entries(self, x: np.ndarray) -> np.ndarray:
+        return self._constraints_compiled(x).reshape(len(x), len(self.stages), -1)
+
     @cached_property
-    def _changes(self) -> Any:
-        """Largest change of each a, to first order, over states that rounding cannot tell apart."""
-        widths = (_EPSILONS * (self.region.high - self.region.low)).tolist()
-        entries = [self.system.numeric(a) for c in self._constraints for a in c.coefficient]
-        return self._compiled(
-            [_change(a, dict(zip(self.system.states, widths, strict=True))) for a in entries]
-        )
+    def _nearly_zero(self) -> np.ndarray:
+        """Sizes below which an a may be 0 but for rounding, shape (k, m)."""
+        x = self.region.draw(_SIZES_LOG2, np.random.default_rng(0))
+        return _NEARLY * _typical(self._entries(x)[:, :, :-1])
 
     def constraints_at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a (B, k, m) and b (B, k) of the constraints a u + b >= 0.
@@ -183,9 +195,13 @@ class Formulas:
         An a that is 0 to rounding is 0: within input bounds that are wide enough, rounding would
         meet any condition.
         """
-        found = self._constraints_compiled(x).reshape(len(x), len(self.stages), -1)
+        found = self._entries(x)
         a = found[:, :, :-1]
-        return np.where(abs(a) <= self._changes(x).reshape(a.shape), 0.0, a), found[:, :, -1]
+        small = (abs(a) <= self._nearly_zero).any(axis=(1, 2))
+        if small.any():
+            a = a.copy()
+            a[small] = np.where(abs(a[small]) <= self._changes(x[small]), 0.0, a[small])
+        return a, found[:, :, -1]
 
     def defined(self, x: np.ndarray) -> np.ndarray:
         """Return whether the conditions have finite values, shape (B,)."""
@@ -278,17 +294,6 @@ class Formulas:
         return self.safety_filter.filter(
             x, np.broadcast_to(self._rest, (len(x), len(self._rest)))
         ).slack
-
-
-def _change(expression: Any, widths: dict[sp.Symbol, float]) -> sp.Expr:
-    """Return the sum of the sizes of the slopes times the widths, without undefined ones."""
-    slopes = [(sp.diff(expression, s), width) for s, width in widths.items()]
-    known = [
-        sp.Abs(slope) * width
-        for slope, width in slopes
-        if not slope.has(sp.DiracDelta, sp.Derivative, sp.Subs)
-    ]
-    return sp.Add(*known).evalf(17)
 
 
 def _typical(values: np.ndarray) -> np.ndarray:

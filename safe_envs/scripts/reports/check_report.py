@@ -1,0 +1,125 @@
+"""The answer of `safe-envs check`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy as sp
+from rich.console import Console
+
+from safe_envs.errors import shortened
+from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.wrappers.certificates.certificate import BarrierCertificate
+from safe_envs.wrappers.certificates.check_result import CheckResult
+from safe_envs.wrappers.certificates.statements import EnvDifference
+
+_BY = {"intervals": "branch and bound with first-order forms", "balls": "ball arithmetic of Arb"}
+
+
+@dataclass(frozen=True, eq=False)
+class CheckAnswer:
+    """What was found of the certificate of a file.
+
+    Attributes:
+        file: its name.
+        certificate: what it states.
+        found: results of the checks, by name.
+        env: whether its system is that of the env that it names.
+        starts: states to tell the bound of.
+    """
+
+    file: str
+    certificate: BarrierCertificate
+    found: Mapping[str, CheckResult]
+    env: EnvDifference
+    starts: Sequence[Sequence[float]]
+
+    @property
+    def word(self) -> str:
+        """What is said of the certificate: checked only where every check says so."""
+        words = [result.word for result in self.found.values()]
+        words += ["refuted"] if self.env.word == "differs" else []
+        return next((word for word in ("refuted", "undecided") if word in words), "checked")
+
+    def bounds(self) -> list[float]:
+        """Return the bound that is stated at each start, 0 outside of G, rounded down."""
+        plant, bounds = self.certificate.plant, []
+        for start in self.starts:
+            known = dict(zip(plant.states, map(sp.Float, start), strict=True))
+            ranges = zip(start, plant.workspace, strict=True)
+            within = all(float(low) < x < float(high) for x, (low, high) in ranges)
+            inside = within and all(float(h.xreplace(known)) > 0 for h in plant.barriers)
+            value = self.certificate.bounds_at(np.array([start], dtype=float))[0] if inside else 0.0
+            bounds.append(max(0.0, float(value) - 1e-9))
+        return bounds
+
+    def document(self) -> dict[str, Any]:
+        """Return all as JSON-able data."""
+        c = self.certificate
+        parts = {
+            name: {
+                "word": result.word,
+                "boxes": result.boxes,
+                "statements": [part.as_dict() for part in result.parts],
+            }
+            for name, result in self.found.items()
+        }
+        bounds = zip(self.starts, self.bounds(), strict=True)
+        return {
+            "file": self.file,
+            "env_id": c.env_id,
+            "options": c.options,
+            "env": self.env._asdict(),
+            "degree": c.psi.degree,
+            "control": "policy" if c.plant.policy else "constraint",
+            **{name: float(v) for name, v in _numbers(c).items()},
+            "word": self.word,
+            "checks": parts,
+            "bounds": [{"state": list(start), "bound": bound} for start, bound in bounds],
+        }
+
+
+def _numbers(c: BarrierCertificate) -> dict[str, Any]:
+    return {"a": c.rate, "m": c.shortfall, "c": c.supremum, "horizon": c.horizon}
+
+
+def print_check(console: Console, answer: CheckAnswer) -> None:
+    """Print what a certificate states, and whether it is so.
+
+    Args:
+        console: to print on.
+        answer: to print.
+    """
+    c = answer.certificate
+    names = ", ".join(s.name for s in c.plant.states)
+    whose = c.env_id or "a system without an id"
+    control = "one policy" if c.plant.policy else "every input that meets its constraint"
+    say(console, f"{shortened(answer.file)}: barrier certificate of {shortened(whose)}")
+    say(console, f"psi has degree {c.psi.degree} in {names}; it is for {control}")
+    told = ", ".join(f"{name} = {float(v):.9g}" for name, v in _numbers(c).items())
+    spent = "m (1 - e^(-a T))/a" if c.rate else "m T"
+    weight = "psi(x) e^(-a T)" if c.rate else "psi(x)"
+    say(console, f"{told}; P(safe for T, or until the workspace is left) >= [{weight} - {spent}]/c")
+    say(console, answer.env.text)
+    for name, result in answer.found.items():
+        say(console, f"\nBy {_BY[name]}:")
+        table = make_table("llrrp", "statement", "word", "boxes", "seconds", "")
+        for part in result.parts:
+            at = "" if part.state is None else f"at ({', '.join(f'{x:.6g}' for x in part.state)})"
+            note = "; ".join(text for text in (at, part.reason) if text)
+            boxes, seconds = f"{part.boxes:,}" if part.boxes else "", f"{part.seconds:.2f}"
+            table.add_row(part.name, part.word, boxes, seconds, note)
+        print_whole(console, table)
+    if answer.starts:
+        table = make_table("lr", names, "bound" if answer.word == "checked" else "not proved")
+        for start, bound in zip(answer.starts, answer.bounds(), strict=True):
+            percent = math.floor(1e4 * bound) / 1e2
+            table.add_row(", ".join(f"{x:g}" for x in start), f">= {percent:.2f} %")
+        print_whole(console, table)
+    proof = "a proof of its bound" if answer.word == "checked" else "no proof of its bound"
+    say(console, f"{answer.word}: the certificate is {proof}, for continuous control")

@@ -1,0 +1,216 @@
+"""Expressions of certificates as text: arithmetic of named symbols, read without running code."""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+
+FUNCTIONS: dict[str, Any] = {
+    name: getattr(sp, name)
+    for name in ("Abs", "Max", "Min", "atan", "cos", "exp", "log", "sin", "sqrt", "tanh")
+}
+"""Those that both checkers know; a plant has them in place of tan, sinh and cosh."""
+
+_CONSTANTS: dict[str, Any] = {"pi": sp.pi, "E": sp.E}
+_OPERATORS: dict[type[ast.AST], Any] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+_NUMBER = re.compile(r"[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]{1,3})?|\.[0-9]+([eE][-+]?[0-9]{1,3})?")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,39}")
+
+MOST_BITS = 1100
+"""Of the numerator and the denominator of a fraction, as far as floats reach."""
+
+_LARGEST_EXPONENT = 100
+_MOST_CHARACTERS = 20_000
+_MOST_PARTS = 3000
+_MOST_FUNCTIONS = 100
+_DEEPEST = 100
+
+
+def require_name(name: Any, where: str) -> str:
+    """Return the name of a symbol.
+
+    Raises:
+        ConfigurationError: a text of an expression cannot have it.
+    """
+    taken = {*FUNCTIONS, *_CONSTANTS, "and", "or", "not", "in", "is", "if", "else", "lambda"}
+    if isinstance(name, str) and _NAME.fullmatch(name) and name not in taken:
+        try:
+            if isinstance(ast.parse(name, mode="eval").body, ast.Name):
+                return name
+        except SyntaxError:
+            pass
+    raise ConfigurationError(
+        f"{where}: the name {shown(name)} cannot stand in a certificate; give at most 40 letters,"
+        " digits and underscores, which are no function or word of Python"
+    )
+
+
+def write_expression(expression: sp.Expr, names: Mapping[str, sp.Symbol], where: str) -> str:
+    """Return the text of an expression, which is read back as an equal one.
+
+    Args:
+        expression: with exact numbers.
+        names: the symbols that it may have, by name.
+        where: it stands, for errors.
+
+    Raises:
+        ConfigurationError: it has a float, or something else that cannot be read back.
+    """
+    text = str(expression)
+    found = read_expression(text, names, where)
+    if found != expression and sp.expand(found - expression) != 0:
+        raise ConfigurationError(
+            f"{where}: {shortened(expression)} is read back as {shortened(found)}; give exact"
+            " numbers and sympy's own forms of expressions"
+        )
+    return text
+
+
+def read_expression(text: Any, names: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
+    """Read arithmetic of symbols, with exact numbers, without Python's eval.
+
+    Nothing is computed whose size is not known to be small before.
+
+    Args:
+        text: such as "x_1**3 - 3*x_2/5".
+        names: the symbols, by name.
+        where: it stands, for errors.
+
+    Raises:
+        ConfigurationError: it is no such arithmetic, or too long.
+    """
+    if not isinstance(text, str) or not 0 < len(text) <= _MOST_CHARACTERS:
+        raise ConfigurationError(
+            f"{where} is {shown(text)}; give an expression as text of 1 to {_MOST_CHARACTERS:,}"
+            " characters"
+        )
+    if not (text.isascii() and text.isprintable()):
+        raise ConfigurationError(f"{where}: {shown(text)} has characters beyond ASCII; use none")
+    source = text.strip()
+    try:
+        tree = ast.parse(source, mode="eval").body
+        _require_few_parts(tree, where)
+        return _Reading(names, source, where).value(tree)
+    except ConfigurationError:
+        raise
+    except (
+        *(SyntaxError, RecursionError, MemoryError, TypeError, ValueError),
+        *(ArithmeticError, AttributeError),
+    ) as error:
+        raise ConfigurationError(
+            f"{where}: {shown(text)} is no expression; write it like x_1**3 - 3*x_2/5"
+        ) from error
+
+
+def _require_few_parts(tree: ast.expr, where: str) -> None:
+    parts, functions, left = 0, 0, [(tree, 0)]
+    while left:
+        node, depth = left.pop()
+        parts, functions = parts + 1, functions + isinstance(node, ast.Call)
+        if parts > _MOST_PARTS or functions > _MOST_FUNCTIONS or depth > _DEEPEST:
+            raise ConfigurationError(
+                f"{where}: the expression has more than {_MOST_PARTS} parts, more than"
+                f" {_MOST_FUNCTIONS} functions, or is nested more than {_DEEPEST} deep; give a"
+                " simpler one"
+            )
+        # The terms of a long sum are nested in its left side, and read one after the other.
+        for child in ast.iter_child_nodes(node):
+            is_sum = isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub)
+            left.append((child, depth + (not (is_sum and child is node.left))))  # pyright: ignore
+
+
+class _Reading:
+    """One expression that is being read."""
+
+    def __init__(self, names: Mapping[str, sp.Symbol], source: str, where: str) -> None:
+        self._names, self._source, self._where = {**_CONSTANTS, **names}, source, where
+
+    def value(self, node: ast.expr) -> Any:
+        terms = []
+        while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub):
+            last = self.value(node.right)
+            terms.append(last if isinstance(node.op, ast.Add) else -last)
+            node = node.left
+        first = self._combined(node)
+        return self._small(sp.Add(first, *reversed(terms)) if terms else first, node)
+
+    def _combined(self, node: ast.expr) -> Any:
+        match node:
+            case ast.Name(name):
+                if name in self._names:
+                    return self._names[name]
+                raise ConfigurationError(
+                    f"{self._where}: unknown name {shown(name)}; {nearest(name, self._names)}"
+                )
+            case ast.Constant(int() | float()):
+                text = self._source[node.col_offset : node.end_col_offset]
+                if _NUMBER.fullmatch(text) and len(text) <= _MOST_CHARACTERS:
+                    return sp.Rational(text)
+            case ast.BinOp(left, kind, right) if type(kind) in _OPERATORS:
+                first, second = self.value(left), self.value(right)
+                if isinstance(kind, ast.Pow) and not _is_exponent(second):
+                    raise ConfigurationError(
+                        f"{self._where}: the exponent {shortened(ast.unparse(right))} is no"
+                        f" number up to {_LARGEST_EXPONENT}"
+                    )
+                return _OPERATORS[type(kind)](first, second)
+            case ast.UnaryOp(kind, operand) if type(kind) in _OPERATORS:
+                return _OPERATORS[type(kind)](self.value(operand))
+            case ast.Call(ast.Name(name), arguments, []) if arguments:
+                single = name not in ("Max", "Min")
+                if name in FUNCTIONS and not (single and len(arguments) > 1):
+                    return FUNCTIONS[name](*map(self.value, arguments))
+                raise ConfigurationError(
+                    f"{self._where}: unknown function {shown(name)} of {len(arguments)} arguments;"
+                    f" {nearest(name, FUNCTIONS)}"
+                )
+        raise ConfigurationError(
+            f"{self._where}: {shown(ast.unparse(node))} is not allowed; write arithmetic with"
+            " decimal numbers, like x_1**3 - 3*x_2/5"
+        )
+
+    def _small(self, found: Any, node: ast.expr) -> Any:
+        numbers, powers = found.atoms(sp.Number, sp.NumberSymbol), found.atoms(sp.Pow)
+        fits = all(map(_is_small, numbers)) and all(_is_exponent(p.exp) for p in powers)
+        if not fits or found.has(sp.I, sp.zoo, sp.nan, sp.oo) or not _is_real(found):
+            raise ConfigurationError(
+                f"{self._where}: {shown(ast.unparse(node))} has a number that is not real, beyond"
+                f" floats or too long, or an exponent above {_LARGEST_EXPONENT}; give smaller ones"
+            )
+        return found
+
+
+def _is_exponent(value: Any) -> bool:
+    return bool(value.is_Rational) and abs(value) <= _LARGEST_EXPONENT
+
+
+def _is_small(value: Any) -> bool:
+    if value.is_Rational:
+        return max(int(value.p).bit_length(), int(value.q).bit_length()) <= MOST_BITS
+    return bool(value.is_NumberSymbol)
+
+
+def _is_real(found: Any) -> bool:
+    """Whether floats hold an expression without symbols."""
+    if found.free_symbols:
+        return True
+    try:
+        return math.isfinite(float(found))
+    except (TypeError, ValueError, OverflowError):
+        return False
