@@ -140,7 +140,7 @@ def _judgement(found: Guarantee | CertificateGuarantee) -> tuple[Word, str]:
     if isinstance(found, ChainGuarantee):
         return found.proof.word_of(any(found.stages.shortfalls))
     if isinstance(found, CertificateGuarantee):
-        open_ = [v for w in _OPEN for _, v in found.verdicts if v.word == w]
+        open_ = [v for w in _OPEN for _, v in found.statements if v.word == w]
         return (open_[0].word, open_[0].reason) if open_ else ("proved", "")
     # That of a posterior says so in its remark.
     return "proved", ""

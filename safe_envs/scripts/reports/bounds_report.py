@@ -8,7 +8,12 @@ from rich.console import Console
 from rich.markup import escape
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
-from safe_envs.agents.evaluation.bound_text import bound_text, continuous_text, held_text
+from safe_envs.agents.evaluation.bound_text import (
+    bound_text,
+    continuous_text,
+    held_text,
+    rounded_down,
+)
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.best_text import COMPUTED
@@ -138,6 +143,8 @@ def _in_brackets(bound: Bound) -> bool:
 def _value(bound: Bound) -> str:
     if bound.status == "proved":
         return bound_text(bound.value, "proved")
+    if bound.status == "estimated" and bound.value is not None:
+        return f"{rounded_down(bound.value)} %"
     return f"({share_text(bound.value)})" if _in_brackets(bound) else share_text(bound.value)
 
 

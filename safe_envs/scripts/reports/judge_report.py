@@ -26,8 +26,7 @@ def print_statements(console: Console, answer: VerifyAnswer) -> None:
     statements = answer.statements
     if not statements:
         return
-    region = "G is where all b_j are positive, in the workspace"
-    console.print(f"\n[bold]Hypotheses, judged[/] {region}", highlight=False)
+    console.print(f"\n[bold]Hypotheses, judged[/] {answer.judged_region}", highlight=False)
     table = make_table("plrp", "statement", "word", "boxes", "where, or why not", indent=True)
     for text, verdict in statements:
         word = f"[{_COLORS[verdict.word]}]{verdict.word}[/]"

@@ -13,6 +13,7 @@ from safe_envs.agents.evaluation.bound_check import Measurement
 from safe_envs.agents.evaluation.safety_chain import SafetyChain
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
+from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
 from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
 from safe_envs.wrappers.verification.judge import Verdict
 from safe_envs.wrappers.verification.results import Bound
@@ -47,9 +48,16 @@ class VerifyAnswer:
         """All that a bound asks for, with the judge's word; none without an invariant set."""
         if self.verification.invariant_set is None:
             return []
-        found = self.verification.guarantee.proof.statements
+        found = self.verification.guarantee.statements
         # Where no number is proved, none is finite.
         return [(text.replace("<= inf", "is finite"), verdict) for text, verdict in found]
+
+    @property
+    def judged_region(self) -> str:
+        """What the G of the statements is, in words."""
+        of_certificate = isinstance(self.verification.guarantee, CertificateGuarantee)
+        positive = "psi and all h are" if of_certificate else "all b_j are"
+        return f"G is where {positive} positive, in the workspace"
 
     @property
     def problem(self) -> SafetyProblem:
