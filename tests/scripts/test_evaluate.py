@@ -13,7 +13,9 @@ from rich.console import Console
 
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.yardstick import chained
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
+from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")
@@ -396,6 +398,30 @@ def test_bounds_are_shown_where_there_are_any():
     )
     assert "] withheld " in " ".join(line_of(below, "scbf").split())
     assert "est.: " not in below
+
+
+def test_the_columns_read_as_a_chain():
+    answer = evaluate(
+        "Scalar-v0", filters=["none", "scbf"], options={"horizon": 0.1}, episodes=5, bounds=False
+    )
+    held = {"held_bound": 0.8, "held_word": "proved", "held_note": "of a certificate"}
+    rows = [answer.rows[0], replace(answer.rows[1], **held)]
+
+    def printed(best):
+        console = Console(width=200, file=io.StringIO())
+        judged_best, judged_rows = chained(best, rows)
+        print_evaluation(console, replace(answer, rows=judged_rows, best=judged_best))
+        return console.file.getvalue()
+
+    rate = f"100.0 % [{100 * rows[0].ci_low:.1f}, 100.0]"
+    found = printed(attainable(0.9, 0.99981))
+    assert f" >= 80.0 %  {rate}  99.99 %  " in line_of(found, "scbf")
+    assert "the bound for held input, of every policy under the filter" in found
+    # A bound above what is attainable, and a rate above it: the table is wrong.
+    low = printed(attainable(0.3, 0.7))
+    assert "attain-" not in low
+    assert "best attainable safety: withheld" in low
+    assert f" >= 80.0 %  {rate}  " in line_of(low, "scbf")
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.agents.evaluation import bound_check
-from safe_envs.agents.evaluation.attainable import AttainableSafety
+from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 from tests.wrappers.verification.verified import verify_once
@@ -95,13 +95,6 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
         "continuous",
     ]
     assert " 99.99 % " in cells
-
-
-def attainable(lower, upper):
-    """Return what a table of no problem in particular says."""
-    nothing = {"simulated": None, "contradiction": "", "knowledge": "plant", "leaving": "safe"}
-    sizes = {"coordinates": (), "cells": (), "inputs": 1, "steps": 1, "seconds": 0.0, "memory": 0}
-    return AttainableSafety(lower=lower, upper=upper, specification="", **nothing, **sizes)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from safe_envs.agents.evaluation.safety_chain import safety_chain
 from safe_envs.agents.evaluation.yardstick import against_attainable, chained
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.verification.results import Bound
+from tests.agents.evaluation.made_up import attainable
 from tests.conftest import problem_of
-from tests.scripts.test_verify import attainable
 
 PROVED = Bound("a", 0.42, "proved", "")
 ESTIMATED = Bound("b", 0.6, "estimated", "undecided: a box is left")
