@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.contradiction import by_rate, by_states
+from safe_envs.agents.evaluation.attainable import SURE
+from safe_envs.agents.evaluation.contradiction import by_rate, by_states, end_for
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
@@ -94,7 +96,7 @@ def judged(
     for m in measurements:
         for h in m.horizons:
             for bound in h.bounds:
-                below = by_rate(bound.value, h.rate if m.repeats else h.ci_high)
+                below = by_rate(bound.value, _end(m, h, bound.status))
                 if below:
                     of_each.setdefault(bound.name, f"from {m.start}, up to {h.time:g} s, {below}")
 
@@ -107,6 +109,14 @@ def judged(
     return [without(bound) for bound in bounds], [
         replace(m, horizons=tuple(map(cleared, m.horizons))) for m in measurements
     ]
+
+
+def _end(measurement: Measurement, horizon: Horizon, word: str) -> float:
+    """Return what a bound may not be above."""
+    if measurement.repeats:
+        return horizon.rate
+    sure = rate_interval(horizon.safe, measurement.episodes, SURE)[1]
+    return end_for(word, horizon.ci_high, sure)
 
 
 def measure(

@@ -5,6 +5,9 @@ uses, is wrong: a start or a visited state has a b_j above the supremum c_j, the
 condition by more than the shortfall m, or the interval of the measured rate lies below the bound.
 See `safe_envs.wrappers.verification.guarantee.ChainGuarantee.contradiction` for the first two.
 
+A bound that is proved is withheld only where an interval lies below it that is so wide that this
+hardly happens by chance.
+
 A bound for the env's own steps and the rates stand in a chain: bound <= rate <= what any policy can
 attain. Where the bound is above the last number, one of both is wrong; see `above_attainable`. A
 bound for continuous control is of another process, which the episodes come near to where dt is
@@ -28,6 +31,7 @@ ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 _ADVICE_PROVED = "an interval misses the truth at times: try more episodes; else report an error"
 _ADVICE_COMPUTED = "an interval misses the truth at times: try more episodes, or another table"
 _DEVIATIONS = 3.0
+_SURE_WORDS = ("proved", "certified")
 
 
 def by_states(bound: Guarantee, visited: Sequence[VisitedStates]) -> str:
@@ -60,27 +64,41 @@ def by_rate(bound: float | None, ci_high: float, advice: str = ADVICE) -> str:
     )
 
 
-def judged(row: Bounded, ci_high: float) -> Bounded:
+def end_for(word: str, ci_high: float, sure_high: float) -> float:
+    """Return the end of an interval that a bound may not be above.
+
+    Args:
+        word: what the bound is worth.
+        ci_high: upper end of the interval of a rate.
+        sure_high: that of a wider one, for what is proved.
+    """
+    return max(ci_high, sure_high) if word in _SURE_WORDS else ci_high
+
+
+def judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
     """Return a row without the bounds that a measured rate contradicts; `withheld` says why.
 
     Args:
         row: of an evaluation.
         ci_high: upper end of the interval of the rate.
+        sure_high: upper end of a wider one, which a proved bound is held against.
     """
     advice = _ADVICE_COMPUTED if row.held_word == "computed" else _ADVICE_PROVED
-    reason = by_rate(row.held_bound, ci_high, advice)
-    return continuous_judged(without_held(row, reason) if reason else row, ci_high)
+    reason = by_rate(row.held_bound, end_for(row.held_word, ci_high, sure_high), advice)
+    return continuous_judged(without_held(row, reason) if reason else row, ci_high, sure_high)
 
 
-def continuous_judged(row: Bounded, ci_high: float) -> Bounded:
+def continuous_judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
     """Return a row without the bounds of continuous control that a rate contradicts.
 
     Args:
         row: of an evaluation.
         ci_high: upper end of the interval of a rate, maybe with a smaller control period.
+        sure_high: upper end of a wider one, which a proved bound is held against.
     """
     posterior = row.posterior_bound
-    reason = by_rate(row.continuous_bound, ci_high) or by_rate(
+    end = end_for(row.continuous_word, ci_high, sure_high)
+    reason = by_rate(row.continuous_bound, end) or by_rate(
         posterior and posterior.probability, ci_high
     )
     return without_continuous(row, reason) if reason else row

@@ -24,7 +24,7 @@ from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.trajectories import Trajectories
-from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained
+from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained, sure_high
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
 from safe_envs.wrappers.learning import LearnedModel
@@ -262,7 +262,7 @@ class _Runner:
         row = EvaluationRow(
             filter=name, policy=policy, learning=learning, **vars(pool), **vars(together(bounds))
         )
-        return judged(row, row.ci_high)
+        return judged(row, row.ci_high, sure_high(row))
 
     def _timing(
         self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float

@@ -14,6 +14,7 @@ from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
+from safe_envs.agents.evaluation.yardstick import sure_high
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 
@@ -152,7 +153,8 @@ def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
     What is of the env's own steps is of its own period, and no other one contradicts it.
     """
     for evaluation in finer:
-        row = continuous_judged(row, evaluation.row(row.filter).ci_high)
+        finer_row = evaluation.row(row.filter)
+        row = continuous_judged(row, finer_row.ci_high, sure_high(finer_row))
     return row
 
 

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety, contradicted
+from safe_envs.agents.evaluation.attainable import SURE, AttainableSafety, contradicted
 from safe_envs.agents.evaluation.bound_check import Measurement
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.held_bound import HeldAverager, held_bound_of
 from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.agents.evaluation.yardstick import against_attainable, best_at_hand
 from safe_envs.wrappers import spec_of
@@ -87,9 +88,9 @@ def safety_chain(
         h = first.horizons[0]
         rates = h.rate, h.ci_low, h.ci_high
         # The bounds for continuous control were judged before, with all measurements.
-        held = judged(
-            replace(summary, continuous_bound=None), h.rate if first.repeats else h.ci_high
-        )
+        ends = (h.ci_high, rate_interval(h.safe, first.episodes, SURE)[1])
+        ends = (h.rate, h.rate) if first.repeats else ends
+        held = judged(replace(summary, continuous_bound=None), *ends)
         summary = replace(held, continuous_bound=summary.continuous_bound)
         episodes = 1 if first.repeats else first.episodes
         best = best and contradicted(best, [(name, round(h.rate * episodes), episodes)])

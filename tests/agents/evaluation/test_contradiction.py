@@ -192,8 +192,7 @@ def test_a_rate_with_a_smaller_period_withholds_too():
     (row,) = evaluate("Scalar-v0", filters="scbf", episodes=2, bounds=False).rows
     row = replace(row, continuous_bound=0.5, continuous_word="estimated", continuous_note="")
     finer = [
-        SimpleNamespace(row=lambda name, high=high: SimpleNamespace(ci_high=high))
-        for high in (0.6, 0.4)
+        SimpleNamespace(row=lambda _, high=high: replace(row, ci_high=high)) for high in (0.6, 0.4)
     ]
     assert refinement._judged(row, finer[:1]) == row
     assert refinement._judged(row, finer).withheld.startswith(
@@ -259,6 +258,16 @@ def test_one_claim_is_withheld_without_the_other():
     other = judged(replace(row, continuous_bound=0.95), 0.92)
     assert (other.held_bound, other.continuous_word) == (0.9, "withheld")
     assert "try a smaller dt" in other.withheld
+
+
+@pytest.mark.parametrize("word", ["proved", "certified", "computed"])
+def test_what_is_proved_is_held_against_a_wider_interval(word):
+    sure = word != "computed"
+    row = BoundSummary(held_bound=0.9, held_word=word)
+    assert (judged(row, 0.89, 0.91) == row) == sure
+    assert judged(row, 0.89, 0.895).held_word == "withheld"
+    given = {"continuous_bound": 0.9, "continuous_word": "proved" if sure else "estimated"}
+    assert (judged(BoundSummary(**given), 0.89, 0.91).continuous_bound == 0.9) == sure
 
 
 def test_a_held_bound_above_what_is_attainable_is_a_contradiction():

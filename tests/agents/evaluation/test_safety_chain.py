@@ -89,10 +89,13 @@ def test_without_a_simulation_there_is_no_rate(chain_of):
 
 
 def test_a_bound_above_the_interval_is_withheld(chain_of):
-    found = chain_of(measured=[measured(0.7)], held=held_of(0.8)).bounds
+    # The 95 % interval ends at 75 %, and what is proved is held against one of 99.9 %.
+    assert chain_of(measured=[measured(0.7)], held=held_of(0.8)).bounds.held_bound == 0.8
+    found = chain_of(measured=[measured(0.7)], held=held_of(0.8, "computed")).bounds
     assert (found.held_bound, found.held_word) == (None, "withheld")
     assert found.continuous_bound == 0.42
     # Episodes that are one and the same have no interval.
+    assert chain_of(measured=[measured(0.6)], held=held_of(0.8)).bounds.held_word == "withheld"
     one = measured(0.78, repeats=True)
     assert chain_of(measured=[one], held=held_of(0.8)).bounds.held_word == "withheld"
     assert chain_of(measured=[replace(one, repeats=False)], held=held_of(0.8)).bounds.held_bound
