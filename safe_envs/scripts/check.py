@@ -47,7 +47,8 @@ def check(
     """
     from safe_envs.number_text import numbers
     from safe_envs.scripts.reports.check_report import CheckAnswer, print_check
-    from safe_envs.wrappers.certificates.ball_checker import check_with_balls, require_flint
+    from safe_envs.wrappers.certificates.ball_checker import check_with_balls
+    from safe_envs.wrappers.certificates.balls import require_flint
     from safe_envs.wrappers.certificates.checker import check as check_certificate
     from safe_envs.wrappers.certificates.files import load_certificate
     from safe_envs.wrappers.certificates.statements import env_difference

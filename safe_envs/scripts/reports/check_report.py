@@ -51,9 +51,10 @@ class CheckAnswer:
         plant, bounds = self.certificate.plant, []
         for start in self.starts:
             known = dict(zip(plant.states, map(sp.Float, start), strict=True))
+            values: list[Any] = [h.xreplace(known) for h in plant.barriers]
             ranges = zip(start, plant.workspace, strict=True)
             within = all(float(low) < x < float(high) for x, (low, high) in ranges)
-            inside = within and all(float(h.xreplace(known)) > 0 for h in plant.barriers)
+            inside = within and all(float(v) > 0 for v in values)
             value = self.certificate.bounds_at(np.array([start], dtype=float))[0] if inside else 0.0
             bounds.append(max(0.0, float(value) - 1e-9))
         return bounds

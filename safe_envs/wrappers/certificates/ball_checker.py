@@ -6,42 +6,29 @@ f(x_0) + f'(box) (x - x_0), with derivatives that SymPy forms and Arb encloses w
 
 from __future__ import annotations
 
-import functools
 import math
-import operator
 import time
 from collections import deque
-from functools import cached_property
 from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.certificates.balls import (
+    Balls,
+    MeanValueForm,
+    PolynomialBalls,
+    require_flint,
+)
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.certificates.check_result import CheckResult, StatementCheck, combined
 from safe_envs.wrappers.certificates.claims import Statement, first_statement, statements_of
+from safe_envs.wrappers.certificates.touching import proved_around
 
 _BITS = 100
 _STEEPEST = 1e6
 _SMALLEST = 1e-9
-
-
-def require_flint() -> Any:
-    """Return the module of python-flint.
-
-    Raises:
-        ConfigurationError: it is not installed.
-    """
-    try:
-        import flint  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ConfigurationError(
-            "the check by ball arithmetic needs python-flint; install it with pip install"
-            ' "safe-envs[proofs]", or check without it'
-        ) from error
-    return flint
 
 
 def check_with_balls(
@@ -73,153 +60,6 @@ def check_with_balls(
     return combined(parts)
 
 
-class _Balls:
-    """Expressions in ball arithmetic."""
-
-    def __init__(self, flint: Any) -> None:
-        self.flint, self.arb = flint, flint.arb
-
-    def rational(self, value: Any) -> Any:
-        p, q = (value.p, value.q) if isinstance(value, sp.Rational) else value.as_integer_ratio()
-        return self.arb(self.flint.fmpq(int(p), int(q)))
-
-    def power(self, base: Any, exponent: sp.Rational, nonnegative: bool) -> Any:
-        if exponent.q not in (1, 2):
-            raise ConfigurationError(f"this check does not know the power {exponent}; use others")
-        if exponent.q == 2:
-            base = (base.nonnegative_part() if nonnegative else base).sqrt()
-        found = self.arb(1)
-        for _ in range(abs(int(exponent.p))):
-            found = found * base
-        return 1 / found if exponent < 0 else found
-
-    def value(self, e: Any, known: dict[Any, Any]) -> Any:
-        """Return the ball of an expression; `known` has those of symbols, and remembers all."""
-        if e in known:
-            return known[e]
-        name = type(e).__name__
-        if e.is_Rational:
-            return self.rational(e)
-        if e.is_NumberSymbol:
-            return self.arb.pi() if e is sp.pi else self.arb.const_e()
-        if e.is_Pow and e.exp.is_Rational:
-            base = self.value(e.base, known)
-            found = self.power(base, e.exp, bool(e.base.is_nonnegative))
-        else:
-            found = self._applied(name, [self.value(x, known) for x in e.args])
-        known[e] = found
-        return found
-
-    def _applied(self, name: str, args: list[Any]) -> Any:
-        first = args[0]
-        if name in ("Add", "Mul"):
-            return functools.reduce(operator.add if name == "Add" else operator.mul, args)
-        if name in ("Max", "Min"):
-            return functools.reduce(lambda x, y: getattr(x, name.lower())(y), args)
-        if name == "Heaviside":
-            return (first.sgn() + 1) / 2
-        if name in ("sin", "cos", "exp", "log", "tanh", "atan"):
-            return getattr(first, name)()
-        if name in ("Abs", "sign"):
-            return abs(first) if name == "Abs" else first.sgn()
-        raise ConfigurationError(f"this check does not know the function {name}; use others")
-
-
-class _Derivatives:
-    """psi and its derivatives as balls."""
-
-    def __init__(self, psi: Any, balls: _Balls) -> None:
-        self._balls, self._psi, self._shape = balls, psi, psi.tensor.shape
-        self._entries = [balls.rational(v) for v in psi.tensor.ravel()]
-        self._powers = list(np.ndindex(*self._shape))
-        self._weights: dict[Any, Any] = {}
-
-    def _shifted(self, z: list[Any]) -> Any:
-        mat, entries = self._balls.flint.arb_mat, self._entries
-        for d, middle in zip(self._shape, z, strict=True):
-            powers = [self._balls.arb(1)]
-            for _ in range(d - 1):
-                powers.append(powers[-1] * middle)
-            shift = [
-                [powers[j - k] * math.comb(j, k) if j >= k else 0 for j in range(d)]
-                for k in range(d)
-            ]
-            rest = len(entries) // d
-            entries = (mat(shift) * mat(d, rest, entries)).transpose().entries()
-        return mat(1, len(entries), entries)
-
-    def _weights_of(self, r: tuple[Any, ...], orders: tuple[Any, ...]) -> Any:
-        """Return the matrix from shifted coefficients to the derivatives on a box of radii r."""
-        key = (r, orders)
-        if key not in self._weights:
-            balls, psi = self._balls, self._psi
-            axes: list[Any] = []
-            for radius, scale, d in zip(r, psi.scale, self._shape, strict=True):
-                wide = balls.rational(radius) / balls.rational(scale)
-                powers = [balls.arb(1), balls.arb(0, wide.upper())]
-                for k in range(2, d + 1):
-                    whole = (wide**k).upper() if wide > 0 else balls.arb(0)
-                    powers.append(
-                        balls.arb(whole / 2, whole / 2) if k % 2 == 0 else balls.arb(0, whole)
-                    )
-                axes.append(powers)
-            lines = []
-            for key_of in self._powers:
-                line = []
-                for order in orders:
-                    taken = [order.count(i) for i in range(psi.n)]
-                    weight = balls.arb(1)
-                    for i, (k, a) in enumerate(zip(key_of, taken, strict=True)):
-                        factor = self._balls.rational(1 / psi.scale[i] ** a) * math.perm(k, a)
-                        weight = weight * (factor * axes[i][k - a] if k >= a else 0)
-                    line.append(weight)
-                lines.append(line)
-            if len(self._weights) > 100:
-                self._weights.clear()
-            self._weights[key] = balls.flint.arb_mat(lines)
-        return self._weights[key]
-
-    def __call__(self, x: list[Any], r: tuple[Any, ...], orders: tuple[Any, ...]) -> list[Any]:
-        psi, balls = self._psi, self._balls
-        z = [
-            (m - balls.rational(c)) / balls.rational(s)
-            for m, c, s in zip(x, psi.center, psi.scale, strict=True)
-        ]
-        return (self._shifted(z) * self._weights_of(r, orders)).entries()
-
-
-class _Form:
-    """f(x_0), and the gradient on the box."""
-
-    def __init__(self, middle: Any, slopes: list[Any], r: tuple[float, ...], box: Any) -> None:
-        self.middle, self.slopes, self.r, self.box = middle, slopes, r, box
-
-    def plus(self, multiple: Any, other: _Form) -> _Form:
-        slopes = [a + multiple * b for a, b in zip(self.slopes, other.slopes, strict=True)]
-        box = self.box + multiple * other.box
-        return _Form(self.middle + multiple * other.middle, slopes, self.r, box)
-
-    @cached_property
-    def _reach(self) -> Any:
-        return sum(abs(s).upper() * r for s, r in zip(self.slopes, self.r, strict=True))
-
-    @cached_property
-    def low(self) -> Any:
-        return _better(self.middle - self._reach, self.box, "lower")
-
-    @cached_property
-    def high(self) -> Any:
-        return _better(self.middle + self._reach, self.box, "upper")
-
-
-def _better(first: Any, other: Any, end: str) -> Any:
-    """Return the narrower one of two ends; that of a ball without bounds is none."""
-    ends = [getattr(ball, end)() for ball in (first, other) if ball.is_finite()]
-    if not ends:
-        return first
-    return (max if end == "lower" else min)(ends)
-
-
 class _Search:
     """Branch and bound with balls."""
 
@@ -231,9 +71,19 @@ class _Search:
         self._symbols: dict[Any, sp.Symbol] = {o: sp.Dummy(real=True) for o in orders}
         self._orders = {symbol: order for order, symbol in self._symbols.items()}
         self.statements = statements_of(certificate, self._symbols)
-        self._balls = _Balls(flint)
-        self._psi = _Derivatives(certificate.psi, self._balls)
+        self._balls = Balls(flint)
+        self._psi = PolynomialBalls(certificate.psi, self._balls)
         self._slopes: dict[Any, tuple[Any, ...]] = {}
+        proved = [
+            proved_around(st, certificate, self._symbols, self._ends) for st in self.statements
+        ]
+        self._proved = dict(zip([st.name for st in self.statements], proved, strict=True))
+
+    def _ends(self, e: sp.Expr, x: np.ndarray, r: np.ndarray) -> tuple[float, float]:
+        arb = self._balls.arb
+        known = {s: arb(float(c), float(d)) for s, c, d in zip(self._states, x, r, strict=True)}
+        found = self._balls.value(e, known)
+        return float(found.lower()) - 1e-12, float(found.upper()) + 1e-12
 
     def _gradient(self, e: Any) -> tuple[Any, ...]:
         """Return the derivatives of an expression of the states and of psi's derivatives."""
@@ -258,7 +108,9 @@ class _Search:
             known |= {self._symbols[o]: v for o, v in zip(orders, values, strict=True)}
         return known
 
-    def _forms(self, expressions: list[Any], x: list[float], r: tuple[float, ...]) -> list[_Form]:
+    def _forms(
+        self, expressions: list[Any], x: list[float], r: tuple[float, ...]
+    ) -> list[MeanValueForm]:
         value = self._balls.value
         gradients = [self._gradient(e) for e in expressions]
         points = set().union(*(e.free_symbols for e in expressions))
@@ -266,7 +118,7 @@ class _Search:
         at_point = self._known(x, (0.0,) * len(x), points)
         on_box = self._known(x, r, both)
         return [
-            _Form(value(e, at_point), [value(d, on_box) for d in g], r, value(e, on_box))
+            MeanValueForm(value(e, at_point), [value(d, on_box) for d in g], r, value(e, on_box))
             for e, g in zip(expressions, gradients, strict=True)
         ]
 
@@ -283,12 +135,16 @@ class _Search:
         while queue:
             x, r = queue.popleft()
             took = time.monotonic() - began
-            if self._boxes <= 0 or time.monotonic() > self._end or (r < _SMALLEST * sizes).all():
+            small = seen > len(st.faces) and (r < _SMALLEST * sizes).all()
+            if small or self._boxes <= 0 or time.monotonic() > self._end:
                 reason = f"{len(queue) + 1} boxes are left, of radius {r.max():.1e}"
                 return StatementCheck(st.name, "undecided", seen, took, x, reason)
             seen, self._boxes = seen + 1, self._boxes - 1
             # So that halves cover the whole of a box, although their centers are rounded.
             wider = r * (1 + 2.0**-20) + 2.0**-50 * np.abs(ends).max(1)
+            box = self._proved[st.name]
+            if box and (np.abs(x - box[0]) + wider <= box[1] * (1 - 1e-12)).all():
+                continue
             word = self._word(st, [float(v) for v in x], tuple(map(float, wider)))
             inside = ((ends[:, 0] <= x) & (x <= ends[:, 1])).all()
             if word == "refuted" and inside:
@@ -325,7 +181,7 @@ class _Search:
             return "checked"
         return "refuted" if self._is_false(st, (claim, region, zero, inputs), x, r) else "open"
 
-    def _raised(self, claim: _Form, ranges: list[Any]) -> _Form:
+    def _raised(self, claim: MeanValueForm, ranges: list[Any]) -> MeanValueForm:
         """Add multiples, for a large lower end; they are chosen in floating point."""
         arb, total = self._balls.arb, claim
         for q, low, high, bounds in ranges:
@@ -334,7 +190,9 @@ class _Search:
                 ratio = -float(s.mid()) / float(t.mid()) if t.mid() != 0 else 0.0
                 if math.isfinite(ratio):
                     tries.add(min(max(ratio, low), high))
-            best = max(tries, key=lambda k: self._score(total, q, k))
+            best = max(tries, key=lambda k: (self._score(total, q, k), -abs(k)))
+            if best == 0.0:
+                continue
             exact = arb(best)
             if bounds is not None and best in (low, high):
                 exact = self._balls.value(bounds[1] if best == low else bounds[2], {})
@@ -342,7 +200,7 @@ class _Search:
         return total
 
     @staticmethod
-    def _score(total: _Form, q: _Form, k: float) -> float:
+    def _score(total: MeanValueForm, q: MeanValueForm, k: float) -> float:
         value = float(total.middle.mid()) + k * float(q.middle.mid())
         for s, t, r in zip(total.slopes, q.slopes, total.r, strict=True):
             value -= r * abs(float(s.mid()) + k * float(t.mid()))

@@ -26,6 +26,7 @@ from safe_envs.wrappers.certificates.enclosures import (
     times,
     value_of,
 )
+from safe_envs.wrappers.certificates.touching import proved_around
 
 _STEEPEST, _TRIED, _NUMBERS = 1e6, 200, 2_000_000  # multipliers; points, numbers in a batch
 _SMALLEST = 1e-9  # box for the workspace
@@ -60,15 +61,26 @@ class _Search:
         self._psi, self._boxes = PolynomialForms(certificate.psi), boxes
         self._batch = int(np.clip(_NUMBERS // certificate.psi.tensor.size, 8, 4096))
         self._end = time.monotonic() + seconds
+        proved = [
+            proved_around(st, certificate, self._symbols, self._ends) for st in self.statements
+        ]
+        self._proved = dict(zip([st.name for st in self.statements], proved, strict=True))
+
+    def _states(self, x: np.ndarray, r: np.ndarray) -> dict[Any, Form]:
+        slopes = r * np.eye(len(x))[:, :, None]
+        parts = zip(self._plant.states, x, slopes, r, strict=True)
+        return {s: form(c, b, 0.0, c - d, c + d) for s, c, b, d in parts}
+
+    def _ends(self, e: sp.Expr, x: np.ndarray, r: np.ndarray) -> tuple[float, float]:
+        found = value_of(e, self._states(x[:, None], r[:, None]), len(x))
+        return float(found.low[0]), float(found.high[0])
 
     def _forms(self, st: Statement, x: np.ndarray, r: np.ndarray) -> tuple[Any, ...]:
         """Return those of claim, region and zero, and the inputs with theirs."""
         n, effects = len(x), [w for w, _, _ in st.inputs]
         wanted = (st.claim, st.zero or sp.Integer(0), *st.region, *effects, *st.defined)
         free = set().union(*(e.free_symbols for e in wanted))
-        known: dict[Any, Form] = {}
-        for i, s in enumerate(self._plant.states):
-            known[s] = form(x[i], r[i] * np.eye(n)[:, i : i + 1], 0.0, x[i] - r[i], x[i] + r[i])
+        known = self._states(x, r)
         orders = [order for order, symbol in self._symbols.items() if symbol in free]
         for order, found in zip(orders, self._psi(x, r, orders), strict=True):
             known[self._symbols[order]] = found
@@ -95,7 +107,7 @@ class _Search:
             for start in range(0, x.shape[1], self._batch):
                 y, s = x[:, start : start + self._batch], r[:, start : start + self._batch]
                 late = self._boxes <= 0 or time.monotonic() > self._end
-                if late or (s[:, 0] < _SMALLEST * sizes).all():
+                if late or (seen and (s[:, 0] < _SMALLEST * sizes).all()):
                     count = x.shape[1] - start + sum(map(len, left))
                     why = f"is short by {short:.1e} or less" if np.isfinite(short) else "has a pole"
                     reason = (
@@ -122,6 +134,8 @@ class _Search:
         helpers += [(zero, -_STEEPEST, _STEEPEST)] if st.zero is not None else []
         low = claim.low if st.defined else _best(claim, helpers).low
         void = np.any([q.high < 0 for q in region], axis=0) | (zero.low > 0) | (zero.high < 0)
+        if box := self._proved[st.name]:
+            void |= (np.abs(x - box[0][:, None]) + r <= box[1][:, None] * (1 - EPS)).all(0)
         return low, np.flatnonzero(~((low >= 0) | void))
 
     def _counterexample(self, st: Statement, x: np.ndarray, r: np.ndarray) -> Any:
@@ -133,7 +147,7 @@ class _Search:
             most = [times(constant(u, len(x)), w).high for u in (low, high)]
             claim = plus(claim, claim._replace(b=0 * x, c=0.0, rho=np.inf, high=np.maximum(*most)))
         wrong = (claim.high < 0) & np.all([q.low > 0 for q in region], axis=0)
-        if st.zero is not None:  # it changes its sign within the box
+        if st.zero is not None:  # it changes its sign in between
             step = r * np.sign(zero.b)
             low, high = (self._forms(st, x + k * step, 0 * r)[2] for k in (-1, 1))
             wrong &= (low.high < 0) & (high.low > 0)

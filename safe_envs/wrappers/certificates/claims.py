@@ -43,7 +43,12 @@ class Statement(NamedTuple):
 
 
 def statements_of(certificate: BarrierCertificate, psi: dict[Any, sp.Symbol]) -> list[Statement]:
-    """Return all statements; psi has the symbols of its derivatives by the indices of states."""
+    """Return all statements but the first one.
+
+    Args:
+        certificate: that makes them.
+        psi: symbols of psi, by (), and of its derivatives, by the sorted indices of states.
+    """
     plant, p, h = certificate.plant, psi[()], certificate.plant.barriers
     a, m, c = map(sp.Rational, (certificate.rate, certificate.shortfall, certificate.supremum))
     claim = a * p + m + sum(f * psi[i,] for i, f in enumerate(plant.drift))

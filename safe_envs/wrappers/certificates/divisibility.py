@@ -13,7 +13,7 @@ _MOST_TERMS = 3000
 
 
 def divides(h: sp.Expr, psi: Polynomial) -> bool:
-    """Whether psi is a polynomial times h, so that it is 0 where h is.
+    """Return whether psi is a polynomial times h, so that it is 0 where h is.
 
     Args:
         h: expression of the states of psi.

@@ -31,7 +31,18 @@ class Form(NamedTuple):
 
 
 def form(c: Any, b: Any, rho: Any, low: Any, high: Any) -> Form:
-    """Round outwards and keep the better enclosure; none where there is no number."""
+    """Round outwards and keep the better enclosure.
+
+    Args:
+        c: values of the linear part at the centers.
+        b: its slopes times the radii.
+        rho: largest distance from the linear part.
+        low: lower ends.
+        high: upper ends.
+
+    Returns:
+        The whole line where there is no number.
+    """
     rho = rho + EPS * (np.abs(c) + np.abs(b).sum(0) + rho) + _TINY
     lost = ~(np.abs(c) + np.abs(b).sum(0) + rho < np.inf)
     c, b, rho = (np.where(lost, other, e) for e, other in ((c, 0.0), (b, 0.0), (rho, np.inf)))
@@ -46,18 +57,33 @@ def form(c: Any, b: Any, rho: Any, low: Any, high: Any) -> Form:
 
 
 def constant(value: Any, n: int) -> Form:
-    """Return numbers, rounded outwards, so that what they approximate is in it."""
+    """Return what holds the numbers that floats approximate.
+
+    Args:
+        value: floats, correctly rounded.
+        n: number of states.
+    """
     value = np.atleast_1d(np.asarray(value, dtype=float))
     return form(value, np.zeros((n, 1)), 0.0, value, value)
 
 
 def plus(p: Form, q: Form) -> Form:
-    """Return p + q."""
+    """Return the sum of p and q.
+
+    Args:
+        p: first form.
+        q: second form.
+    """
     return form(*(x + y for x, y in zip(p, q, strict=True)))
 
 
 def times(p: Form, q: Form) -> Form:
-    """Return p q; of one and the same object the square."""
+    """Return the product of p and q, for one and the same object the square.
+
+    Args:
+        p: first form.
+        q: second form.
+    """
     corners = [x * y for x in (p.low, p.high) for y in (q.low, q.high)]
     low, high = functools.reduce(np.minimum, corners), functools.reduce(np.maximum, corners)
     low = np.fmax(low, 0.0) if p is q else np.where((p.low >= 0) & (q.low >= 0), low, low - _TINY)
@@ -109,7 +135,16 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
 
 
 def value_of(e: Any, known: dict[Any, Form], n: int) -> Form:
-    """Return the enclosure of an expression; `known` has those of symbols, and remembers all."""
+    """Return the enclosure of an expression.
+
+    Args:
+        e: expression.
+        known: enclosures of its symbols; all that is found is added to it.
+        n: number of states.
+
+    Raises:
+        ConfigurationError: it has a function that is not known here.
+    """
     if e in known:
         return known[e]
     name, args = type(e).__name__, e.args
@@ -180,6 +215,7 @@ class PolynomialForms:
             back = np.prod(wide ** taken[:, None], axis=0)
             c, b = terms @ (weight * ((total == 0) + even)) / back, linear @ terms.T / back
             rho = np.abs(terms) @ (weight * (total > 1) * (1 - even)) + errors @ weight
-            rho = (rho * (1 + terms.shape[1] * EPS)) / back + (np.abs(b) * slack / wide).sum(0)
+            rho = rho * (1 + terms.shape[1] * EPS) / back + (np.abs(b) * slack / wide).sum(0)
+            rho = rho + terms.shape[1] * EPS / 8 * np.abs(c)  # of the sum that is c
             forms.append(form(c, b * (r / self.scale) / wide, rho * (1 + EPS), -np.inf, np.inf))
         return forms

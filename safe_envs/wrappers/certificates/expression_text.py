@@ -40,10 +40,15 @@ _MOST_CHARACTERS = 20_000
 _MOST_PARTS = 3000
 _MOST_FUNCTIONS = 100
 _DEEPEST = 100
+_MOST_ARGUMENTS = 12
 
 
 def require_name(name: Any, where: str) -> str:
     """Return the name of a symbol.
+
+    Args:
+        name: what was given.
+        where: it stands, for errors.
 
     Raises:
         ConfigurationError: a text of an expression cannot have it.
@@ -74,7 +79,8 @@ def write_expression(expression: sp.Expr, names: Mapping[str, sp.Symbol], where:
     """
     text = str(expression)
     found = read_expression(text, names, where)
-    if found != expression and sp.expand(found - expression) != 0:
+    same = found == expression or sp.expand(found - expression) == 0
+    if not same or expression.atoms(sp.Float):
         raise ConfigurationError(
             f"{where}: {shortened(expression)} is read back as {shortened(found)}; give exact"
             " numbers and sympy's own forms of expressions"
@@ -173,9 +179,12 @@ class _Reading:
             case ast.UnaryOp(kind, operand) if type(kind) in _OPERATORS:
                 return _OPERATORS[type(kind)](self.value(operand))
             case ast.Call(ast.Name(name), arguments, []) if arguments:
-                single = name not in ("Max", "Min")
-                if name in FUNCTIONS and not (single and len(arguments) > 1):
-                    return FUNCTIONS[name](*map(self.value, arguments))
+                most = _MOST_ARGUMENTS if name in ("Max", "Min") else 1
+                if name in FUNCTIONS and len(arguments) <= most:
+                    found = FUNCTIONS[name](*map(self.value, arguments))
+                    # sympy compares each two of them, and flattens what is nested.
+                    if len(found.args) <= _MOST_ARGUMENTS or name not in ("Max", "Min"):
+                        return found
                 raise ConfigurationError(
                     f"{self._where}: unknown function {shown(name)} of {len(arguments)} arguments;"
                     f" {nearest(name, FUNCTIONS)}"

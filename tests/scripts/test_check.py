@@ -1,0 +1,113 @@
+"""`safe-envs check`, as a person types it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import pytest
+
+from safe_envs.wrappers.certificates.files import save_certificate
+from tests.scripts.conftest import strictly
+from tests.wrappers.certificates.examples import FALSE, TRUE, brownian, disk
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(certificate, name="psi.json"):
+        save_certificate(certificate, tmp_path / name)
+        return name
+
+    return write
+
+
+def test_a_proof_ends_with_0_and_says_what_it_proves(safe_envs_command, written):
+    starts = ("--state=0,0", "--state", "-.1,.7", "--state", "0,1.5")
+    found = safe_envs_command("check", written(disk()), *starts, "--json", "found.json")
+    status, out, err = found
+    assert (status, err) == (0, "")
+    for text in ("psi has degree 2 in x_1, x_2", "every input", "m = 0.080000001", "T = 1"):
+        assert text in out.replace("horizon = 1", "T = 1")
+    for text in ("exactly that of safe_envs/CubicSDEDisk-v0", "A psi >= -a psi - m", ">= 91.99 %"):
+        assert text in out
+    assert "checked: the certificate is a proof" in out
+    document = strictly("found.json")
+    assert document["word"] == document["checks"]["intervals"]["word"] == "checked"
+    assert [b["state"] for b in document["bounds"]] == [[0, 0], [-0.1, 0.7], [0, 1.5]]
+    bounds = [b["bound"] for b in document["bounds"]]
+    assert bounds == pytest.approx([0.92, 0.42, 0.0], abs=1e-6)
+    assert bounds[1] < 0.42
+    statements = document["checks"]["intervals"]["statements"]
+    assert {part["word"] for part in statements} == {"checked"}
+    assert (document["degree"], document["control"], document["c"]) == (
+        2,
+        "constraint",
+        1.000000001,
+    )
+
+
+def test_what_is_refuted_or_undecided_ends_with_1(safe_envs_command, written):
+    status, out, err = safe_envs_command("check", written(FALSE["the disk with a smaller m"]))
+    assert (status, err) == (1, "")
+    assert "at (0, 0); it is false" in out
+    assert "refuted: the certificate is no proof" in out
+    asked = ("--seconds", 1e-9, "--state", "0,0", "--json", "-")
+    status, out, err = safe_envs_command("check", written(TRUE["the disk"]), *asked)
+    assert (status, err) == (1, "")
+    assert json.loads(out)["word"] == "undecided"
+    status, out, _ = safe_envs_command("check", "psi.json", *asked[:4])
+    assert status == 1
+    assert "not proved" in out
+
+
+def test_a_proof_of_another_system_is_none_of_the_env(safe_envs_command, written):
+    other = replace(brownian(), env_id="safe_envs/Scalar-v0")
+    status, out, _ = safe_envs_command("check", written(other), "--json", "found.json")
+    assert status == 1
+    assert "differs from that of safe_envs/Scalar-v0" in out
+    document = strictly("found.json")
+    assert document["word"] == "refuted"
+    assert document["checks"]["intervals"]["word"] == "checked"
+    status, out, _ = safe_envs_command("check", written(brownian()))
+    assert status == 0
+    assert "no env of this project" in out
+
+
+def test_the_second_opinion(safe_envs_command, written, monkeypatch):
+    name = written(brownian())
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "flint", None)
+        status, _, err = safe_envs_command("check", name, "--arb")
+    assert status == 2
+    assert "safe-envs[proofs]" in err
+    pytest.importorskip("flint")
+    status, out, _ = safe_envs_command("check", name, "--arb", "--json", "found.json")
+    assert status == 0
+    assert "ball arithmetic" in out
+    assert set(strictly("found.json")["checks"]) == {"intervals", "balls"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("none.json",), "none.json cannot be read"),
+        (("bad.json",), "is no JSON"),
+        (("changed.json",), "sha256"),
+        (("psi.json", "--state", "0"), "1 numbers; give 2"),
+        (("psi.json", "--state", "0,x"), "--state"),
+        (("psi.json", "--seconds", "0"), "seconds = 0"),
+        (("psi.json", "--json", "no/where.json"), "no/where.json"),
+        (("psi.json", "--json", "psi.json"), "would overwrite"),
+        ((), "FILE"),
+    ],
+)
+def test_errors_end_with_2(safe_envs_command, written, tmp_path, arguments, text):
+    written(disk())
+    (tmp_path / "bad.json").write_text("{")
+    content = (tmp_path / "psi.json").read_text()
+    (tmp_path / "changed.json").write_text(content.replace("0.080000001", "0.080000002"))
+    status, out, err = safe_envs_command("check", *arguments)
+    assert (status, out) == (2, "")
+    assert text in err
+    assert "Traceback" not in err

@@ -1,0 +1,105 @@
+"""The checker of certificates, against some that are true and false by hand."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs.dynamics.polynomial import Polynomial
+from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.certificates import enclosures
+from safe_envs.wrappers.certificates.checker import check
+from tests.wrappers.certificates.examples import FALSE, TRUE, UNDECIDED, R, brownian, with_plant, x
+
+
+@pytest.mark.parametrize("name", TRUE)
+def test_what_is_true_is_proved_also_by_1e_9(name):
+    found = check(TRUE[name], boxes=20_000)
+    assert (found.word, found.statement, found.state) == ("checked", "", None)
+    assert found.boxes == sum(part.boxes for part in found.parts)
+
+
+@pytest.mark.parametrize("name", FALSE)
+def test_what_is_false_is_refuted_also_by_1e_9_at_a_state(name):
+    found = check(FALSE[name], boxes=20_000)
+    assert found.word == "refuted"
+    if name != "a < 0":
+        low, high = np.array(FALSE[name].plant.workspace, dtype=float).T
+        assert found.state is not None
+        assert np.all((low <= found.state) & (found.state <= high))
+
+
+@pytest.mark.parametrize("name", UNDECIDED)
+def test_what_it_cannot_know_is_undecided_with_the_reason(name):
+    found = check(UNDECIDED[name], boxes=5_000)
+    assert found.word == "undecided"
+    part = next(part for part in found.parts if part.name == found.statement)
+    assert "boxes are left" in part.reason
+    assert part.state is not None
+
+
+def test_limits_end_a_check_as_undecided():
+    assert check(TRUE["the disk"], boxes=10).word == "undecided"
+    assert check(TRUE["the disk"], seconds=0.0).word == "undecided"
+
+
+def test_functions_that_it_does_not_know_are_an_error():
+    with pytest.raises(ConfigurationError, match="sign"):
+        check(with_plant(brownian(), drift=(sp.sign(x),)))
+
+
+FUNCTIONS = [
+    *(sp.sin(x), sp.cos(x), sp.exp(x), sp.tanh(x), sp.atan(x), sp.Abs(x), x**2, x**3, x**-1, x**-2),
+    *(sp.log(x + 3), sp.sqrt(x + 3), (x + 3) ** R(-3, 2), sp.Max(x, x**2), sp.Min(x, 1 - x, 0)),
+    *(sp.sqrt(x**2 * 1 + 1) / (2 + sp.sin(3 * x)), sp.exp(sp.sin(x) * x) - x / 3, sp.pi * x),
+]
+
+
+@pytest.mark.parametrize("e", FUNCTIONS, ids=str)
+def test_enclosures_hold_the_values(e):
+    rng = np.random.default_rng(0)
+    middles, radii = rng.uniform(-2, 2, 300), 10 ** rng.uniform(-9, 0, 300)
+    known = {
+        x: enclosures.form(middles, radii[None], np.zeros(300), middles - radii, middles + radii)
+    }
+    with np.errstate(all="ignore"):
+        found = enclosures.value_of(e, known, 1)
+    points = rng.uniform(-1, 1, (20, 300))
+    points[:2] = [[-1], [1]]
+    exact = sp.lambdify(x, e, "mpmath")
+    for t in points[:5]:
+        for k in range(0, 300, 7):
+            value = exact(sp.Float(middles[k], 30) + sp.Float(t[k], 30) * sp.Float(radii[k], 30))
+            linear = found.c[k] + found.b[0, k] * t[k]
+            slack = 1e-15 * (1 + abs(value))
+            assert found.low[k] - slack <= value <= found.high[k] + slack
+            assert abs(value - linear) <= found.rho[k] + slack
+
+
+def test_the_forms_of_a_polynomial_hold_its_derivatives():
+    rng = np.random.default_rng(1)
+    y = sp.Symbol("y", real=True)
+    coefficients = {
+        (i, j): Fraction(int(rng.integers(-999, 999)), 37) for i in range(9) for j in range(7)
+    }
+    psi = Polynomial(
+        (x, y), (Fraction(1, 3), Fraction(-1, 7)), (Fraction(3, 2), Fraction(2, 3)), coefficients
+    )
+    middles, radii = rng.uniform(-1, 1, (2, 50)), 10 ** rng.uniform(-6, -1, (2, 50))
+    orders = [(), (0,), (1,), (0, 0), (0, 1), (1, 1)]
+    forms = enclosures.PolynomialForms(psi)(middles, radii, orders)
+    points = rng.uniform(-1, 1, (2, 50))
+    for order, form in zip(orders, forms, strict=True):
+        derived = psi
+        for i in order:
+            derived = derived.derivative(i)
+        values = derived.values((middles + points * radii).T)
+        slack = 1e-10 * np.abs(values).max()
+        linear = form.c + (form.b * points).sum(0)
+        assert np.all(np.abs(values - linear) <= form.rho + slack)
+        assert np.all((form.low - slack <= values) & (values <= form.high + slack))
+        # They are of second order.
+        assert np.median(form.rho / np.abs(form.b).sum(0)) < 1e-2
