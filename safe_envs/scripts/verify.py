@@ -101,7 +101,7 @@ def verify(
                 found, actor, episodes=episodes, seed=seed, engine=engine, progress=tell
             )
         bounds, measurements = judged(bounds, measurements, found)
-    chain = safety_chain(found, starts, bounds, measurements)
+    chain = safety_chain(found, starts, bounds, measurements, policy)
     config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
     title = title_of(known, arguments)
     answer = VerifyAnswer(title, config, policy, found, starts, bounds, measurements, chain)

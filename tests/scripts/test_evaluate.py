@@ -416,7 +416,7 @@ def test_the_columns_read_as_a_chain():
     rate = f"100.0 % [{100 * rows[0].ci_low:.1f}, 100.0]"
     found = printed(attainable(0.9, 0.99981))
     assert f" >= 80.0 %  {rate}  99.99 %  " in line_of(found, "scbf")
-    assert "the bound for held input, of every policy under the filter" in found
+    assert "from left to right, for the env's own steps: the bound for held input" in found
     # A bound above what is attainable, and a rate above it: the table is wrong.
     low = printed(attainable(0.3, 0.7))
     assert "attain-" not in low

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager
-from safe_envs.agents.evaluation.held_bound import HeldAverager, held_averager_of
-from safe_envs.agents.evaluation.resolved import FilterParts
+from safe_envs.agents.evaluation.held_input import HeldAverager, held_averager_of
 from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 STEPS_ONLY = "its table is of the env's own steps"
@@ -21,23 +19,18 @@ class BoundAverager:
     """Averages both bounds of a filter over the starts of episodes.
 
     Args:
-        parts: of the filter.
-        problem: what is simulated.
-        spec: what is asked for.
+        of: the policy and the filter.
+        monitoring: where h is checked, "discrete" or "continuous".
         why_not: why not to look for bounds at all, if so.
     """
 
     def __init__(
-        self,
-        parts: FilterParts,
-        problem: SafetyProblem,
-        spec: EvaluationSpec,
-        why_not: str | None = None,
+        self, of: FilteredPolicy, monitoring: str = "discrete", why_not: str | None = None
     ) -> None:
-        self._held: HeldAverager = held_averager_of(parts, problem, spec, why_not)
+        self._held: HeldAverager = held_averager_of(of, monitoring, why_not)
         self._continuous: GuaranteeAverager | None = None
-        if not isinstance(parts, PromiseSettings):
-            self._continuous = GuaranteeAverager(parts, problem, spec.knowledge, why_not)
+        if not isinstance(of.parts, PromiseSettings):
+            self._continuous = GuaranteeAverager(of.parts, of.problem, of.knowledge, why_not)
 
     def add(self, starts: np.ndarray) -> None:
         """Add the starts of a batch, shape (E, n)."""

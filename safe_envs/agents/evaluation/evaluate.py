@@ -14,6 +14,7 @@ from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.guarantees import together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
 from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
@@ -65,7 +66,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     its return and minimum h are of the whole episode.
 
     Each row has two bounds, averaged over the starts: one for the env's own steps, see
-    `safe_envs.agents.evaluation.held_bound`, and the largest one for continuous control, see
+    `safe_envs.agents.evaluation.held_input`, and the largest one for continuous control, see
     `safe_envs.wrappers.verification.bounds`, which is proved where a judge proves its hypotheses
     and numbers, and estimated otherwise. A bound that the episodes contradict is withheld: see
     `safe_envs.agents.evaluation.contradiction`.
@@ -222,9 +223,16 @@ class _Runner:
         """Run the episodes under a filter, with each identification, and take the time in s."""
         resolved, episodes = self._resolved, self._spec.episodes
         found = []
+        spec, given = self._spec, self._spec.policy
+        # The name of an object says nothing.
+        policy = given if isinstance(given, str) else ""
         averagers = [
-            BoundAverager(c, resolved.problem, self._spec, self._why_no_bound)
-            for c in resolved.filters[name]
+            BoundAverager(
+                FilteredPolicy(resolved.problem, parts, spec.knowledge, policy),
+                spec.monitoring,
+                self._why_no_bound,
+            )
+            for parts in resolved.filters[name]
         ]
         # The search for bounds is over: what is timed are episodes.
         begun = time.perf_counter()

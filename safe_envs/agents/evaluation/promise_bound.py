@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from safe_envs.agents.evaluation.resolved import FilterParts
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.promise_memory import ROUNDING
@@ -52,7 +52,7 @@ class PromiseBound:
         )
 
     def at(self, starts: np.ndarray) -> np.ndarray:
-        """Return p_0 at starts; see `HeldBound.at`."""
+        """Return p_0 at starts; see `HeldInputBound.at`."""
         return self._filter.start(tuple(np.ascontiguousarray(starts.T)))
 
     def contradiction(self, visited: VisitedStates) -> str:
@@ -67,16 +67,12 @@ class PromiseBound:
         return f"no input kept p_k in a step, which fell by {lost:.2g}: the table is wrong"
 
 
-def promise_bound(
-    parts: FilterParts, problem: SafetyProblem, knowledge: str
-) -> PromiseBound | None:
+def promise_bound(of: FilteredPolicy) -> PromiseBound | None:
     """Return the bound of a promise filter; None for other filters.
 
     Args:
-        parts: of the filter.
-        problem: what is simulated.
-        knowledge: of the filter, "model" or "plant".
+        of: a policy, which does not matter, and the filter.
     """
-    if not isinstance(parts, PromiseSettings):
+    if not isinstance(of.parts, PromiseSettings):
         return None
-    return PromiseBound(parts, problem, knowledge)
+    return PromiseBound(of.parts, of.problem, of.knowledge)

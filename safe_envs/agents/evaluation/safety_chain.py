@@ -15,7 +15,8 @@ import numpy as np
 from safe_envs.agents.evaluation.attainable import SURE, AttainableSafety, contradicted
 from safe_envs.agents.evaluation.bound_check import Measurement
 from safe_envs.agents.evaluation.contradiction import judged
-from safe_envs.agents.evaluation.held_bound import HeldAverager, held_bound_of
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
+from safe_envs.agents.evaluation.held_input import HeldAverager, held_bound_of
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.visited_states import VisitedStates
@@ -62,6 +63,7 @@ def safety_chain(
     starts: np.ndarray,
     bounds: Sequence[Bound],
     measurements: Sequence[Measurement],
+    policy: str = "nominal",
 ) -> SafetyChain:
     """Return the chain of conditions, without what contradicts another part of it.
 
@@ -70,10 +72,12 @@ def safety_chain(
         starts: over which the bounds are averaged, shape (B, n).
         bounds: for continuous control, as far as they are not contradicted.
         measurements: of the problem's start first; none without a simulation.
+        policy: name of the one that was simulated.
     """
     formulas = verification.formulas
     problem, name = formulas.problem, spec_of(formulas.conditions)
-    averager = HeldAverager(held_bound_of(tuple(formulas.conditions), problem, formulas.knowledge))
+    filtered = FilteredPolicy(problem, tuple(formulas.conditions), formulas.knowledge, policy)
+    averager = HeldAverager(held_bound_of(filtered))
     averager.add(starts)
     first = measurements[0] if measurements else None
     visited = first.visited if first and first.visited else [VisitedStates.nothing(problem)]

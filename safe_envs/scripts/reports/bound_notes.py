@@ -18,8 +18,8 @@ from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.wrappers.conditions.text_parts import names_promise
 
 CHAIN = (
-    "from left to right, for the env's own steps: the bound for held input, of every policy under"
-    " the filter, the measured rate, and what any policy can attain."
+    "from left to right, for the env's own steps: the bound for held input, the measured rate, and"
+    " what any policy can attain."
 )
 """What the columns of the chain are."""
 

@@ -1,8 +1,8 @@
 """Bounds for the env's own steps: the input is held, and safety is judged at control instants.
 
-Each is a lower bound on the probability of a safe episode of every policy under a filter, and is
-made by one of `MAKERS`, which know what filters are made of: a table of a promise filter, or a
-certificate of the step. What makes a new kind of bound is added there, and nowhere else.
+Each is a lower bound on the probability of a safe episode of a policy under a filter, or of every
+policy under it, and is made by one of `MAKERS`: from the table of a promise filter, say. What makes
+a new kind of bound is added there, and nowhere else.
 """
 
 from __future__ import annotations
@@ -15,16 +15,14 @@ from typing import Literal, Protocol
 import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import without_held
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.promise_bound import promise_bound
-from safe_envs.agents.evaluation.resolved import FilterParts
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
-from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.problem.problem import SafetyProblem
 
 
-class HeldBound(Protocol):
+class HeldInputBound(Protocol):
     """A lower bound on the probability of a safe episode, in the env's own steps."""
 
     @property
@@ -56,9 +54,8 @@ class HeldBound(Protocol):
         ...
 
 
-Maker = Callable[[FilterParts, SafetyProblem, str], HeldBound | None]
-"""From what a filter is made of, a problem, and what the filter knows ("model" or "plant"), to its
-bound; None where such a bound is not for such filters."""
+Maker = Callable[[FilteredPolicy], HeldInputBound | None]
+"""From a policy under a filter to its bound; None where such a bound is not for such filters."""
 
 MAKERS: tuple[Maker, ...] = (promise_bound,)
 """All that makes such bounds, the best one first."""
@@ -69,25 +66,18 @@ _BETWEEN = "it is of control instants, not of the time between them"
 
 
 def held_bound_of(
-    parts: FilterParts,
-    problem: SafetyProblem,
-    knowledge: str,
-    makers: Sequence[Maker] | None = None,
-) -> HeldBound | str:
-    """Return the bound of a filter for the env's own steps, or why there is none.
+    of: FilteredPolicy, makers: Sequence[Maker] | None = None
+) -> HeldInputBound | str:
+    """Return the bound of a policy under a filter for the env's own steps, or why there is none.
 
     Args:
-        parts: of the filter.
-        problem: what is simulated.
-        knowledge: of the filter, "model" or "plant".
+        of: the policy and the filter.
         makers: of bounds; by default all.
     """
-    if not parts:
-        return NO_FILTER
-    made = (make(parts, problem, knowledge) for make in (MAKERS if makers is None else makers))
+    made = (make(of) for make in (MAKERS if makers is None else makers))
     found = [bound for bound in made if bound is not None]
     if not found:
-        return NO_MAKER
+        return NO_MAKER if of.parts else NO_FILTER
     best = next((bound for bound in found if not bound.why_none), found[0])
     return best.why_none or best
 
@@ -99,7 +89,7 @@ class HeldAverager:
         bound: of the filter, or why there is none.
     """
 
-    def __init__(self, bound: HeldBound | str) -> None:
+    def __init__(self, bound: HeldInputBound | str) -> None:
         self._bound = bound
         self._total, self._squares, self._count = RunningSum(), RunningSum(), 0
 
@@ -135,19 +125,16 @@ class HeldAverager:
         )
 
 
-def held_averager_of(
-    parts: FilterParts, problem: SafetyProblem, spec: EvaluationSpec, why_not: str | None
-) -> HeldAverager:
-    """Return what averages the bound of a filter for the env's own steps.
+def held_averager_of(of: FilteredPolicy, monitoring: str, why_not: str | None) -> HeldAverager:
+    """Return what averages the bound of a policy under a filter for the env's own steps.
 
     Args:
-        parts: of the filter.
-        problem: what is simulated.
-        spec: what is asked for.
+        of: the policy and the filter.
+        monitoring: where h is checked, "discrete" or "continuous".
         why_not: why not to look for a bound at all, if so.
     """
-    if parts and spec.monitoring == "continuous":
+    if monitoring == "continuous":
         why_not = why_not or _BETWEEN
-    return HeldAverager(
-        why_not if parts and why_not else held_bound_of(parts, problem, spec.knowledge)
-    )
+    if why_not:
+        return HeldAverager(why_not if of.parts else NO_FILTER)
+    return HeldAverager(held_bound_of(of))

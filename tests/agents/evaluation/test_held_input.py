@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.held_bound import (
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
+from safe_envs.agents.evaluation.held_input import (
     MAKERS,
     NO_FILTER,
     NO_MAKER,
@@ -17,7 +18,6 @@ from safe_envs.agents.evaluation.held_bound import (
 )
 from safe_envs.agents.evaluation.promise_bound import PromiseBound
 from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.value.promise_text import PromiseSettings
@@ -55,26 +55,26 @@ def nothing(problem):
 
 def test_each_filter_has_the_bound_of_the_first_that_makes_one(problem):
     conditions = parse_conditions("scbf", problem)
-    assert held_bound_of((), problem, "model") == NO_FILTER
-    assert held_bound_of(conditions, problem, "model") == NO_MAKER
-    asked = []
-
-    def none(*arguments):
-        asked.append(arguments)
-
+    unfiltered = FilteredPolicy(problem, (), "model", "nominal")
+    filtered = FilteredPolicy(problem, conditions, "plant", "nominal")
+    assert held_bound_of(unfiltered) == NO_FILTER
+    assert held_bound_of(filtered) == NO_MAKER
     first, second = Parabola(why_none="not of this plant"), Parabola()
-    found = [lambda *_: first, lambda *_: second]
-    assert held_bound_of(conditions, problem, "plant", [none, *found]) is second
-    assert asked == [(conditions, problem, "plant")]
-    assert held_bound_of(conditions, problem, "plant", found[:1]) == "not of this plant"
+    found = [lambda _: None, lambda _: first, lambda _: second]
+    assert held_bound_of(filtered, found) is second
+    assert held_bound_of(filtered, found[:2]) == "not of this plant"
+    # A policy alone may have one too.
+    assert held_bound_of(unfiltered, found) is second
 
 
 def test_the_makers_know_the_promise_filter(problem):
     short = problem_of(SCALAR, horizon=0.05)
-    (made,) = [make(PromiseSettings(0.9), short, "model") for make in MAKERS]
+    of_filter = FilteredPolicy(short, PromiseSettings(0.9), "model", "random")
+    (made,) = [make(of_filter) for make in MAKERS]
     assert isinstance(made, PromiseBound)
     assert made.word == "computed"
-    assert [make(parse_conditions("scbf", problem), problem, "model") for make in MAKERS] == [None]
+    of_condition = FilteredPolicy(problem, parse_conditions("scbf", problem), "model", "random")
+    assert [make(of_condition) for make in MAKERS] == [None]
 
 
 def test_the_mean_over_starts_has_an_error(nothing):
@@ -126,7 +126,9 @@ def test_without_a_bound_there_is_a_reason(nothing):
 def test_what_is_watched_between_instants_has_none(
     problem, nothing, text, monitoring, why_not, note
 ):
-    spec = EvaluationSpec(SCALAR, monitoring=monitoring)
     parts = parse_conditions(text, problem) if text else ()
-    row = held_averager_of(parts, problem, spec, why_not).put_in(BoundSummary(), nothing)
+    averager = held_averager_of(
+        FilteredPolicy(problem, parts, "model", "nominal"), monitoring, why_not
+    )
+    row = averager.put_in(BoundSummary(), nothing)
     assert row.held_note.endswith(note)
