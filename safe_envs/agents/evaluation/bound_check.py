@@ -77,6 +77,12 @@ class Measurement:
     horizons: tuple[Horizon, ...]
     visited: tuple[VisitedStates, ...] = ()
 
+    def ends(self, horizon: Horizon) -> tuple[float, float]:
+        """Return the upper ends of the intervals of its rate, of 95 % and of `SURE`."""
+        if self.repeats:
+            return horizon.rate, horizon.rate
+        return horizon.ci_high, rate_interval(horizon.safe, self.episodes, SURE)[1]
+
 
 def judged(
     bounds: Sequence[Bound], measurements: Sequence[Measurement], verification: Verification
@@ -96,7 +102,7 @@ def judged(
     for m in measurements:
         for h in m.horizons:
             for bound in h.bounds:
-                below = by_rate(bound.value, _end(m, h, bound.status))
+                below = by_rate(bound.value, end_for(bound.status, *m.ends(h)))
                 if below:
                     of_each.setdefault(bound.name, f"from {m.start}, up to {h.time:g} s, {below}")
 
@@ -109,14 +115,6 @@ def judged(
     return [without(bound) for bound in bounds], [
         replace(m, horizons=tuple(map(cleared, m.horizons))) for m in measurements
     ]
-
-
-def _end(measurement: Measurement, horizon: Horizon, word: str) -> float:
-    """Return what a bound may not be above."""
-    if measurement.repeats:
-        return horizon.rate
-    sure = rate_interval(horizon.safe, measurement.episodes, SURE)[1]
-    return end_for(word, horizon.ci_high, sure)
 
 
 def measure(

@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.attainable import SURE, AttainableSafety, contradicted
+from safe_envs.agents.evaluation.attainable import AttainableSafety, contradicted
 from safe_envs.agents.evaluation.bound_check import Measurement
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.held_input import HeldAverager, held_bound_of
 from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.agents.evaluation.yardstick import against_attainable, best_at_hand
 from safe_envs.wrappers import spec_of
@@ -92,9 +91,7 @@ def safety_chain(
         h = first.horizons[0]
         rates = h.rate, h.ci_low, h.ci_high
         # The bounds for continuous control were judged before, with all measurements.
-        ends = (h.ci_high, rate_interval(h.safe, first.episodes, SURE)[1])
-        ends = (h.rate, h.rate) if first.repeats else ends
-        held = judged(replace(summary, continuous_bound=None), *ends)
+        held = judged(replace(summary, continuous_bound=None), *first.ends(h))
         summary = replace(held, continuous_bound=summary.continuous_bound)
         episodes = 1 if first.repeats else first.episodes
         best = best and contradicted(best, [(name, round(h.rate * episodes), episodes)])
