@@ -131,7 +131,7 @@ class ExpressionProgram:
     def _slot(self, expression: Any) -> int:
         """Return the place of the result of an expression, after adding what computes it."""
         if expression not in self._known:
-            if expression.is_number:
+            if _is_plain(expression):
                 self._constants.append((self._size, self._arithmetic.constant(expression)))
             else:
                 operation, parts = self._operation(expression)
@@ -169,15 +169,17 @@ class ExpressionProgram:
     def _power(self, base: Any, exponent: Any) -> tuple[Operation, Sequence[Any]]:
         ops = self._arithmetic
         if exponent.is_number:
-            value = float(exponent) if exponent.is_Rational or exponent.is_Float else 0.0
-            if value and value.is_integer():
-                return partial(ops.integer_power, n=int(value)), [base]
-            if value == 0.5:
+            # Exactly: a number that rounds to a whole one is none.
+            exact = sp.Rational(exponent) if exponent.is_Rational or exponent.is_Float else None
+            if exact and exact.is_Integer:
+                return partial(ops.integer_power, n=int(exact)), [base]
+            if exact == sp.Rational(1, 2):
                 return ops.square_root, [base]
-            if value == -0.5:
+            if exact == sp.Rational(-1, 2):
                 return lambda a: ops.reciprocal(ops.square_root(a)), [base]
-            constant = ops.constant(exponent)
-            return lambda a: ops.real_power(a, constant), [base]
+            if _is_plain(exponent):
+                constant = ops.constant(exponent)
+                return lambda a: ops.real_power(a, constant), [base]
         return ops.function(sp.exp), [sp.Mul(exponent, sp.log(base), evaluate=False)]
 
     def _folded(self, operation: Operation, *values: Any) -> Any:
@@ -213,6 +215,14 @@ class ExpressionProgram:
                 for place in done:
                     memory[place] = None
         return tuple(memory[place] for place in self._results)
+
+
+def _is_plain(expression: Any) -> bool:
+    """Return whether an expression is a number that is not composed of others.
+
+    A composed one is carried out, for digits of sin(1)^2 + cos(1)^2 - 1 say nothing of its sign.
+    """
+    return expression.is_Rational or expression.is_Float or isinstance(expression, sp.NumberSymbol)
 
 
 def _require_known(expression: Any) -> None:

@@ -24,6 +24,7 @@ from safe_envs.dynamics.interval_arithmetic import Interval, negative
 
 EPS = 2.0**-52
 TINY = 1e-300
+SMALLEST = 5e-324
 MORE = 1.0 + 64 * EPS
 
 

@@ -11,6 +11,7 @@ import sympy as sp
 from safe_envs.dynamics.first_order_forms import (
     EPS,
     MORE,
+    SMALLEST,
     TINY,
     Form,
     is_finite,
@@ -159,7 +160,8 @@ class FormArithmetic:
         distance = np.maximum(below, above) * MORE
         center, error = _ball(middles)
         rise, uncertain = _ball(rises)
-        curved = 0.5 * distance * distance * MORE
+        # A square that underflows is not 0: the curvature may be as large as that is small.
+        curved = 0.5 * distance * distance * MORE + SMALLEST
         low = -_times(-np.minimum(bend.low, 0.0), curved)
         high = _times(np.maximum(bend.high, 0.0), curved)
         half, spread = _ball(Interval(low, high))

@@ -207,8 +207,12 @@ class IntervalArithmetic:
 
     def real_power(self, a: Interval, exponent: Interval) -> Interval:
         """Return a^e, the whole line where a reaches below 0; see `IntervalArithmetic`."""
-        if exponent.low < 0:
+        if exponent.high <= 0:
             return self.reciprocal(self.real_power(a, negative(exponent)))
+        if exponent.low < 0:
+            parts = Interval(exponent.low, 0.0), Interval(0.0, exponent.high)
+            below, above = (self.real_power(a, part) for part in parts)
+            return Interval(np.minimum(below.low, above.low), np.maximum(below.high, above.high))
         outside = np.less(a.low, 0)
         lows = [np.power(np.maximum(a.low, 0.0), e) for e in exponent]
         highs = [np.power(np.maximum(a.high, 0.0), e) for e in exponent]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from safe_envs.scripts.benchmark import benchmark
 from safe_envs.scripts.best import best
+from safe_envs.scripts.certify import certify
 from safe_envs.scripts.check import check
 from safe_envs.scripts.demo import demo
 from safe_envs.scripts.doctor import doctor
@@ -28,6 +29,7 @@ app = make_app(
         "leaderboard": leaderboard,
         "best": best,
         "verify": verify,
+        "certify": certify,
         "check": check,
         "frontier": frontier,
         "render": render,

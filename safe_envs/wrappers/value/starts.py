@@ -56,7 +56,7 @@ def start_values(look_ahead: LookAhead, problem: SafetyProblem, seed: int = 0) -
     count = next((n for most, n in _STARTS.items() if boxes <= most), _FEWEST)
     x = draw_starts(problem, count, seed)
     lower, upper = look_ahead.start_bounds(x)
-    below, above = _margin(lower), _margin(upper)
+    below, above = sampling_margin(lower), sampling_margin(upper)
     return StartValues(
         max(0.0, float(lower.mean()) - below),
         min(1.0, float(upper.mean()) + above),
@@ -101,8 +101,14 @@ def draw_starts(problem: SafetyProblem, count: int, seed: int) -> Components:
     )
 
 
-def _margin(values: np.ndarray) -> float:
-    """Return how far the mean of all values in [0, 1] may be from that of a sample, one-sided."""
+def sampling_margin(values: np.ndarray) -> float:
+    """Return how far the mean of all values may be from that of a sample, at 99.99 % confidence.
+
+    Args:
+        values: of the sample, in [0, 1], shape (B,); one value is that of all starts.
+
+    Source: see `start_values`.
+    """
     n = len(values)
     if n == 1:
         return 0.0

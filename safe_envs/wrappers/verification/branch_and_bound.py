@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_envs.dynamics.first_order_forms import Form
+from safe_envs.wrappers.verification.bisection import axis_of, middle_of
 from safe_envs.wrappers.verification.statement import Enclosures, Statement
 
 _BATCH = 4096
@@ -49,6 +49,7 @@ class BranchAndBound:
         self._upper = np.array([math.inf])
         self._width = high - low
         self._settled = -math.inf
+        self._stuck: np.ndarray | None = None
         self._begun = time.monotonic()
         self.best, self.best_state, self.boxes = -math.inf, None, 0
         self.guide = -math.inf
@@ -61,9 +62,10 @@ class BranchAndBound:
 
     @property
     def widest_open(self) -> np.ndarray:
-        """The box whose bound is worst, shape (2, n)."""
-        worst = int(np.nan_to_num(self._upper, nan=math.inf).argmax())
-        return np.array([self._low[:, worst], self._high[:, worst]])
+        """The box that bisection does not help, or whose bound is worst, shape (2, n)."""
+        worst = int(self._upper.argmax())
+        open_ = np.array([self._low[:, worst], self._high[:, worst]])
+        return open_ if self._stuck is None else self._stuck
 
     @property
     def upper(self) -> float:
@@ -91,7 +93,9 @@ class BranchAndBound:
         )
 
     def tried(self, x: np.ndarray) -> bool:
-        """Look at states, shape (n, B), and return whether one of them refutes the statement."""
+        """Look at states in the box, shape (n, B), and return whether one refutes the statement."""
+        low, high = (end[:, None] for end in self._statement.ends)
+        x = x[:, ((low <= x) & (x <= high)).all(axis=0)]
         if not x.size:
             return False
         found = self._program(x, x)
@@ -125,7 +129,7 @@ class BranchAndBound:
         value = np.where(likely, -found.claim.center, -np.inf)
         chosen = np.argsort(-value)[:_TRIED]
         chosen = chosen[open_[chosen]]
-        middle = _middle(low[:, chosen], high[:, chosen])
+        middle = middle_of(low[:, chosen], high[:, chosen])
         if self.tried(middle):
             return ""
         if found.zeros:
@@ -193,6 +197,7 @@ class BranchAndBound:
         if len(found.zeros) != 1:
             return False
         fails = found.inside & (found.claim.range.high < 0.0) & np.isfinite(found.claim.range.low)
+        fails &= found.zeros[0].smooth
         for i in chosen[fails[chosen]].tolist():
             upward = found.zeros[0].slopes[:, i] >= 0.0
             ends = np.stack(
@@ -205,7 +210,7 @@ class BranchAndBound:
             (zero,) = self._program(ends, ends).zeros
             if zero.range.low[0] > 0.0 and zero.range.high[1] < 0.0:
                 self.best = float(-found.claim.range.high[i])
-                self.best_state = _middle(low[:, [i]], high[:, [i]])[:, 0]
+                self.best_state = middle_of(low[:, [i]], high[:, [i]])[:, 0]
                 return True
         return False
 
@@ -219,24 +224,32 @@ class BranchAndBound:
     ) -> str:
         """Put the halves of boxes back; return why that is of no use, in words."""
         low, high, upper = low[:, open_], high[:, open_], upper[open_]
-        axis = self._axis(low, high, found, open_)
+        forms = (found.claim, *found.region, *found.zeros)
+        axis = axis_of(low, high, self._width, forms, open_)
         at = np.arange(len(axis))
-        middle = _middle(low, high)[axis, at]
+        middle = middle_of(low, high)[axis, at]
         stuck = (middle <= low[axis, at]) | (middle >= high[axis, at]) | (np.abs(middle) > _FAR)
         with np.errstate(invalid="ignore"):
             narrow = ((high - low) <= _NARROW * np.minimum(self._width, 1.0)[:, None]).all(axis=0)
         rough = narrow & ~found.smooth[open_] & found.inside[open_]
+        for form in found.zeros:
+            rough |= narrow & ~form.smooth[open_]
         below, above = high.copy(), low.copy()
         below[axis, at], above[axis, at] = middle, middle
         if (stuck | rough).any():
             i = int((stuck | rough).argmax())
-            self._low, self._high = low[:, [i]], high[:, [i]]
-            self._upper = upper[[i]]
+            self._stuck = np.array([low[:, i], high[:, i]])
+            self._leave(low, high, upper)  # All: a bound is over all that are left.
             return self._why_stuck(bool(rough[i]), bool(found.smooth[open_][i]))
-        self._low = np.concatenate([self._low, low, above], axis=1)
-        self._high = np.concatenate([self._high, below, high], axis=1)
-        self._upper = np.concatenate([self._upper, upper, upper])
+        self._leave(low, below, upper)
+        self._leave(above, high, upper)
         return ""
+
+    def _leave(self, low: np.ndarray, high: np.ndarray, upper: np.ndarray) -> None:
+        """Add boxes to those that are left."""
+        self._low = np.concatenate([self._low, low], axis=1)
+        self._high = np.concatenate([self._high, high], axis=1)
+        self._upper = np.concatenate([self._upper, upper])
 
     def _why_stuck(self, rough: bool, smooth: bool) -> str:
         name, (low, high) = self._statement.name, self.widest_open
@@ -246,43 +259,13 @@ class BranchAndBound:
         )
         if rough or not smooth:
             return (
-                f"{name}: not twice continuously differentiable near {near}, where evaluation meets"
-                " a kink, a pole, or the edge of a domain"
+                f"{name}: not {self._asked} near {near}, where evaluation meets a kink, a jump, a"
+                " pole, or the edge of a domain"
             )
         if not np.isfinite(high - low).all() or max(abs(low).max(), abs(high).max()) > _FAR:
             return f"{name}: the region has no end, {near}"
         return f"{name}: equal to rounding near {near}; a larger margin would tell"
 
-    def _axis(
-        self, low: np.ndarray, high: np.ndarray, found: Enclosures, open_: np.ndarray
-    ) -> np.ndarray:
-        """Return the axis to bisect of each box, shape (B,)."""
-        with np.errstate(all="ignore"):
-            share = (high - low) / np.where(np.isfinite(self._width), self._width, 1.0)[:, None]
-            share = np.where(np.isfinite(share), share, 1e30)
-            share = share / share.sum(axis=0)
-            score = 1e-3 * share
-            for form in (found.claim, *found.region, *found.zeros):
-                score = score + _variation(form, open_, share)
-        return np.where(np.isfinite(score), score, 0.0).argmax(axis=0)
-
-
-def _variation(form: Form, open_: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the part of a range that each axis makes, shape (n, B)."""
-    slopes, radius = np.abs(form.slopes[:, open_]), form.radius[open_]
-    total = slopes.sum(axis=0) + radius
-    part = (slopes + share * radius) / total
-    return np.where(np.isfinite(part) & (total > 0.0), part, share)
-
-
-def _middle(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return midpoints; where an end is infinite, numbers that are far beyond the other one."""
-    with np.errstate(invalid="ignore"):
-        middle = 0.5 * low + 0.5 * high
-    middle = np.where(np.isneginf(low) & np.isposinf(high), 0.0, middle)
-    middle = np.where(
-        np.isfinite(low) & np.isposinf(high), np.maximum(2.0 * low, low + 1.0), middle
-    )
-    return np.where(
-        np.isneginf(low) & np.isfinite(high), np.minimum(2.0 * high, high - 1.0), middle
-    )
+    @property
+    def _asked(self) -> str:
+        return "twice continuously differentiable" if self._statement.smooth else "continuous"

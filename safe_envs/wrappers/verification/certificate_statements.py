@@ -16,7 +16,7 @@ import sympy as sp
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.input_terms import largest_input_term
+from safe_envs.wrappers.verification.input_terms import largest_input_term, not_polynomial
 from safe_envs.wrappers.verification.judge import Verdict, judge, supremum
 from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
 
@@ -73,7 +73,12 @@ class CertificateStatements:
             for j in range(len(plant.bounds))
         ]
         if plant.policy:
-            found += sum(u * a for u, a in zip(plant.policy, moved, strict=True))
+            # What is applied: an input beyond its bounds is cut to them.
+            applied = [
+                sp.Max(low, sp.Min(high, u))
+                for u, (low, high) in zip(plant.policy, plant.bounds, strict=True)
+            ]
+            found += sum(u * a for u, a in zip(applied, moved, strict=True))
         else:
             found += largest_input_term(moved, plant.bounds)
         for (i, j), symbol in curves.items():
@@ -99,6 +104,13 @@ class CertificateStatements:
             positive=positive,
             polynomials=self.polynomials,
         )
+
+    def coefficients(self) -> Statement:
+        """Return the statement that f, g and sigma are continuous on G."""
+        plant = self.plant
+        entries = (*plant.drift, *itertools.chain(*plant.input_matrix, *plant.diffusion))
+        statement = self.statement("f, g and sigma are continuous on G", sp.Integer(1))
+        return replace(statement, continuous=not_polynomial(entries, plant.states))
 
     @property
     def value(self) -> sp.Symbol:
@@ -168,12 +180,17 @@ def judged(
     Returns:
         The name and the verdict of each; it is a proof where all are proved.
     """
+    name = "a >= 0, m >= 0 and c > 0"
+    if min(certificate.rate, certificate.shortfall) < 0 or certificate.supremum <= 0:
+        # With a < 0 an end of the episode, at the edge of the workspace, would be worth too much.
+        return [(name, Verdict("refuted", 0, reason=f"not {name}"))]
     parts = CertificateStatements(certificate.plant, certificate.psi, certificate.rate)
     c, m = sp.Rational(certificate.supremum), sp.Rational(certificate.shortfall)
     statements = [
         parts.statement("psi <= c", c - parts.value),
         parts.statement("A psi >= -a psi - m", parts.generator + m),
         *parts.edges(),
+        parts.coefficients(),
     ]
     return [(statement.name, judge(statement, budget)) for statement in statements]
 

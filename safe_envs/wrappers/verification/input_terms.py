@@ -1,4 +1,4 @@
-"""The best input within its bounds, in expressions for the judge."""
+"""Parts of systems in expressions for the judge."""
 
 from __future__ import annotations
 
@@ -27,3 +27,14 @@ def largest_input_term(coefficients: Sequence[Any], bounds: Sequence[tuple[Any, 
 def exact_number(value: float) -> Any:
     """Return the decimal that a float is written as, exactly; infinities stay what they are."""
     return sp.Rational(repr(float(value))) if math.isfinite(value) else sp.Float(value)
+
+
+def not_polynomial(expressions: Sequence[Any], states: Sequence[sp.Symbol]) -> tuple[Any, ...]:
+    """Return those of several expressions that may fail to be continuous, for a form alone.
+
+    Args:
+        expressions: of the states.
+        states: symbols.
+    """
+    found = (sp.sympify(e) for e in expressions)
+    return tuple(dict.fromkeys(e for e in found if not e.is_polynomial(*states)))

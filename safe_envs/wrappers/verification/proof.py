@@ -15,7 +15,11 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.verification.assumptions import JOINT
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.input_terms import exact_number, largest_input_term
+from safe_envs.wrappers.verification.input_terms import (
+    exact_number,
+    largest_input_term,
+    not_polynomial,
+)
 from safe_envs.wrappers.verification.judge import Verdict, Word, judge, supremum
 from safe_envs.wrappers.verification.statement import Statement
 
@@ -124,6 +128,16 @@ class ChainProof:
         return judge(
             replace(self._region, name="the barrier on G", smooth=self._chain), self._budget
         )
+
+    @cached_property
+    def continuous(self) -> Verdict:
+        """Whether f, g and sigma are continuous on G."""
+        system = self._formulas.system
+        entries = [
+            e for part in (system.drift, system.input_matrix, system.diffusion) for e in part
+        ]
+        asked = not_polynomial([system.exact(e) for e in entries], system.states)
+        return judge(replace(self._region, name="the system on G", continuous=asked), self._budget)
 
     @cached_property
     def suprema(self) -> tuple[JudgedNumber, ...]:
@@ -239,7 +253,10 @@ class ChainProof:
     def statements(self) -> list[tuple[str, Verdict]]:
         """All that a bound asks for, with the judge's word."""
         noisy, certain = self._formulas.noisy, self._formulas.certain
-        found = [("G is bounded", self.bounded)]
+        found = [
+            ("G is bounded", self.bounded),
+            ("f, g and sigma are continuous on G", self.continuous),
+        ]
         if noisy:
             found.append(("the barrier is twice differentiable on G", self.smooth))
         if not certain:
@@ -257,7 +274,7 @@ class ChainProof:
         Args:
             allows_shortfall: whether it holds with a shortfall.
         """
-        needed = [self.bounded, self.smooth]
+        needed = [self.bounded, self.continuous, self.smooth]
         if not self._formulas.certain:
             needed += [number.verdict for number in self.suprema]
         needed.append(self.shortfall.verdict if allows_shortfall else self.feasible)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
+from safe_envs.dynamics.continuous_forms import ContinuousOperations
 from safe_envs.dynamics.expression_program import ExpressionProgram
 from safe_envs.dynamics.first_order_forms import Form, points, variables
 from safe_envs.dynamics.form_functions import FormOperations
@@ -40,8 +41,8 @@ class Statement:
     """A claim: an expression is at least 0 at every state of a region.
 
     The region is where all of `positive` are above 0, all of `nonnegative` at least 0 and all of
-    `zeros` are 0, within a box. Where `smooth` is given the statement says besides that these
-    expressions are twice continuously differentiable there.
+    `zeros` are 0, within a box. Where `smooth` or `continuous` are given the statement says besides
+    that these expressions are twice continuously differentiable there, or continuous.
 
     Attributes:
         name: in words.
@@ -51,8 +52,9 @@ class Statement:
         claim: that is to be at least 0.
         positive: above 0 in the region.
         nonnegative: at least 0 in the region.
-        zeros: 0 in the region.
+        zeros: 0 in the region, or not continuous: there the sign may change without a zero.
         smooth: to be twice continuously differentiable.
+        continuous: to be continuous, and so to have a value.
         polynomials: what symbols in the expressions stand for.
         witnesses: symbols that may be chosen on each box, such as an input that meets a claim.
         witness: which chooses them.
@@ -66,6 +68,7 @@ class Statement:
     nonnegative: tuple[sp.Expr, ...] = ()
     zeros: tuple[sp.Expr, ...] = ()
     smooth: tuple[sp.Expr, ...] = ()
+    continuous: tuple[sp.Expr, ...] = ()
     polynomials: Mapping[sp.Symbol, PolynomialPart] = field(default_factory=dict)
     witnesses: tuple[sp.Symbol, ...] = ()
     witness: Witness | None = None
@@ -93,11 +96,11 @@ class Enclosures(NamedTuple):
     Attributes:
         claim: its form.
         region: forms of the expressions that make the region.
-        zeros: forms of those that are 0 in it.
+        zeros: forms of those that are 0 in it, smooth where they are continuous.
         outside: whether the region has no state in the box, shape (B,).
         inside: whether the whole box lies in the region, shape (B,); where there are `zeros`, apart
             from these.
-        smooth: whether all that has to be smooth is, shape (B,).
+        smooth: whether all that has to be smooth or continuous is, shape (B,).
     """
 
     claim: Form
@@ -123,10 +126,12 @@ class StatementProgram:
         self._parts = _by_polynomial(statement.polynomials)
         symbols = (*statement.states, *statement.polynomials, *statement.witnesses)
         s = statement
-        expressions = (s.claim, *s.positive, *s.nonnegative, *s.zeros, *s.smooth)
+        expressions = (s.claim, *s.positive, *s.nonnegative, *s.smooth)
         self._program = ExpressionProgram(
             symbols, [sp.sympify(e) for e in expressions], FormOperations(self._n)
         )
+        continuous = [sp.sympify(e) for e in (*s.zeros, *s.continuous)]
+        self._continuous = ExpressionProgram(symbols, continuous, ContinuousOperations(self._n))
 
     def __call__(self, low: np.ndarray, high: np.ndarray) -> Enclosures:
         """Return what is known on boxes.
@@ -149,10 +154,12 @@ class StatementProgram:
                 )
             values = [found[symbol] for symbol in (*s.states, *s.polynomials, *s.witnesses)]
             forms = [_broadcast(form, self._n, boxes) for form in self._program(values)]
+            others = [_broadcast(form, self._n, boxes) for form in self._continuous(values)]
+        zeros, continuous = tuple(others[: len(s.zeros)]), others[len(s.zeros) :]
         rest = iter(forms[1:])
-        positive, nonnegative, zeros, smooth = (
+        positive, nonnegative, smooth = (
             tuple(itertools.islice(rest, len(part)))
-            for part in (s.positive, s.nonnegative, s.zeros, s.smooth)
+            for part in (s.positive, s.nonnegative, s.smooth)
         )
         outside, inside = np.zeros(boxes, dtype=bool), np.ones(boxes, dtype=bool)
         for form in positive:
@@ -162,9 +169,9 @@ class StatementProgram:
             outside |= form.range.high < 0.0
             inside &= form.range.low >= 0.0
         for form in zeros:
-            outside |= (form.range.high < 0.0) | (form.range.low > 0.0)
+            outside |= form.smooth & ((form.range.high < 0.0) | (form.range.low > 0.0))
         regular = np.ones(boxes, dtype=bool)
-        for form in smooth:
+        for form in (*smooth, *continuous):
             regular &= form.smooth
         region = (*positive, *nonnegative)
         return Enclosures(forms[0], region, zeros, outside, inside, regular)

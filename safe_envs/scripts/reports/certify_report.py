@@ -1,0 +1,201 @@
+"""The answer of `safe-envs certify`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from safe_envs.agents.evaluation.rate_text import percent
+from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.evaluation_report import describe_system
+from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.wrappers.certificates.certificate import BarrierCertificate
+from safe_envs.wrappers.synthesis.certify import Certification
+from safe_envs.wrappers.value.look_ahead import LookAhead
+from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.wrappers.value.starts import start_values
+from safe_envs.wrappers.value.table_cache import table_at_hand
+
+
+@dataclass(frozen=True, eq=False)
+class CertifyAnswer:
+    """What was found for an env.
+
+    Attributes:
+        title: of the env.
+        config: what was asked for, as JSON.
+        problem: of the env.
+        found: the certificate, and what was tried.
+        upper: of the best attainable safety of the env's step; None where no table of it is kept.
+        out: file of the certificate, if one was asked for.
+    """
+
+    title: str
+    config: dict[str, Any]
+    problem: SafetyProblem
+    found: Certification
+    upper: float | None
+    out: Path | None
+
+    def document(self) -> dict[str, Any]:
+        """Return all as JSON-able data."""
+        found = self.found
+        judged = {j.degree: j for j in found.judgements}
+        degrees = []
+        for a in found.attempts:
+            c, j = a.candidate, judged.get(a.degree)
+            degrees.append(
+                {
+                    "degree": a.degree,
+                    "coefficients": a.members,
+                    "program": c and c.program,
+                    "sampled": c and c.mean,
+                    "proved": j and (None if j.numbers.reason else j.mean),
+                    "reason": j and (j.numbers.reason or None),
+                    "boxes": j and j.numbers.boxes,
+                    "first_input": a.inputs,
+                    "seconds": a.seconds + (j.seconds if j else 0.0),
+                }
+            )
+        return {
+            "config": self.config,
+            "versions": package_versions(),
+            "proved": found.mean if found.certificate else None,
+            "proved_margin": found.margin if found.certificate else None,
+            "starts": found.starts,
+            "attainable_upper": self.upper,
+            **_numbers(found.certificate),
+            "degrees": degrees,
+            "seconds": found.seconds,
+            "file": None if self.out is None or found.certificate is None else str(self.out),
+        }
+
+
+def attainable_upper(problem: SafetyProblem) -> float | None:
+    """Return how safe any policy can be at most, if `best` has computed it; see `table_at_hand`.
+
+    Args:
+        problem: of the env.
+    """
+    try:
+        table = table_at_hand(problem, ValueSettings(leaving="safe"))
+        return table and start_values(LookAhead(table, problem), problem).upper
+    except ConfigurationError:  # No grid takes the problem.
+        return None
+
+
+def print_certification(console: Console, answer: CertifyAnswer) -> None:
+    """Print the degrees, the certificate, and what was not found.
+
+    Args:
+        console: to print on.
+        answer: to print.
+    """
+    found, problem = answer.found, answer.problem
+    whose = "the nominal controller" if answer.config["policy"] else "every policy under psi's"
+    whose += "" if answer.config["policy"] else " constraint"
+    told = f" | barrier certificate for {whose} | start {problem.start}\n{describe_system(problem)}"
+    say(console, Text.assemble((answer.title, "bold"), told))
+    judged = {j.degree: j for j in found.judgements}
+    titles = ("degree", "coefficients", "linear\nprogram", "sampled", "proved", "a", "boxes")
+    table = make_table("r", *titles, "seconds")
+    for a in found.attempts:
+        c, j = a.candidate, judged.get(a.degree)
+        table.add_row(
+            str(a.degree),
+            str(a.members),
+            percent(c.program if c else None),
+            percent(c.mean if c else None),
+            "-" if j is None else "undecided" if j.numbers.reason else percent(j.mean),
+            f"{c.bound.rate:g}" if c else "-",
+            f"{j.numbers.boxes:,}" if j else "-",
+            f"{a.seconds + (j.seconds if j else 0.0):.1f}",
+        )
+    print_whole(console, table)
+    for line in (*_result_lines(answer), *_missing_lines(found)):
+        say(console, line)
+
+
+def _result_lines(answer: CertifyAnswer) -> list[str]:
+    found, certificate = answer.found, answer.found.certificate
+    if certificate is None:
+        return ["No bound above 0 is proved."]
+    a, m, c, horizon = (
+        f"{float(v):.6g}"
+        for v in (
+            certificate.rate,
+            certificate.shortfall,
+            certificate.supremum,
+            certificate.horizon,
+        )
+    )
+    margin = "" if found.starts == 1 else f" - {100 * found.margin:.2g} %"
+    of = "from the start" if found.starts == 1 else f"mean over {found.starts:,} starts"
+    lines = [
+        f"Proved: P(safe for {horizon} s, or until the workspace is left) >="
+        f" {percent(found.mean)}{margin}, {of}"
+        + ("" if found.starts == 1 else "; the margin of the mean is one at 99.99 %"),
+        f"psi of degree {certificate.psi.degree}, a = {a} 1/s, m = {m} 1/s, c = {c};"
+        f" found and proved in {found.seconds:.3g} s",
+    ]
+    best = next(x for x in found.attempts if x.degree == _degree(found))
+    gap = (best.candidate.program if best.candidate else 0.0) - found.mean
+    if gap > 0.0:
+        lines.append(
+            f"The linear program of this degree has {100 * gap:.2g} % more, at sampled states:"
+            " better bounds need higher degrees, or other inputs in the program"
+        )
+    if answer.upper is not None:
+        lines.append(
+            f"No policy is safer than {percent(answer.upper)} with the env's own held input"
+            " (computed; another claim than this one, of continuous control)"
+        )
+    if answer.out is not None:
+        lines.append(f"Written to {answer.out}; check it with: safe-envs check {answer.out}")
+    lines.append(
+        "Note: the bound is of continuous control; the env holds its input for"
+        f" {answer.problem.dt:g} s."
+    )
+    return lines
+
+
+def _missing_lines(found: Certification) -> list[str]:
+    """Return what was not found, in words."""
+    lines = []
+    none = [str(a.degree) for a in found.attempts if a.candidate is None]
+    if none:
+        lines.append(
+            f"Note: no barrier of degree {', '.join(none)} has a bound above 0 at the sampled"
+            " states. That says nothing of other degrees, or of other functions than polynomials."
+        )
+    lines += [
+        f"Note: degree {j.degree} is undecided: {j.numbers.reason}."
+        for j in found.judgements
+        if j.numbers.reason
+    ]
+    lines += [
+        f"Note: the numbers of degree {j.degree} may be far from the least ones: {j.numbers.note}."
+        for j in found.judgements
+        if j.numbers.note and not j.numbers.reason
+    ]
+    return lines
+
+
+def _degree(found: Certification) -> int:
+    return max(found.judgements, key=lambda j: j.mean).degree
+
+
+def _numbers(certificate: BarrierCertificate | None) -> dict[str, Any]:
+    if certificate is None:
+        return {}
+    names = ("rate", "shortfall", "supremum", "horizon")
+    return {name: float(getattr(certificate, name)) for name in names} | {
+        "degree": certificate.psi.degree
+    }

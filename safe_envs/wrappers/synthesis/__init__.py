@@ -1,0 +1,1 @@
+"""Polynomial barriers by linear programs: candidates, whose statements others have to prove."""

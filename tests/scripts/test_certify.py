@@ -1,0 +1,68 @@
+"""`safe-envs certify`, as a person types it."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from safe_envs.wrappers.certificates.files import load_certificate
+from tests.scripts.conftest import strictly
+
+SCALAR = ("safe_envs/Scalar-v0", "--degree", 6, "--rate", 0, "--horizon", 0.5)
+
+
+def test_it_prints_the_bound_and_writes_what_check_accepts(safe_envs_command):
+    files = ("--out", "psi.json", "--json", "all.json")
+    status, out, _ = safe_envs_command("certify", *SCALAR, *files)
+    assert status == 0
+    for text in (
+        "Proved: P(safe for 0.5 s",
+        "every policy",
+        "continuous control",
+        "safe-envs check",
+    ):
+        assert text in out
+    found = strictly("all.json")
+    assert 0.7 < found["proved"] < 0.99
+    assert found["degrees"][0]["degree"] == 6
+    assert abs(found["degrees"][0]["proved"] - found["degrees"][0]["sampled"]) < 0.02
+    certificate = load_certificate("psi.json")
+    assert (certificate.env_id, certificate.options) == ("safe_envs/Scalar-v0", {"horizon": 0.5})
+    assert float(certificate.shortfall) == found["shortfall"]
+    status, out, _ = safe_envs_command("check", "psi.json")
+    assert (status, "checked:" in out) == (0, True)
+
+
+def test_the_nominal_controller_alone(safe_envs_command):
+    status, out, _ = safe_envs_command("certify", *SCALAR[:-1], 0.2, "--policy", "nominal")
+    assert status == 0
+    assert "barrier certificate for the nominal controller" in out
+
+
+def test_what_is_not_found_is_said(safe_envs_command):
+    asked = ("--start", 1, "--json", "-")
+    status, out, _ = safe_envs_command("certify", *SCALAR, *asked)
+    assert status == 1
+    assert json.loads(out)["proved"] is None
+    status, out, _ = safe_envs_command("certify", *SCALAR, "--start", 1, "--out", "psi.json")
+    assert status == 1
+    assert "No bound above 0 is proved" in out
+    assert "no barrier of degree 6" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--degree", 0), "degree = 0"),
+        (("--degree", 6, "--rate", -1), "does not hold for a negative one"),
+        (("--degree", 6, "--policy", "nobody"), "nobody"),
+        (("--degree", 6, "--policy", "random"), "has no formula"),
+        (("--degree", 6, "--out", "a.json", "--json", "a.json"), "give two files"),
+        (("--degree", 6, "--seed", -1), "seed"),
+    ],
+)
+def test_errors_are_those_of_a_user(safe_envs_command, arguments, told):
+    status, _, err = safe_envs_command("certify", "safe_envs/Scalar-v0", *arguments)
+    assert status == 2
+    assert told in err

@@ -1,0 +1,152 @@
+"""Barriers of systems whose safety is known, and what the judge makes of them."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs.errors import ConfigurationError
+from safe_envs.registry import make_problem
+from safe_envs.wrappers.certificates.checker import check
+from safe_envs.wrappers.certificates.statements import plant_of
+from safe_envs.wrappers.synthesis.certify import Named, certify, nominal_laws
+from safe_envs.wrappers.synthesis.domain import Domain
+from safe_envs.wrappers.synthesis.finalize import finalize
+from safe_envs.wrappers.synthesis.settings import SynthesisSettings
+from safe_envs.wrappers.synthesis.synthesize import Synthesis, Task, degrees_of
+from tests.wrappers.synthesis.systems import brownian, survival
+
+HORIZON = 1.0
+BEST = math.exp(-HORIZON / 2)
+"""Largest bound at pi/2 for a = 1/2: psi is the first eigenfunction, sin x."""
+
+
+def attempts(degrees, rate=0.5, horizon=HORIZON):
+    settings = SynthesisSettings(degrees=degrees, rates=(rate,))
+    synthesis = Synthesis(brownian(horizon), settings)
+    return synthesis, synthesis.attempts()
+
+
+def test_the_bound_of_brownian_motion_approaches_that_of_the_eigenfunction():
+    synthesis, found = attempts((2, 4, 8))
+    means = [a.candidate.mean for a in found]
+    assert means == sorted(means)
+    assert means[0] < BEST - 0.05
+    assert BEST - 2e-3 < means[-1] <= BEST + 1e-6
+    z = np.linspace(0.1, 3.0, 50)[:, None]
+    np.testing.assert_allclose(found[-1].candidate.psi(z), np.sin(z[:, 0]), atol=0.01)
+    numbers = finalize(found[-1].candidate, synthesis.domain)
+    assert not numbers.reason
+    bound = found[-1].candidate.bound.mean(
+        numbers.psi.values(np.array([[math.pi / 2]])),
+        float(numbers.shortfall),
+        float(numbers.supremum),
+    )
+    assert BEST - 0.01 < bound <= BEST
+
+
+def test_no_proved_bound_is_above_the_exact_probability():
+    for rate in (0.0, 0.5, 1.0):
+        synthesis, found = attempts((6,), rate, horizon=0.4)
+        candidate = found[0].candidate
+        numbers = finalize(candidate, synthesis.domain)
+        assert not numbers.reason
+        for start in np.linspace(0.05, 3.1, 40):
+            bound = candidate.bound.mean(
+                numbers.psi.values(np.array([[start]])),
+                float(numbers.shortfall),
+                float(numbers.supremum),
+            )
+            assert bound <= survival(start, 0.4)
+
+
+def test_psi_is_not_above_zero_on_the_edge_after_the_judge():
+    synthesis, found = attempts((4,))
+    psi = finalize(found[0].candidate, synthesis.domain).psi
+    assert max(psi.values(np.array([[0.0], [math.pi]]))) <= 0.0
+
+
+def test_a_certificate_is_checked_by_the_other_program_and_repeats_itself():
+    problem = make_problem("safe_envs/Scalar-v0", horizon=1.0)
+    settings = SynthesisSettings(degrees=(8,), rates=(0.0,))
+    named = Named(problem, "safe_envs/Scalar-v0", {"horizon": 1.0})
+    first, second = certify(named, settings), certify(named, settings)
+    certificate = first.certificate
+    assert certificate is not None
+    assert certificate == second.certificate
+    assert certificate.plant.policy == ()
+    assert certificate.horizon == Fraction(1)
+    assert 0.85 < first.mean < 0.999
+    assert first.mean <= first.attempts[0].candidate.program + first.margin
+    assert check(certificate, seconds=60.0).word == "checked"
+
+
+def test_a_bound_of_the_nominal_controller_is_another_one():
+    problem = make_problem("safe_envs/Scalar-v0", horizon=0.2)
+    settings = SynthesisSettings(degrees=(6,), rates=(0.0,))
+    every = certify(Named(problem), settings)
+    nominal = certify(Named(problem), settings, policy=True)
+    assert nominal.certificate is not None
+    (law,), (given,) = nominal.certificate.plant.policy, nominal_laws(problem)
+    assert sp.nsimplify(given) == law
+    assert 0.05 < nominal.mean < every.mean - 0.05
+    assert check(nominal.certificate, seconds=60.0).word == "checked"
+
+
+def test_nothing_is_certified_where_the_system_leaves_at_once():
+    # From the edge of C no bound is above 0.
+    problem = make_problem("safe_envs/Scalar-v0", start=(1.0,))
+    found = certify(Named(problem), SynthesisSettings(degrees=(4,), rates=(0.0,)))
+    assert found.certificate is None
+    assert (found.mean, found.attempts[0].candidate) == (0.0, None)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"degrees": (0,)}, "degree = 0"),
+        ({"degrees": (21,)}, "up to degree 20"),
+        ({"rates": (-0.1,)}, "at least 0"),
+        ({"rates": (math.nan,)}, "at least 0"),
+        ({"tolerance": 0.0}, "tolerance"),
+        ({"seconds": 0.0}, "seconds"),
+    ],
+)
+def test_settings_out_of_range_are_refused(wrong, told):
+    with pytest.raises(ConfigurationError, match=told):
+        SynthesisSettings(**wrong)
+
+
+def test_a_polynomial_with_too_many_coefficients_is_refused():
+    plant = make_problem("safe_envs/Quadrotor-v0").plant
+    with pytest.raises(ConfigurationError, match="coefficients"):
+        degrees_of(plant, SynthesisSettings(degrees=(5,)))
+
+
+def test_starts_are_taken_within_the_period_of_an_angle():
+    problem = make_problem("safe_envs/StochasticDubins-v0")
+    plant = plant_of(problem)
+    task = Task(plant, 1.0, np.array([[0.5, 0.5, 7.0], [0.5, 0.5, -4.0]]), (False, False, True))
+    starts = Synthesis(task, SynthesisSettings(degrees=(2,))).starts
+    np.testing.assert_allclose(starts[:, 2], [7.0 - 2 * np.pi, 2 * np.pi - 4.0])
+
+
+def test_starts_outside_of_the_safe_set_have_no_bound():
+    inside = brownian(HORIZON, starts=(1.0, -0.5, 3.5))
+    assert Synthesis(inside, SynthesisSettings(degrees=(2,))).starts.tolist() == [[1.0]]
+    with pytest.raises(ConfigurationError, match="no start"):
+        Synthesis(brownian(HORIZON, starts=(-0.5,)), SynthesisSettings(degrees=(2,)))
+
+
+def test_a_state_on_the_edge_is_on_it():
+    problem = make_problem("safe_envs/CubicSDE-v0")
+    domain = Domain.of(plant_of(problem), (False, False))
+    edge = domain.draw_edge(500, np.random.default_rng(0))
+    assert len(edge) > 100
+    assert np.abs(domain.level(edge)).max() < 1e-9
+    # Its corners with the ends of the workspace are among them.
+    assert edge[:, 0].min() == -6.0
