@@ -47,6 +47,7 @@ ROW_KEYS = [
     "continuous_bound",
     "continuous_word",
     "continuous_note",
+    "continuous_error",
     "posterior_bound",
     "learning",
 ]
@@ -383,7 +384,7 @@ def test_bounds_are_shown_where_there_are_any():
     proved = printed({}, nothing, {**given, "continuous_word": "proved"})
     assert " >= 49.2 % " in line_of(proved, "scbf")
     assert "est.: " not in proved
-    assert proved.count("Note: continuous control, >=: proved for these starts") == 1
+    assert proved.count("Note: continuous control, >=: proved at these starts") == 1
     held = {"held_bound": 0.4929, "held_word": "proved", "held_note": "of a certificate"}
     chain = printed({}, {**nothing, **held, "held_word": "computed"}, {**nothing, **held})
     assert line_of(chain, "hocbf").split()[1:4] == ["49.2", "%", "comp."]

@@ -148,6 +148,6 @@ def without_continuous(row: Bounded, reason: str) -> Bounded:
     note, posterior = f"withheld: {reason}", row.posterior_bound
     row = replace(row, withheld=row.withheld or reason, continuous_bound=None)
     if posterior is None:
-        return replace(row, continuous_word="withheld", continuous_note=note)
+        return replace(row, continuous_word="withheld", continuous_note=note, continuous_error=0.0)
     none = replace(posterior, probability=None, note=note, word="withheld")
     return replace(row, posterior_bound=none)

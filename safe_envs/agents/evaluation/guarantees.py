@@ -11,7 +11,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import by_states, without_continuous
 from safe_envs.agents.evaluation.rows import BoundSummary, ContinuousWord, PosteriorSummary
-from safe_envs.agents.evaluation.running_sum import RunningSum
+from safe_envs.agents.evaluation.running_sum import RunningMean
 from safe_envs.agents.evaluation.statistics import share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.dynamics.codegen import compile_function, stacked
@@ -61,7 +61,7 @@ class GuaranteeAverager:
         self._of_posterior = any(c.credible_set is not None for c in conditions)
         self._found: Guarantee | None = None
         self._why_none: str | None = why_not if conditions else "there is no filter"
-        self._total, self._count = RunningSum(), 0
+        self._values = RunningMean()
         self._outside = _outside_of(conditions, problem, knowledge)
         self._lost, self._starts = 0, 0
         self._against, self._nothing = "", VisitedStates.nothing(problem)
@@ -81,11 +81,10 @@ class GuaranteeAverager:
     def add(self, starts: np.ndarray) -> None:
         """Add the starts of a batch, shape (E, n)."""
         if self._found is not None and not self._why_none:
-            self._total.add(self._found.at(starts, self._horizon))
+            self._values.add(self._found.at(starts, self._horizon))
             self._against = self._against or by_states(
                 self._found, [replace(self._nothing, deepest=starts)]
             )
-            self._count += len(starts)
         if self._outside is not None:
             self._lost += int(np.count_nonzero(self._outside(starts)))
             self._starts += len(starts)
@@ -103,6 +102,7 @@ class GuaranteeAverager:
             continuous_bound=bound,
             continuous_word=word,
             continuous_note=note,
+            continuous_error=0.0 if bound is None else self._values.error,
         )
         if self._of_posterior:
             of_posterior = isinstance(self._found, PosteriorGuarantee)
@@ -111,6 +111,7 @@ class GuaranteeAverager:
                 found,
                 continuous_bound=None,
                 continuous_word="none",
+                continuous_error=0.0,
                 continuous_note="the condition is learned: see its bound over the posterior",
                 posterior_bound=PosteriorSummary(bound, note, word, **sizes),
             )
@@ -129,7 +130,7 @@ class GuaranteeAverager:
     def _mean(self) -> tuple[float | None, str | None]:
         if self._found is None or self._why_none:
             return None, self._why_none
-        mean, remark = share(self._total.total, self._count), self._found.remark
+        mean, remark = self._values.mean, self._found.remark
         if not mean:
             return None, remark or "it is 0 at these starts up to this horizon"
         return mean, "; ".join(filter(None, [remark, _undecided(self._found)]))

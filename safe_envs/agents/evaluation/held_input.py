@@ -7,7 +7,6 @@ a new kind of bound is added there, and nowhere else.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, Protocol
@@ -18,7 +17,7 @@ from safe_envs.agents.evaluation.contradiction import without_held
 from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.promise_bound import promise_bound
 from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.running_sum import RunningSum
+from safe_envs.agents.evaluation.running_sum import RunningMean
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 
 
@@ -91,15 +90,12 @@ class HeldAverager:
 
     def __init__(self, bound: HeldInputBound | str) -> None:
         self._bound = bound
-        self._total, self._squares, self._count = RunningSum(), RunningSum(), 0
+        self._values = RunningMean()
 
     def add(self, starts: np.ndarray) -> None:
         """Add the starts of a batch, shape (E, n)."""
         if not isinstance(self._bound, str):
-            values = self._bound.at(starts)
-            self._total.add(values)
-            self._squares.add(values**2)
-            self._count += len(values)
+            self._values.add(self._bound.at(starts))
 
     def put_in(self, summary: BoundSummary, visited: VisitedStates) -> BoundSummary:
         """Return a summary with the mean of the bound, or with why there is none.
@@ -111,17 +107,18 @@ class HeldAverager:
         bound = self._bound
         if isinstance(bound, str):
             return replace(summary, held_note=bound)
-        if not self._count or not self._total.total:
+        mean = self._values.mean
+        if not mean:
             return replace(summary, held_note=bound.nowhere)
         reason = bound.contradiction(visited)
         if reason:
             return without_held(summary, reason)
-        mean, rest = self._total.total / self._count, max(self._count - 1, 1)
-        variance = max(self._squares.total - self._count * mean**2, 0.0) / rest
-        # What rounding leaves of the variance of equal values is none.
-        error = math.sqrt(variance / self._count) if variance > 1e-12 * mean**2 else 0.0
         return replace(
-            summary, held_bound=mean, held_word=bound.word, held_note=bound.note, held_error=error
+            summary,
+            held_bound=mean,
+            held_word=bound.word,
+            held_note=bound.note,
+            held_error=self._values.error,
         )
 
 

@@ -178,6 +178,7 @@ class BoundSummary:
             is none.
         continuous_word: what it is worth.
         continuous_note: why there is none, or why it is weak or not proved.
+        continuous_error: its standard error as the mean over all starts; 0 for one start.
         posterior_bound: that over the posterior; None where the filter is not robust over one.
     """
 
@@ -190,6 +191,7 @@ class BoundSummary:
     continuous_bound: float | None = None
     continuous_word: ContinuousWord = "none"
     continuous_note: str | None = None
+    continuous_error: float = 0.0
     posterior_bound: PosteriorSummary | None = None
 
 

@@ -53,7 +53,7 @@ class SafetyChain:
 
 _SHOWN = (
     *("withheld", "held_bound", "held_word", "held_note", "held_error"),
-    *("continuous_bound", "continuous_word", "continuous_note"),
+    *("continuous_bound", "continuous_word", "continuous_note", "continuous_error"),
 )
 
 
@@ -110,6 +110,7 @@ def _of_continuous(bounds: Sequence[Bound]) -> BoundSummary:
                 continuous_bound=largest.value,
                 continuous_word="proved" if word == "proved" else "estimated",
                 continuous_note=largest.reason,
+                continuous_error=largest.error,
             )
     against = next((b for b in bounds if b.status == "withheld"), bounds[-1])
     word = "withheld" if against.status == "withheld" else "none"

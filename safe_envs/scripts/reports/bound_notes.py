@@ -24,7 +24,7 @@ CHAIN = (
 """What the columns of the chain are."""
 
 PROVED = (
-    "continuous control, >=: proved for these starts and every policy, if the filter acts at every"
+    "continuous control, >=: proved at these starts for every policy, if the filter acts at every"
     " instant: the judge proved all hypotheses and numbers of a theorem by interval branch and"
     " bound, rounded outwards, with exact rational parameters; leaving the workspace is an end."
 )
@@ -84,6 +84,7 @@ def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
         if row.continuous_word == "estimated" and row.continuous_note
     ]
     notes += held_notes(rows)
+    notes += _of_drawn_starts(filtered)
     notes += [PROVED] * _any(rows, "proved") + [ESTIMATED] * _any(rows, "estimated")
     return notes
 
@@ -110,6 +111,18 @@ def _why_none(claim: str, rows: Iterable[tuple[EvaluationRow, str | None]]) -> l
     for row, note in rows:
         names.setdefault(note or "", []).append(row.filter)
     return [f"no bound, {claim}, for {', '.join(of)}: {note}" for note, of in names.items()]
+
+
+def _of_drawn_starts(rows: Sequence[EvaluationRow]) -> list[str]:
+    """Return how far the bounds at the starts of these episodes may be from those of all starts."""
+    error = max((max(row.held_error, row.continuous_error) for row in rows), default=0.0)
+    if not error:
+        return []
+    return [
+        "bounds are means over the starts of these episodes, as the rates are; these starts are"
+        f" drawn, and over all starts the standard error of such a mean is {100 * error:.2g} points"
+        " at most."
+    ]
 
 
 def _any(rows: Sequence[BoundSummary], word: str) -> bool:

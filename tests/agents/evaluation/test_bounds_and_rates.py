@@ -62,6 +62,10 @@ def test_bound_is_the_mean_over_the_starts():
         np.mean(1 - starts[:, 0] ** 2 - starts[:, 1] ** 2) * math.exp(-2.0), rel=1e-3
     )
     assert first.rows[0].continuous_bound != answer.rows[0].continuous_bound
+    h = 1 - starts[:, 0] ** 2 - starts[:, 1] ** 2
+    assert first.rows[0].continuous_error == pytest.approx(
+        np.std(h, ddof=1) / math.sqrt(32) * math.exp(-2.0), rel=1e-3
+    )
 
 
 def test_a_bound_that_cannot_be_computed_does_not_end_an_evaluation():

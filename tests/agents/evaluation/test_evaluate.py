@@ -40,6 +40,7 @@ KEYS = {
     "continuous_bound",
     "continuous_word",
     "continuous_note",
+    "continuous_error",
     "posterior_bound",
     "withheld",
     "outside_rate",
