@@ -36,6 +36,10 @@ def best(
     episodes: Annotated[
         int, typer.Option(help="Episodes of the greedy policy's simulation; 0 for none.")
     ] = 1000,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Prove both ends by outward-rounded arithmetic."),
+    ] = False,
     seed: text_options.Seed = 0,
     json: Annotated[
         Path | None,
@@ -55,13 +59,14 @@ def best(
 
     The largest probability of a safe episode lies between a lower and an upper end, which dynamic
     programming of the env's own step gives on a grid: no policy is above the upper end, and one is
-    at least at the lower end. Both hold the error of the grid and are computed in floating point.
+    at least at the lower end. Both hold the error of the grid and are computed in floating point;
+    --check proves them.
     The greedy policy takes the input of the largest value at each step; it is --policy best of
     evaluate.
 
     The table is kept in the user's cache, so that it is computed once.
     """
-    from safe_envs.agents.evaluation.attainable import attainable_safety
+    from safe_envs.agents.evaluation.attainable import attainable_safety, certified
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.best_report import BestAnswer, print_best
     from safe_envs.wrappers.value.settings import ValueSettings
@@ -85,6 +90,9 @@ def best(
         found, policy = attainable_safety(
             problem, settings, episodes=episodes, seed=seed, file=table, progress=tell
         )
+    if check:
+        with progress_bar("Checking") as tell:
+            found = certified(found, policy, tell)
     config = {"env_id": known, "options": arguments, "seed": seed}
     answer = BestAnswer(title_of(known, arguments), config, problem, found)
     print_best(stdout(), answer)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from safe_envs.agents.evaluation import yardstick
 from safe_envs.wrappers.value import table_cache
+from safe_envs.wrappers.value.table_files import load_table, save_table
 from tests.agents.policies.coarse import COARSE
 from tests.scripts.conftest import strictly
 
@@ -41,6 +45,33 @@ def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, 
     assert found["coordinates"] == ["x"]
     assert found["seconds"] > 0
     assert found["memory"] > 0
+
+
+def test_check_certifies_both_ends_or_refuses_the_table(safe_envs_command, tmp_path):
+    asked = (*SCALAR, *COARSELY, "--table", "mine.npz")
+    safe_envs_command("best", *asked, "--json", "1.json")
+    status, out, _ = safe_envs_command("best", *asked, "--check", "--json", "2.json")
+    assert status == 0
+    assert "lower and upper are certified" in out
+    assert "not proved" not in out
+    computed, certified = strictly("1.json"), strictly("2.json")
+    assert computed["check"] is None
+    assert 0 <= certified["check"]["lower"] < 1e-9
+    assert abs(certified["lower"] - computed["lower"]) < 1e-6
+    assert abs(certified["upper"] - computed["upper"]) < 1e-6
+    table = load_table("mine.npz")
+    lower = np.array(table.lower)
+    cell = int(np.flatnonzero((lower[3] > 0.3) & (table.upper[3] > lower[3] + 2e-3))[0])
+    lower[3, cell] += 1e-3
+    Path("mine.npz").unlink()
+    save_table(replace(table, lower=lower), "mine.npz")
+    status, _, err = safe_envs_command("best", *asked, "--check")
+    assert status == 2
+    assert f"k = 3 on cell {cell}," in err
+    specified = (*SCALAR, "--spec", "always safe", *COARSELY, "--check")
+    status, _, err = safe_envs_command("best", *specified)
+    assert status == 2
+    assert "only tables of staying safe" in err
 
 
 def test_leaving_and_knowledge_are_as_asked_for(safe_envs_command):

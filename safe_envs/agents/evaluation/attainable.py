@@ -2,8 +2,9 @@
 
 The largest probability of a safe episode lies between the means, over the starts, of a lower and of
 an upper envelope, which hold the error of their grid; see `safe_envs.wrappers.value`. They are
-computed in floating point, not proved. The policy that follows the table is simulated, and its rate
-must lie between them: where its interval does not meet them, they are withheld.
+computed in floating point, and certified where the table was checked. The policy that follows the
+table is simulated, and its rate must lie between them: where its interval does not meet them, they
+are withheld.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
+from safe_envs.wrappers.value.proved_starts import ProvedStarts
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.starts import start_values
 from safe_envs.wrappers.value.table import ValueTable
+from safe_envs.wrappers.value.table_check import TableCheck, check_table
 
 SURE = 0.999
 """Confidence of the intervals that may contradict a table: at 95 % one of forty true ones would."""
@@ -53,6 +56,7 @@ class AttainableSafety:
         steps: control periods of an episode.
         seconds: that the table took when it was computed.
         memory: of the table in bytes.
+        check: of the table, whose result is in both ends; None where they are only computed.
     """
 
     lower: float | None
@@ -68,12 +72,14 @@ class AttainableSafety:
     steps: int
     seconds: float
     memory: int
+    check: TableCheck | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON-able data; the rate of the greedy policy is a number, or null."""
         found = {**vars(self), "contradiction": self.contradiction or None}
         found |= {name: list(found[name]) for name in ("coordinates", "cells")}
         s = self.simulated
+        found["check"] = self.check and vars(self.check)
         return found | {
             "simulated": s and s.rate,
             "simulated_interval": s and [s.low, s.high],
@@ -163,6 +169,32 @@ def of_table(problem: SafetyProblem, table: ValueTable, look_ahead: LookAhead) -
         seconds=table.seconds,
         memory=table.memory,
     )
+
+
+def certified(
+    found: AttainableSafety, policy: BestPolicy, progress: Progress | None = None
+) -> AttainableSafety:
+    """Return what was found with certified ends in place of computed ones.
+
+    The upper end is computed still where `check.upper` is None.
+
+    Args:
+        found: with bounds; without any it is returned as it is.
+        policy: with the table.
+        progress: called with the part of the work that is done, from 0 to 1.
+
+    Raises:
+        TableRefusedError: The table is no envelope.
+        ConfigurationError: Such tables are not checked.
+    """
+    if found.lower is None or found.upper is None:
+        return found
+    table, problem, look_ahead = policy.table, policy.problem, policy.look_ahead
+    check = check_table(table, problem, progress=progress)
+    starts = ProvedStarts(table, problem, check, look_ahead)
+    values = start_values(starts, problem, most=starts.most_starts)
+    upper = found.upper if check.upper is None else values.upper
+    return judged(replace(found, lower=values.lower, upper=upper, check=check))
 
 
 def judged(found: AttainableSafety) -> AttainableSafety:

@@ -60,10 +60,19 @@ def chain_cells(row: EvaluationRow, best: AttainableSafety | None) -> list[str]:
 
 
 def attainable_text(best: AttainableSafety | None) -> list[str]:
-    """Return the upper end of the attainable safety, rounded up; none where it is not known."""
+    """Return the upper end of the attainable safety, rounded up; none where it is not known.
+
+    Args:
+        best: attainable safety, if it is known; only a certified end stands after a sign.
+    """
     if best is None or best.lower is None or best.upper is None:
         return []
-    return [f"{outwards(best.lower, best.upper)[1]} %"]
+    return [f"{'<= ' * is_certified(best)}{outwards(best.lower, best.upper)[1]} %"]
+
+
+def is_certified(best: AttainableSafety) -> bool:
+    """Return whether the upper end of the attainable safety is of a table that was checked."""
+    return best.check is not None and best.check.upper is not None
 
 
 def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:

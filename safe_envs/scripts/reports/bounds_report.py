@@ -17,7 +17,7 @@ from safe_envs.agents.evaluation.bound_text import (
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.best_text import COMPUTED
-from safe_envs.scripts.reports.bound_notes import attainable_text
+from safe_envs.scripts.reports.bound_notes import attainable_text, is_certified
 from safe_envs.scripts.reports.quantities import share_text, state_text
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
@@ -132,8 +132,9 @@ def print_chain(console: Console, answer: VerifyAnswer) -> None:
         say(console, f"Held input: {'no bound, ' * none}{held}.")
     if chain.best is not None and chain.best.contradiction:
         say(console, f"The attainable safety is withheld: {chain.best.contradiction}.")
-    elif attainable:
-        say(console, f"Attainable: what no policy exceeds, {COMPUTED}.")
+    elif chain.best is not None and attainable:
+        how = "certified" if is_certified(chain.best) else COMPUTED
+        say(console, f"Attainable: what no policy exceeds, {how}.")
 
 
 def _in_brackets(bound: Bound) -> bool:

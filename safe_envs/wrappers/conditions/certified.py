@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -222,9 +222,11 @@ class _Places:
             self.nearest[x] = place
             self._nearest_z[self._z[i]] = self._scaled(psi, i, place)
         # What rounding cannot tell from 0 counts as 0, so that a state alone and in a batch agree.
-        rounding = ROUNDING * (1 + psi.degree) * _largest_sum(psi, ends)
+        size = sum(abs(float(value)) for value in psi.coefficients.values())
+        rounding = sp.Float(ROUNDING * (1 + psi.degree) * size, 17)
+        farthest = sp.Max(1, *[sp.Abs(z) for z in self._nearest_z.values()])
         self.domain = (
-            self.value(psi) - sp.Float(rounding, 17),
+            self.value(psi) - rounding * farthest**psi.degree,
             *(self.at(barrier) for barrier in plant.barriers),
             *inside,
         )
@@ -252,16 +254,3 @@ class _Places:
         # A fraction of large whole numbers is no number of compiled code.
         fractions = (r for r in exact.atoms(sp.Rational) if not r.is_Integer)
         return exact.xreplace({r: sp.Float(r, 17) for r in fractions})
-
-
-def _largest_sum(psi: Polynomial, ends: Sequence[tuple[Any, Any]]) -> float:
-    """Return a bound on the sum of the sizes of the terms of psi in the workspace."""
-    farthest = [
-        max(1.0, *(abs(float(end) - float(center)) / float(scale) for end in pair))
-        for pair, center, scale in zip(ends, psi.center, psi.scale, strict=True)
-    ]
-    coefficients: Mapping[tuple[int, ...], Fraction] = psi.coefficients
-    return sum(
-        abs(float(value)) * float(sp.prod([r**e for r, e in zip(farthest, key, strict=True)]))
-        for key, value in coefficients.items()
-    )

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.look_ahead import LookAhead
 
 _STARTS = {1: 600_000, 50: 50_000}
 _FEWEST = 20_000
@@ -20,6 +19,20 @@ _DOUBT = 1e-4
 """Chance that the mean over all starts lies outside the interval of the drawn ones."""
 
 _MOST_ROUNDS = 200
+
+
+class BoundsStarts(Protocol):
+    """What bounds the value at starts.
+
+    Attributes:
+        noise_boxes: number of boxes into which the noise of a step is divided.
+    """
+
+    noise_boxes: int
+
+    def start_bounds(self, x: Components) -> tuple[np.ndarray, np.ndarray]:
+        """Return lower and upper bounds of the value at states x, arrays of one shape."""
+        ...
 
 
 class StartValues(NamedTuple):
@@ -38,7 +51,9 @@ class StartValues(NamedTuple):
     margin: tuple[float, float]
 
 
-def start_values(look_ahead: LookAhead, problem: SafetyProblem, seed: int = 0) -> StartValues:
+def start_values(
+    look_ahead: BoundsStarts, problem: SafetyProblem, seed: int = 0, most: int | None = None
+) -> StartValues:
     """Return bounds of the mean value over the starts, by a step of look-ahead from each.
 
     Where starts are random, the bounds hold with a confidence of 99.99 %, by an empirical Bernstein
@@ -48,13 +63,14 @@ def start_values(look_ahead: LookAhead, problem: SafetyProblem, seed: int = 0) -
         look_ahead: of the problem's table.
         problem: the problem.
         seed: of the starts that are drawn.
+        most: how many are drawn at most; None for as many as a look ahead is fast enough for.
 
     Source: A. Maurer, M. Pontil, Empirical Bernstein bounds and sample variance penalization, COLT
         2009, Theorem 4.
     """
     boxes = look_ahead.noise_boxes
     count = next((n for most, n in _STARTS.items() if boxes <= most), _FEWEST)
-    x = draw_starts(problem, count, seed)
+    x = draw_starts(problem, min(count, most or count), seed)
     lower, upper = look_ahead.start_bounds(x)
     below, above = sampling_margin(lower), sampling_margin(upper)
     return StartValues(

@@ -8,17 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.input_terms import largest_input_term, not_polynomial
-from safe_envs.wrappers.verification.judge import Verdict, judge, supremum
-from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
+from safe_envs.wrappers.verification.judge import Verdict, judge
+from safe_envs.wrappers.verification.statement import PolynomialPart, Statement, Witness
 
 _DIGITS = 9
 
@@ -117,51 +118,75 @@ class CertificateStatements:
         """The symbol of psi."""
         return self._parts[0]
 
-    def edges(self) -> list[Statement]:
-        """Return the statements that psi is not above 0 on the edge of C, and where an angle jumps.
+    def edges(self, excess: Fraction = Fraction(0)) -> list[Statement]:
+        """Return the statements that psi is at most 0 on the edge of C, and where an angle jumps.
 
         The edge of C is where an h_i is 0 and no other is below. An angle jumps at the ends of its
         period, where a polynomial would too.
+
+        Args:
+            excess: that psi may have there, in place of 0.
         """
-        found = self._jumps()
-        for i, barrier in enumerate(self.plant.barriers):
+        most = sp.Rational(excess) - self.value
+        return [*self._jumps(most), *self._rims(most)]
+
+    def _rims(self, most: Any) -> list[Statement]:
+        found, plant = [], self.plant
+        for i, barrier in enumerate(plant.barriers):
             # Where psi is h_i itself there is nothing to show.
             if sp.expand(self.psi.expression - barrier) == 0:
                 continue
-            others = self.plant.barriers[:i] + self.plant.barriers[i + 1 :]
+            # On h_i = 0 a multiple of it changes nothing, and lets boxes be wide across the edge.
+            multiple = sp.Dummy("multiple", real=True)
             found.append(
                 Statement(
                     "psi <= 0 on the edge of C",
-                    self.plant.states,
-                    self.plant.workspace,
-                    -self.value,
-                    nonnegative=others,
+                    plant.states,
+                    plant.workspace,
+                    most + multiple * barrier,
+                    nonnegative=plant.barriers[:i] + plant.barriers[i + 1 :],
                     zeros=(barrier,),
                     polynomials=self.polynomials,
+                    witnesses=(multiple,),
+                    witness=_slope_across(plant, self.psi, barrier),
                 )
             )
         return found
 
-    def _jumps(self) -> list[Statement]:
-        found = []
-        for i, angle in enumerate(self.plant.angles):
-            if not angle or not any(
-                key[i] for key, value in self.psi.coefficients.items() if value
-            ):
-                continue
-            for end in self.plant.workspace[i]:
-                box = (*self.plant.workspace[:i], (end, end), *self.plant.workspace[i + 1 :])
-                found.append(
-                    Statement(
-                        "psi <= 0 where an angle jumps",
-                        self.plant.states,
-                        box,
-                        -self.value,
-                        positive=self.plant.barriers,
-                        polynomials=self.polynomials,
-                    )
-                )
-        return found
+    def _jumps(self, most: Any) -> list[Statement]:
+        plant, keys = self.plant, [key for key, value in self.psi.coefficients.items() if value]
+        ends = [
+            (i, end)
+            for i, angle in enumerate(plant.angles)
+            if angle and any(key[i] for key in keys)
+            for end in plant.workspace[i]
+        ]
+        return [
+            Statement(
+                "psi <= 0 where an angle jumps",
+                plant.states,
+                (*plant.workspace[:i], (end, end), *plant.workspace[i + 1 :]),
+                most,
+                positive=plant.barriers,
+                polynomials=self.polynomials,
+            )
+            for i, end in ends
+        ]
+
+
+def _slope_across(plant: Plant, psi: Polynomial, barrier: Any) -> Witness:
+    """Return the slope of psi per slope of h across its edge, at states."""
+    slopes = tabulated(plant.states, [sp.diff(barrier, s) for s in plant.states])
+    gradient = [psi.derivative(i) for i in range(psi.n)]
+
+    def multiples(x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            across = slopes(x)
+            own = np.stack([part.values(x) for part in gradient], axis=1)
+            found = (own * across).sum(axis=1) / (across**2).sum(axis=1)
+        return np.where(np.isfinite(found), found, 0.0)[:, None]
+
+    return multiples
 
 
 def _order(n: int, *states: int) -> tuple[int, ...]:
@@ -193,69 +218,6 @@ def judged(
         parts.coefficients(),
     ]
     return [(statement.name, judge(statement, budget)) for statement in statements]
-
-
-class ProvedNumbers(NamedTuple):
-    """The numbers of a certificate that the judge proves for a psi.
-
-    Attributes:
-        psi: lowered so that it is not above 0 on the edge of C.
-        supremum: c.
-        shortfall: m.
-        worst: states where the generator inequality is least slack or fails, shape (B, n).
-        boxes: number of boxes that were looked at.
-        reason: why there is no proof, in words; empty where there is one.
-    """
-
-    psi: Polynomial
-    supremum: Fraction
-    shortfall: Fraction
-    worst: np.ndarray
-    boxes: int
-    reason: str = ""
-
-
-def proved_numbers(
-    plant: Plant,
-    psi: Polynomial,
-    rate: Fraction,
-    tolerance: float = 1e-4,
-    budget: Budget | None = None,
-) -> ProvedNumbers:
-    """Prove the least numbers c and m for a psi, after lowering it on the edge of C.
-
-    Args:
-        plant: the system.
-        psi: candidate, of size about 1.
-        rate: a.
-        tolerance: by how much the numbers may be larger than they have to be.
-        budget: of each of them.
-    """
-    none, boxes = np.empty((0, len(plant.states))), 0
-    parts = CertificateStatements(plant, psi, rate)
-    excess, reason = 0.0, ""
-    for edge in parts.edges():
-        found = supremum(edge, parts.value, tolerance, budget)
-        boxes += found.boxes
-        excess, reason = max(excess, found.upper), reason or found.reason
-    if not math.isfinite(excess):
-        return ProvedNumbers(psi, Fraction(0), Fraction(0), none, boxes, reason)
-    if excess > 0.0:
-        origin = (0,) * psi.n
-        lowered = psi.coefficients.get(origin, Fraction(0)) - rounded_up(excess)
-        psi = replace(psi, coefficients={**psi.coefficients, origin: lowered})
-        parts = CertificateStatements(plant, psi, rate)
-    region = parts.statement("the region of psi", sp.Integer(0))
-    top = supremum(region, parts.value, tolerance, budget)
-    lack = supremum(region, -parts.generator, tolerance, budget)
-    boxes += top.boxes + lack.boxes
-    worst = none if lack.state is None else lack.state[None]
-    if not top.upper > 0.0:
-        return ProvedNumbers(psi, Fraction(0), Fraction(0), none, boxes, "psi is nowhere above 0")
-    for bound in (top, lack):
-        if not math.isfinite(bound.upper) and bound.upper > 0.0:
-            return ProvedNumbers(psi, Fraction(0), Fraction(0), worst, boxes, bound.reason)
-    return ProvedNumbers(psi, rounded_up(top.upper), rounded_up(max(lack.upper, 0.0)), worst, boxes)
 
 
 def rounded_up(value: float) -> Fraction:
