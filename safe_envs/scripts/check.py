@@ -40,7 +40,8 @@ def check(
     """Check the certificate in a file: what it states, and whether that is so.
 
     All statements are checked by interval branch and bound that shares no code with the search for
-    certificates. Where the file names an env, its system has to be exactly that of the env.
+    certificates. Those of held input are judged by the program that also finds their numbers. Where
+    the file names an env, its system has to be exactly that of the env.
 
     The exit status is 0 where everything is checked, 1 where something is refuted or undecided, and
     2 where the file cannot be read. No code in the file is run.
@@ -49,9 +50,11 @@ def check(
     from safe_envs.scripts.reports.check_report import CheckAnswer, print_check
     from safe_envs.wrappers.certificates.ball_checker import check_with_balls
     from safe_envs.wrappers.certificates.balls import require_flint
+    from safe_envs.wrappers.certificates.certificate import HeldCertificate
     from safe_envs.wrappers.certificates.checker import check as check_certificate
     from safe_envs.wrappers.certificates.files import load_certificate
     from safe_envs.wrappers.certificates.statements import env_difference
+    from safe_envs.wrappers.verification.held_check import check_held
 
     if not 0 < seconds < float("inf"):
         raise ConfigurationError(f"seconds = {seconds}; give a number above 0")
@@ -65,8 +68,13 @@ def check(
     for start in starts:
         if len(start) != n:
             raise ConfigurationError(f"--state {start} has {len(start)} numbers; give {n}")
-    found = {"intervals": check_certificate(certificate, seconds=seconds)}
-    if arb:
+    if isinstance(certificate, HeldCertificate):
+        if arb:
+            raise ConfigurationError(f"--arb is for continuous control; {file} is of held input")
+        found = {"judge": check_held(certificate, seconds)}
+    else:
+        found = {"intervals": check_certificate(certificate, seconds=seconds)}
+    if arb and not isinstance(certificate, HeldCertificate):
         found["balls"] = check_with_balls(certificate, seconds=seconds)
     answer = CheckAnswer(str(file), certificate, found, env_difference(certificate), starts)
     print_check(stdout(), answer)

@@ -14,11 +14,16 @@ from rich.console import Console
 from safe_envs.errors import shortened
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table, print_whole
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate
+from safe_envs.wrappers.certificates.certificate import AnyCertificate, HeldCertificate
 from safe_envs.wrappers.certificates.check_result import CheckResult
 from safe_envs.wrappers.certificates.statements import EnvDifference
+from safe_envs.wrappers.verification.held_check import stated_bound
 
-_BY = {"intervals": "branch and bound with first-order forms", "balls": "ball arithmetic of Arb"}
+_BY = {
+    "intervals": "branch and bound with first-order forms",
+    "balls": "ball arithmetic of Arb",
+    "judge": "the program that found its numbers, branch and bound with outward rounding",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +39,7 @@ class CheckAnswer:
     """
 
     file: str
-    certificate: BarrierCertificate
+    certificate: AnyCertificate
     found: Mapping[str, CheckResult]
     env: EnvDifference
     starts: Sequence[Sequence[float]]
@@ -48,15 +53,21 @@ class CheckAnswer:
 
     def bounds(self) -> list[float]:
         """Return the bound that is stated at each start, 0 outside of G, rounded down."""
-        plant, bounds = self.certificate.plant, []
+        c, bounds = self.certificate, []
+        plant = c.plant
         for start in self.starts:
             known = dict(zip(plant.states, map(sp.Float, start), strict=True))
             values: list[Any] = [h.xreplace(known) for h in plant.barriers]
             ranges = zip(start, plant.workspace, strict=True)
             within = all(float(low) < x < float(high) for x, (low, high) in ranges)
             inside = within and all(float(v) > 0 for v in values)
-            value = self.certificate.bounds_at(np.array([start], dtype=float))[0] if inside else 0.0
-            bounds.append(max(0.0, float(value) - 1e-9))
+            x = np.array([start], dtype=float)
+            at = (
+                stated_bound(c).held_bounds_at(x, c.steps)
+                if isinstance(c, HeldCertificate)
+                else c.bounds_at(x)
+            )
+            bounds.append(max(0.0, float(at[0]) - 1e-9) if inside else 0.0)
         return bounds
 
     def document(self) -> dict[str, Any]:
@@ -77,6 +88,7 @@ class CheckAnswer:
             "options": c.options,
             "env": self.env._asdict(),
             "degree": c.psi.degree,
+            "input": "held" if isinstance(c, HeldCertificate) else "continuous",
             "control": "policy" if c.plant.policy else "constraint",
             **{name: float(v) for name, v in _numbers(c).items()},
             "word": self.word,
@@ -85,8 +97,23 @@ class CheckAnswer:
         }
 
 
-def _numbers(c: BarrierCertificate) -> dict[str, Any]:
+def _numbers(c: AnyCertificate) -> dict[str, Any]:
+    if isinstance(c, HeldCertificate):
+        own = {"m": c.shortfall, "sag": c.sag, "tail": c.tail, "c": c.supremum}
+        return own | {"period": c.period, "steps": c.steps}
     return {"a": c.rate, "m": c.shortfall, "c": c.supremum, "horizon": c.horizon}
+
+
+def _formula(c: AnyCertificate) -> str:
+    """Return the bound that a certificate states."""
+    if isinstance(c, HeldCertificate):
+        return (
+            "P(safe and in the workspace at all control instants) >="
+            " [psi(x) - steps (m + sag + tail)]/c"
+        )
+    spent = "m (1 - e^(-a T))/a" if c.rate else "m T"
+    weight = "psi(x) e^(-a T)" if c.rate else "psi(x)"
+    return f"P(safe for T, or until the workspace is left) >= [{weight} - {spent}]/c"
 
 
 def print_check(console: Console, answer: CheckAnswer) -> None:
@@ -103,9 +130,7 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     say(console, f"{shortened(answer.file)}: barrier certificate of {shortened(whose)}")
     say(console, f"psi has degree {c.psi.degree} in {names}; it is for {control}")
     told = ", ".join(f"{name} = {float(v):.9g}" for name, v in _numbers(c).items())
-    spent = "m (1 - e^(-a T))/a" if c.rate else "m T"
-    weight = "psi(x) e^(-a T)" if c.rate else "psi(x)"
-    say(console, f"{told}; P(safe for T, or until the workspace is left) >= [{weight} - {spent}]/c")
+    say(console, f"{told}; {_formula(c)}")
     say(console, answer.env.text)
     for name, result in answer.found.items():
         say(console, f"\nBy {_BY[name]}:")
@@ -113,7 +138,8 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
         for part in result.parts:
             at = "" if part.state is None else f"at ({', '.join(f'{x:.6g}' for x in part.state)})"
             note = "; ".join(text for text in (at, part.reason) if text)
-            boxes, seconds = f"{part.boxes:,}" if part.boxes else "", f"{part.seconds:.2f}"
+            boxes = f"{part.boxes:,}" if part.boxes else ""
+            seconds = f"{part.seconds:.2f}" if part.seconds else ""
             table.add_row(part.name, part.word, boxes, seconds, note)
         print_whole(console, table)
     if answer.starts:
@@ -123,4 +149,9 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
             table.add_row(", ".join(f"{x:g}" for x in start), f">= {percent:.2f} %")
         print_whole(console, table)
     proof = "a proof of its bound" if answer.word == "checked" else "no proof of its bound"
-    say(console, f"{answer.word}: the certificate is {proof}, for continuous control")
+    held = (
+        f"for input that is held for {float(c.period):g} s"
+        if isinstance(c, HeldCertificate)
+        else ""
+    )
+    say(console, f"{answer.word}: the certificate is {proof}, {held or 'for continuous control'}")

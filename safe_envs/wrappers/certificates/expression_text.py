@@ -7,6 +7,7 @@ import math
 import operator
 import re
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import Any
 
 import sympy as sp
@@ -30,6 +31,7 @@ _OPERATORS: dict[type[ast.AST], Any] = {
     ast.UAdd: operator.pos,
 }
 _NUMBER = re.compile(r"[0-9]+(\.[0-9]*)?([eE][-+]?[0-9]{1,3})?|\.[0-9]+([eE][-+]?[0-9]{1,3})?")
+_EXACT = re.compile(r"-?[0-9]{1,400}(\.[0-9]{1,400})?(e-?[0-9]{1,3})?|-?[0-9]{1,400}/[0-9]{1,400}")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,39}")
 
 MOST_BITS = 1100
@@ -122,6 +124,34 @@ def read_expression(text: Any, names: Mapping[str, sp.Symbol], where: str) -> sp
         raise ConfigurationError(
             f"{where}: {shown(text)} is no expression; write it like x_1**3 - 3*x_2/5"
         ) from error
+
+
+def number_text(value: Fraction) -> str:
+    """Return an exact text of a number: a decimal where there is a short one, or a fraction."""
+    rest, places = value.denominator, 0
+    while rest % 10 == 0 or (places < 60 and (rest % 2 == 0 or rest % 5 == 0)):
+        divisor = math.gcd(rest, 10)
+        rest, places = rest // divisor, places + 1
+    if rest != 1 or places > 60:
+        return f"{value.numerator}/{value.denominator}"
+    digits = str(abs(value.numerator) * 10**places // value.denominator).rjust(places + 1, "0")
+    sign, cut = "-" if value < 0 else "", len(digits) - places
+    return f"{sign}{digits[:cut]}.{digits[cut:]}" if places else f"{sign}{digits}"
+
+
+def read_number(text: Any) -> Fraction | None:
+    """Return the number of a text, as `number_text` writes it; None where it is none.
+
+    Args:
+        text: of a file.
+    """
+    try:
+        found = Fraction(text) if isinstance(text, str) and _EXACT.fullmatch(text) else None
+    except ZeroDivisionError:
+        return None
+    if found is None or max(map(int.bit_length, found.as_integer_ratio())) > MOST_BITS:
+        return None
+    return found
 
 
 def _require_few_parts(tree: ast.expr, where: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -17,10 +16,16 @@ from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import read_json
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, shortened, shown
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
+from safe_envs.wrappers.certificates.certificate import (
+    AnyCertificate,
+    BarrierCertificate,
+    HeldCertificate,
+    Plant,
+)
 from safe_envs.wrappers.certificates.expression_text import (
-    MOST_BITS,
+    number_text,
     read_expression,
+    read_number,
     require_name,
     write_expression,
 )
@@ -33,12 +38,18 @@ _MOST_EXPRESSIONS = 40
 _MOST_COEFFICIENTS = 20_000
 _LARGEST_EXPONENT = 20
 _LARGEST_TENSOR = 200_000
+_MOST_STEPS = 10**9
+_MOST_HELD_TERMS = 5000
+"""Moments of a step that a psi of held input may have: more of them take too long to check."""
+
 _MOST_OPTIONS = 20_000
+_HELD = "held"
+_NOT_NEGATIVE: tuple[str, Callable[[Fraction], bool]] = ("a number of at least 0", lambda v: v >= 0)
+_POSITIVE: tuple[str, Callable[[Fraction], bool]] = ("a number above 0", lambda v: v > 0)
 _ADVICE = "write it again with `safe-envs certify`, or get another copy"
-_NUMBER = re.compile(r"-?[0-9]{1,400}(\.[0-9]{1,400})?(e-?[0-9]{1,3})?|-?[0-9]{1,400}/[0-9]{1,400}")
 
 
-def save_certificate(certificate: BarrierCertificate, path: Path | str) -> None:
+def save_certificate(certificate: AnyCertificate, path: Path | str) -> None:
     """Write a certificate, whole or not at all.
 
     Args:
@@ -54,7 +65,7 @@ def save_certificate(certificate: BarrierCertificate, path: Path | str) -> None:
     write_json(Path(path), {**content, "sha256": checksum(content)})
 
 
-def load_certificate(path: Path | str) -> BarrierCertificate:
+def load_certificate(path: Path | str) -> AnyCertificate:
     """Read a certificate, which may be a stranger's: no code is run.
 
     Args:
@@ -95,7 +106,7 @@ def checksum(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _content_of(certificate: BarrierCertificate) -> dict[str, Any]:
+def _content_of(certificate: AnyCertificate) -> dict[str, Any]:
     plant, psi = certificate.plant, certificate.psi
     if psi.states != plant.states:
         raise ConfigurationError(f"psi is of {psi.states}, the plant of {plant.states}; use one")
@@ -127,41 +138,50 @@ def _content_of(certificate: BarrierCertificate) -> dict[str, Any]:
                 [list(key), number_text(v)] for key, v in sorted(psi.coefficients.items())
             ],
         },
-        "a": number_text(certificate.rate),
         "m": number_text(certificate.shortfall),
         "c": number_text(certificate.supremum),
-        "horizon": number_text(certificate.horizon),
+        **_own_numbers(certificate),
     }
 
 
-def number_text(value: Fraction) -> str:
-    """Return an exact text of a number: a decimal where there is a short one, or a fraction."""
-    rest, places = value.denominator, 0
-    while rest % 10 == 0 or (places < 60 and (rest % 2 == 0 or rest % 5 == 0)):
-        divisor = math.gcd(rest, 10)
-        rest, places = rest // divisor, places + 1
-    if rest != 1 or places > 60:
-        return f"{value.numerator}/{value.denominator}"
-    digits = str(abs(value.numerator) * 10**places // value.denominator).rjust(places + 1, "0")
-    sign, cut = "-" if value < 0 else "", len(digits) - places
-    return f"{sign}{digits[:cut]}.{digits[cut:]}" if places else f"{sign}{digits}"
+def _own_numbers(certificate: AnyCertificate) -> dict[str, Any]:
+    if isinstance(certificate, BarrierCertificate):
+        return {"a": number_text(certificate.rate), "horizon": number_text(certificate.horizon)}
+    return {
+        "control": _HELD,
+        "period": number_text(certificate.period),
+        "steps": certificate.steps,
+        "sag": number_text(certificate.sag),
+        "tail": number_text(certificate.tail),
+    }
 
 
-def _certificate_of(content: dict[str, Any]) -> BarrierCertificate:
+def _certificate_of(content: dict[str, Any]) -> AnyCertificate:
     env = _part(content, "env", dict)
     options = _part(env, "options", dict)
     if len(json.dumps(options)) > _MOST_OPTIONS:
         _refuse("env.options", options, f"at most {_MOST_OPTIONS:,} characters of options")
     plant = _plant_of(content)
-    return BarrierCertificate(
-        env_id=_part(env, "id", str),
-        options=options,
-        plant=plant,
-        psi=_psi_of(_part(content, "psi", dict), plant.states),
-        rate=_number(content, "a", "a number of at least 0", lambda v: v >= 0),
-        shortfall=_number(content, "m", "a number of at least 0", lambda v: v >= 0),
-        supremum=_number(content, "c", "a number above 0", lambda v: v > 0),
-        horizon=_number(content, "horizon", "a number above 0", lambda v: v > 0),
+    env_id, psi = _part(env, "id", str), _psi_of(_part(content, "psi", dict), plant.states)
+    shortfall = _number(content, "m", *_NOT_NEGATIVE)
+    supremum = _number(content, "c", *_POSITIVE)
+    if "control" not in content:
+        rate = _number(content, "a", *_NOT_NEGATIVE)
+        horizon = _number(content, "horizon", *_POSITIVE)
+        return BarrierCertificate(env_id, options, plant, psi, rate, shortfall, supremum, horizon)
+    if content["control"] != _HELD:
+        _refuse("control", content["control"], f'"{_HELD}", or nothing for continuous control')
+    if (psi.degree + 1) ** psi.n > _MOST_HELD_TERMS:
+        _refuse("psi.coefficients", psi.degree, "a psi of lower degree for held input")
+    if len(plant.inputs) != 1 and not plant.policy:
+        _refuse("inputs", len(plant.inputs), "one input, or a policy, for held input")
+    steps = content.get("steps")
+    if type(steps) is not int or not 1 <= steps <= _MOST_STEPS:
+        _refuse("steps", steps, f"a whole number from 1 to {_MOST_STEPS:,}")
+    period = _number(content, "period", *_POSITIVE)
+    sag, tail = (_number(content, key, *_NOT_NEGATIVE) for key in ("sag", "tail"))
+    return HeldCertificate(
+        env_id, options, plant, psi, period, steps, supremum, shortfall, sag, tail
     )
 
 
@@ -268,14 +288,9 @@ def _number(
     sound: Callable[[Fraction], bool] = lambda value: True,
 ) -> Fraction:
     text = content.get(key)
-    try:
-        if isinstance(text, str) and _NUMBER.fullmatch(text):
-            value = Fraction(text)
-            bits = max(value.numerator.bit_length(), value.denominator.bit_length())
-            if sound(value) and bits <= MOST_BITS:
-                return value
-    except ZeroDivisionError:
-        pass
+    value = read_number(text)
+    if value is not None and sound(value):
+        return value
     return _refuse(key, text, f'{allowed} as text, a decimal "0.25" or a fraction "1/3"')
 
 

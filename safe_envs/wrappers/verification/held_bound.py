@@ -63,6 +63,8 @@ from safe_envs.wrappers.verification.statement import Statement
 
 _POWERS = (1.5, 2.0, 4.0, 8.0, 16.0, 32.0)
 _LARGE = 700.0
+_SIGNS = "c > 0, dt > 0, and m1, m2 and e >= 0"
+_LEAVES = "E max(psi(X'), 0) outside the box of psi <= e"
 _ROUNDING = 1e-9
 """Of psi and of a tail, whose floats are exact to much less."""
 
@@ -124,13 +126,24 @@ class HeldBound:
             budget: of each.
 
         Returns:
-            The name and the verdict of each; the bound is proved where all are, up to the tail.
+            The name and the verdict of each; the bound is proved where all are.
         """
+        if min(self.shortfall, self.sag, self.tail) < 0 or self.supremum <= 0 or self.period <= 0:
+            return [(_SIGNS, Verdict("refuted", 0, reason=f"not {_SIGNS}"))]
         parts = HeldStatements(self.plant, self.psi, self.period)
         top = parts.region("psi <= c", sp.Rational(self.supremum) - parts.value)
         shortfall, sag = sp.Rational(self.shortfall), sp.Rational(self.sag)
         statements = [top, *parts.outside(), *parts.step_claims(shortfall, sag)]
-        return [(statement.name, judge(statement, budget)) for statement in statements]
+        found = [(statement.name, judge(statement, budget)) for statement in statements]
+        return [*found, (_LEAVES, self._judged_tail(parts, budget or Budget()))]
+
+    def _judged_tail(self, parts: HeldStatements, budget: Budget) -> Verdict:
+        work = _Numbers(budget, self)
+        found = _tail(parts, work)
+        if work.reason or found > float(self.tail):
+            reason = work.reason or f"it is at most {found:.3g}, and not at most e"
+            return Verdict("undecided", work.boxes, reason=reason)
+        return Verdict("proved", work.boxes)
 
 
 def prove_held_bound(
