@@ -15,6 +15,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import without_held
 from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
+from safe_envs.agents.evaluation.held_certificate_bound import held_certificate_bound
 from safe_envs.agents.evaluation.promise_bound import promise_bound
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.running_sum import RunningMean
@@ -56,7 +57,7 @@ class HeldInputBound(Protocol):
 Maker = Callable[[FilteredPolicy], HeldInputBound | None]
 """From a policy under a filter to its bound; None where such a bound is not for such filters."""
 
-MAKERS: tuple[Maker, ...] = (promise_bound,)
+MAKERS: tuple[Maker, ...] = (promise_bound, held_certificate_bound)
 """All that makes such bounds, the best one first."""
 
 NO_FILTER = "there is no filter"

@@ -187,7 +187,8 @@ def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
         # What the file holds is no text.
         parameters.pop("learned", None)
         parameters.pop("certificate", None)
-    names = list(dict.fromkeys([*parameters, *["file"] * _reads_file(condition)]))
+    texts = ["file"] * _reads_file(condition) + ["control"] * issubclass(condition, Certified)
+    names = list(dict.fromkeys([*parameters, *texts]))
     given: dict[str, Any] = {}
     for setting in part.settings:
         key, _, value = setting.partition("=")
@@ -196,11 +197,7 @@ def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
         if key not in names:
             hint = _hint(key, names, given)
             raise ConfigurationError(f"filter {part.name} has no parameter {shown(key)}; {hint}")
-        given[key] = (
-            value
-            if key == "file" and _reads_file(condition)
-            else _value(part.text, parameters[key], value)
-        )
+        given[key] = value if key in texts else _value(part.text, parameters[key], value)
     return condition, given
 
 

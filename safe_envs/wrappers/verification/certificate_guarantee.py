@@ -11,7 +11,7 @@ import numpy as np
 
 from safe_envs.dynamics.tables import tabulated
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate
+from safe_envs.wrappers.certificates.certificate import BarrierCertificate, HeldCertificate
 from safe_envs.wrappers.certificates.matching import system_differences
 from safe_envs.wrappers.conditions import Certified, Condition
 from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
@@ -21,6 +21,7 @@ from safe_envs.wrappers.verification.judge import Verdict
 from safe_envs.wrappers.verification.results import Bound, Status
 
 _BUDGET = Budget(boxes=2_000_000, seconds=120.0)
+OF_HELD_INPUT = "its certificate is of held input, and not of continuous control"
 _NAME = "barrier certificate: (psi_0 e^(-a T) - m (1 - e^(-a T))/a)/c"
 
 
@@ -29,18 +30,18 @@ class CertificateGuarantee:
     """The bound of a barrier certificate, once the judge has proved its statements.
 
     Attributes:
-        certificate: with psi and the numbers.
+        certificate: with psi and the numbers; None where it is of held input.
         against: why its bound is not one of the filter, in words; empty where it is.
     """
 
-    certificate: BarrierCertificate
+    certificate: BarrierCertificate | None
     against: str = ""
     remark = ""
 
     @cached_property
     def statements(self) -> list[tuple[str, Verdict]]:
         """The statements of the certificate, with the judge's word."""
-        return judged(self.certificate, _BUDGET)
+        return [] if self.certificate is None else judged(self.certificate, _BUDGET)
 
     @property
     def note(self) -> str | None:
@@ -59,27 +60,22 @@ class CertificateGuarantee:
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
         """Return the bound at starts; see `ChainGuarantee.at`."""
         starts = np.asarray(starts, dtype=np.float64)
-        if self.note:
+        if self.note or self.certificate is None:
             return np.zeros(len(starts))
-        return np.where(self._inside(starts), self.certificate.bounds_at(starts, horizon), 0.0)
+        return np.where(
+            _inside(self.certificate, starts), self.certificate.bounds_at(starts, horizon), 0.0
+        )
 
     def best_start(self, seed: int = 0) -> None:
         """Return None: no printed formula has to be tried where it is largest."""
-
-    def _inside(self, x: np.ndarray) -> np.ndarray:
-        """Return which states are in C and in the workspace, shape (B,)."""
-        plant = self.certificate.plant
-        with np.errstate(all="ignore"):
-            barriers = tabulated(plant.states, list(plant.barriers))(x)
-        low, high = np.array([[float(end) for end in ends] for ends in plant.workspace]).T
-        within = ((x >= low) & (x <= high)) | np.array(plant.angles)
-        return (barriers > 0.0).all(axis=1) & within.all(axis=1)
 
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
         """Say what states contradict in c; see `ChainGuarantee.contradiction`."""
-        psi = self.certificate.values(reached[self._inside(reached)])
+        if self.certificate is None:
+            return ""
+        psi = self.certificate.values(reached[_inside(self.certificate, reached)])
         highest, c = float(psi.max(initial=-math.inf)), float(self.certificate.supremum)
         return reaches("psi", highest, c) if highest > c * (1.0 + RELATIVE) else ""
 
@@ -103,6 +99,8 @@ def certificate_guarantee(
         conditions: one for each barrier, at least one of which is `Certified`.
     """
     first = next(c for c in conditions if isinstance(c, Certified))
+    if isinstance(first.certificate, HeldCertificate):
+        return CertificateGuarantee(None, OF_HELD_INPUT)
     against = ""
     if any(condition != first for condition in conditions):
         against = "other conditions act besides that of the certificate"
@@ -111,3 +109,13 @@ def certificate_guarantee(
         parts = ", ".join(differing)
         against = f"the plant differs from the system of the certificate in {parts}" * bool(parts)
     return CertificateGuarantee(first.certificate, against)
+
+
+def _inside(certificate: BarrierCertificate, x: np.ndarray) -> np.ndarray:
+    """Return which states are in C and in the workspace, shape (B,)."""
+    plant = certificate.plant
+    with np.errstate(all="ignore"):
+        barriers = tabulated(plant.states, list(plant.barriers))(x)
+    low, high = np.array([[float(end) for end in ends] for ends in plant.workspace]).T
+    within = ((x >= low) & (x <= high)) | np.array(plant.angles)
+    return (barriers > 0.0).all(axis=1) & within.all(axis=1)

@@ -132,8 +132,13 @@ class HeldBound:
             return [(_SIGNS, Verdict("refuted", 0, reason=f"not {_SIGNS}"))]
         parts = HeldStatements(self.plant, self.psi, self.period)
         top = parts.region("psi <= c", sp.Rational(self.supremum) - parts.value)
-        shortfall, sag = sp.Rational(self.shortfall), sp.Rational(self.sag)
-        statements = [top, *parts.outside(), *parts.step_claims(shortfall, sag)]
+        numbers = [self.shortfall, self.sag]
+        # As their suprema were bounded: the kink decides which sides of boxes are bisected.
+        steps = [
+            replace(claim, claim=sp.Rational(most) - sp.Max(0, -claim.claim, evaluate=False))
+            for claim, most in zip(parts.step_claims(0, 0), numbers, strict=False)
+        ]
+        statements = [top, *parts.outside(), *steps]
         found = [(statement.name, judge(statement, budget)) for statement in statements]
         return [*found, (_LEAVES, self._judged_tail(parts, budget or Budget()))]
 

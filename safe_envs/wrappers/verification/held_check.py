@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import sympy as sp
@@ -18,6 +18,8 @@ from safe_envs.wrappers.certificates.check_result import (
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.held_bound import HeldBound
 from safe_envs.wrappers.verification.judge import Verdict
+
+_BUDGET = Budget(seconds=60.0)
 
 _WORDS: dict[str, Word] = {"proved": "checked", "refuted": "refuted", "undecided": "undecided"}
 
@@ -78,6 +80,27 @@ def check_held(certificate: HeldCertificate, seconds: float) -> CheckResult:
     """
     verdicts = stated_bound(certificate).judged(Budget(seconds=seconds))
     return combined([_check_of(name, verdict) for name, verdict in verdicts])
+
+
+def why_not_proved(certificate: HeldCertificate) -> str:
+    """Return why the bound of a certificate is not proved, in words; "" where it is.
+
+    Each certificate is judged once.
+
+    Args:
+        certificate: of held input.
+    """
+    parts = [getattr(certificate, each.name) for each in fields(certificate)[2:]]
+    # A dictionary has no hash.
+    key = repr([*parts, sorted(certificate.psi.coefficients.items())])
+    if key not in _KNOWN:
+        verdicts = stated_bound(certificate).judged(_BUDGET)
+        reasons = (f"{name}: {v.reason}" for name, v in verdicts if v.word != "proved")
+        _KNOWN[key] = next(reasons, "")
+    return _KNOWN[key]
+
+
+_KNOWN: dict[str, str] = {}
 
 
 def _check_of(name: str, verdict: Verdict) -> StatementCheck:
