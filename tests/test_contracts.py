@@ -46,7 +46,6 @@ NAMES = {
 DEFINITIONS = {
     "chosen": "assumptions",
     "corrections": "errata",
-    "doubts": "unverified_assumptions",
     "elsewhere": "alternative_settings",
     "kept": "invariant_set",
     "leading": "control_authority",

@@ -291,9 +291,8 @@ class Formulas:
 
     def slack(self, x: np.ndarray) -> np.ndarray:
         """Return by how much the filter violates each condition, shape (B, k)."""
-        return self.safety_filter.filter(
-            x, np.broadcast_to(self._rest, (len(x), len(self._rest)))
-        ).slack
+        rest = np.broadcast_to(self._rest, (len(x), len(self._rest)))
+        return self.safety_filter.filter(x, rest).slack
 
 
 def _typical(values: np.ndarray) -> np.ndarray:
