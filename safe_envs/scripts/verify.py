@@ -68,10 +68,13 @@ def verify(
 
     The safe set C is sampled, and searched for the worst states: where the input has no effect,
     where no action within the input bounds meets the conditions, and the suprema that the bounds
-    need. None of this depends on the policy; the simulation does, and a bound that it contradicts
-    is withheld.
+    need. A judge then proves the hypotheses and numbers of the bounds, refutes them, or leaves
+    them undecided. None of this depends on the policy; the simulation does, and a bound that it
+    contradicts is withheld. At the end the rate stands between a bound for the env's own steps and
+    what any policy can attain, as far as these are known.
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
+    from safe_envs.agents.evaluation.safety_chain import safety_chain
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.compiled.engine import require_engine
     from safe_envs.registry import make_problem, title_of
@@ -98,9 +101,10 @@ def verify(
                 found, actor, episodes=episodes, seed=seed, engine=engine, progress=tell
             )
         bounds, measurements = judged(bounds, measurements, found)
+    chain = safety_chain(found, starts, bounds, measurements, policy)
     config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
     title = title_of(known, arguments)
-    answer = VerifyAnswer(title, config, policy, found, starts, bounds, measurements)
+    answer = VerifyAnswer(title, config, policy, found, starts, bounds, measurements, chain)
     print_report(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:

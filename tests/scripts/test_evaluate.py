@@ -13,7 +13,9 @@ from rich.console import Console
 
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.yardstick import chained
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
+from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")
@@ -38,8 +40,14 @@ ROW_KEYS = [
     "curve",
     "withheld",
     "outside_rate",
-    "estimated_bound",
-    "bound_note",
+    "held_bound",
+    "held_word",
+    "held_note",
+    "held_error",
+    "continuous_bound",
+    "continuous_word",
+    "continuous_note",
+    "continuous_error",
     "posterior_bound",
     "learning",
 ]
@@ -341,6 +349,11 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
     assert "90 % band" in picture
 
 
+def line_of(text, name):
+    """Return the row of a filter in a table."""
+    return next(line for line in text.splitlines() if line.startswith(f"{name} "))
+
+
 def test_bounds_are_shown_where_there_are_any():
     answer = evaluate(
         DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5
@@ -352,33 +365,64 @@ def test_bounds_are_shown_where_there_are_any():
         print_evaluation(console, replace(answer, rows=rows))
         return console.file.getvalue()
 
-    bounded = printed(
-        {},
-        {"estimated_bound": None, "bound_note": "it ignores the noise"},
-        {"estimated_bound": 0.492, "bound_note": ""},
-    )
-    lines = {
-        line.split()[0]: line
-        for line in bounded.splitlines()
-        if line.startswith(("none", "hocbf", "scbf"))
+    nothing = {
+        "continuous_bound": None,
+        "continuous_word": "none",
+        "continuous_note": "it ignores the noise",
     }
-    assert " 49.2 % " in lines["scbf"]
-    assert not re.search("≥|>=|proved|guaranteed", bounded.replace("{b_j >= 0}", ""))
-    assert "] none " in " ".join(lines["hocbf"].split())
-    assert "] - " in " ".join(lines["none"].split())
-    assert "Note: no bound for hocbf: it ignores the noise\n" in bounded
-    assert bounded.count("no bound for") == 1
-    assert bounded.count("Note: a bound is estimated: ") == 1
-    nothing = {"estimated_bound": None, "bound_note": "it ignores the noise"}
-    below = printed({}, nothing, vars(judged(replace(answer.rows[2], estimated_bound=0.999), 0.98)))
+    given = {"continuous_bound": 0.4929, "continuous_word": "estimated", "continuous_note": ""}
+    bounded = printed({}, nothing, given)
+    assert " 49.2 % est. " in line_of(bounded, "scbf")
+    assert not re.search("≥|>=|guaranteed", bounded.replace("{b_j >= 0}", ""))
+    assert [line_of(bounded, name).split()[1] for name in ("none", "hocbf", "scbf")] == ["-"] * 3
+    assert "] - " in " ".join(line_of(bounded, "hocbf").split())
+    assert "] - " in " ".join(line_of(bounded, "none").split())
+    assert "Note: no bound, continuous control, for hocbf: it ignores the noise\n" in bounded
+    assert bounded.count("no bound, continuous control, for") == 1
+    assert "Note: no bound, held input, for hocbf, scbf: neither a table" in bounded
+    assert bounded.count("Note: continuous control, est.: ") == 1
+    proved = printed({}, nothing, {**given, "continuous_word": "proved"})
+    assert " >= 49.2 % " in line_of(proved, "scbf")
+    assert "est.: " not in proved
+    assert proved.count("Note: continuous control, >=: proved at these starts") == 1
+    held = {"held_bound": 0.4929, "held_word": "proved", "held_note": "of a certificate"}
+    chain = printed({}, {**nothing, **held, "held_word": "computed"}, {**nothing, **held})
+    assert line_of(chain, "hocbf").split()[1:4] == ["49.2", "%", "comp."]
+    assert line_of(chain, "scbf").split()[1:4] == [">=", "49.2", "%"]
+    assert "Note: held input, scbf: proved, of a certificate\n" in chain
+    assert chain.count("from left to right, for the env's own steps") == 1
+    refuted = judged(replace(answer.rows[2], **{**given, "continuous_bound": 0.999}), 0.98)
+    below = printed({}, nothing, vars(refuted))
     assert (
-        "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below"
-        " 99.9 %" in below
+        "Note: no bound, continuous control, for scbf: withheld: the interval of the measured rate"
+        " ends at 98.0 %, below 99.9 %" in below
     )
-    assert "] withheld " in " ".join(
-        next(line for line in below.splitlines() if line.startswith("scbf")).split()
+    assert "] withheld " in " ".join(line_of(below, "scbf").split())
+    assert "est.: " not in below
+
+
+def test_the_columns_read_as_a_chain():
+    answer = evaluate(
+        "Scalar-v0", filters=["none", "scbf"], options={"horizon": 0.1}, episodes=5, bounds=False
     )
-    assert "a bound is estimated" not in below
+    held = {"held_bound": 0.8, "held_word": "proved", "held_note": "of a certificate"}
+    rows = [answer.rows[0], replace(answer.rows[1], **held)]
+
+    def printed(best):
+        console = Console(width=200, file=io.StringIO())
+        judged_best, judged_rows = chained(best, rows)
+        print_evaluation(console, replace(answer, rows=judged_rows, best=judged_best))
+        return console.file.getvalue()
+
+    rate = f"100.0 % [{100 * rows[0].ci_low:.1f}, 100.0]"
+    found = printed(attainable(0.9, 0.99981))
+    assert f" >= 80.0 %  {rate}  99.99 %  " in line_of(found, "scbf")
+    assert "from left to right, for the env's own steps: the bound for held input" in found
+    # A bound above what is attainable, and a rate above it: the table is wrong.
+    low = printed(attainable(0.3, 0.7))
+    assert "attain-" not in low
+    assert "best attainable safety: withheld" in low
+    assert f" >= 80.0 %  {rate}  " in line_of(low, "scbf")
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):

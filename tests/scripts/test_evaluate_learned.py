@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
-
 import pytest
 
+from safe_envs.agents.evaluation.bound_text import bound_text
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")
@@ -93,8 +92,9 @@ def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate)
     _, row, robust = document["rows"]
     assert f"{100 * min(row['learning']['rates']):.1f} %" in out
     assert row["episodes"] == 40
-    assert f" {100 * robust['posterior_bound']['probability']:.1f} % " in out
-    assert not re.search("≥|>=|certificate|proved", out)
+    bound = robust["posterior_bound"]
+    assert f" {bound_text(bound['probability'], bound['word'])} " in out
+    assert f", {bound['word']} given the posterior, with probability delta" in out
     for text in (
         "20 episodes x 2 identifications",
         "over identifications and episodes",

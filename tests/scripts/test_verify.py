@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.agents.evaluation import bound_check
+from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 from tests.wrappers.verification.verified import verify_once
@@ -35,7 +36,11 @@ def test_the_report_names_what_was_found(verify):
         "sup h over C = c = 1",
         "C: 1.6 %, violated by up to 0.08 at (x_1 = 0, x_2 = 0)",
         "hypothesis fails",
-        "repaired for the shortfall m = 0.08, up to T",
+        "repaired for the shortfall m = 0.08",
+        "Hypotheses, judged G is where all b_j are positive, in the workspace",
+        "Proved: a theorem, whose hypotheses and numbers c and m the judge proved",
+        "The env's own steps from the start 'uniform', up to 1 s",
+        "Held input: no bound, neither a table nor a certificate",
         "policy nominal",
         "The measurement contradicts bound 1, hypothesis fails (Prop. 4.2.8: h/c, for ever)",
         "are estimates from samples",
@@ -43,12 +48,61 @@ def test_the_report_names_what_was_found(verify):
         assert text in out
 
 
+def lines_of(out, start, end):
+    """Return the lines of a section, without its heading."""
+    _, _, rest = out.partition(start)
+    return rest.partition(end)[0].splitlines()[1:]
+
+
+def test_each_hypothesis_has_the_word_of_the_judge(verify):
+    status, out, _ = verify("Pendulum-v0", "--start", ".1,.1", "--no-simulate")
+    assert status == 0
+    lines = lines_of(out, "Hypotheses, judged", "Undecided: neither")
+    (bounded,) = [line for line in lines if line.startswith(" G is bounded")]
+    assert bounded.split()[-2:] == ["proved", "0"]
+    (feasible,) = [line for line in lines if line.startswith(" the condition can be met")]
+    assert " undecided " in feasible
+    (amount,) = [line for line in lines if "violates it by at most" in line]
+    assert " proved " in amount
+    # What is estimated stands after no sign, and what is proved does.
+    estimated, proved = (
+        line for line in lines_of(out, "Bounds on the", "Proved: ") if " %  " in line
+    )
+    assert (" estimated " in estimated, ">=" in estimated) == (True, False)
+    assert " >= 72.6 %  proved" in proved
+
+
+def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
+    chain = "safe_envs.agents.evaluation.safety_chain.best_at_hand"
+    monkeypatch.setattr(chain, lambda problem: attainable(0.2, 0.3))
+    arguments = ("Scalar-v0", "--start", "-1", "--horizon", 0.2, "--episodes", 40, "--json", "o.js")
+    assert verify(*arguments)[0] == 0
+    found = strictly("o.js")["chain"]["best"]
+    assert (found["upper"], found["lower"]) == (None, None)
+    assert "scbf is safe in 100.0 %" in found["contradiction"]
+    monkeypatch.setattr(chain, lambda problem: attainable(0.9, 0.99981))
+    status, out, _ = verify(*arguments[:-2])
+    assert status == 0
+    _, titles, _, cells, *_ = lines_of(out, "The env's own steps", "Shares")
+    assert titles.split() == [
+        "held",
+        "input",
+        "safe",
+        "[95",
+        "%",
+        "interval]",
+        "able",
+        "continuous",
+    ]
+    assert " 99.99 % " in cells
+
+
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
         (
             ("safe_envs/ACC-v0",),
-            ("sup h over C = c = 1000", "suprema are of the part inside", "estimated"),
+            ("sup h over C = c = 1000", "suprema are of the part inside", "proved, but empty"),
         ),
         (
             ("StochasticDubins-v0",),
@@ -73,7 +127,7 @@ def test_the_report_names_what_was_found(verify):
         ),
         (
             ("Pendulum-v0", "--start", ".1,.1"),
-            ("nowhere; the smallest margin", "estimated", "72.7 %"),
+            ("nowhere; the smallest margin", "estimated", " 72.6 % ", ">= 72.6 %"),
         ),
     ],
 )
@@ -119,11 +173,21 @@ def test_json_holds_all_of_it(verify, tmp_path):
         False,
         [1000.0],
     )
-    assert [bound["status"] for bound in document["bounds"]] == ["hypothesis fails", "estimated"]
+    assert [bound["status"] for bound in document["bounds"]] == ["hypothesis fails", "proved"]
     assert len(document["safe_set"]["worst"]) == 3
     measured, _ = document["measurements"]
     assert [h["time"] for h in measured["horizons"]] == [1.0, 2.0, 5.0, 10.0, 20.0]
     assert list(measured) == ["start", "state", "episodes", "repeats", "horizons"]
+    words = {each["statement"]: each["word"] for each in document["statements"]}
+    assert words["G is bounded"] == words["sup h <= 1000"] == "proved"
+    assert words["the condition can be met everywhere on G"] == "refuted"
+    (refuted,) = [each for each in document["statements"] if each["word"] == "refuted"]
+    assert list(refuted) == ["statement", "word", "boxes", "state", "box", "reason"]
+    assert len(refuted["state"]) == 3
+    chain = document["chain"]
+    assert (chain["held_bound"], chain["held_word"]) == (None, "none")
+    assert chain["safety_rate"] == measured["horizons"][0]["rate"]
+    assert chain["ci_low"] <= chain["safety_rate"] <= chain["ci_high"]
 
 
 @pytest.mark.parametrize("env_id", ["StochasticDubins-v0", "CubicSDEDisk-v0", "ACCGap-v0"])

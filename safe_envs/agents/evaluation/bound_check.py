@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.contradiction import by_rate, by_states
+from safe_envs.agents.evaluation.attainable import SURE
+from safe_envs.agents.evaluation.contradiction import by_rate, by_states, end_for
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
@@ -75,6 +77,12 @@ class Measurement:
     horizons: tuple[Horizon, ...]
     visited: tuple[VisitedStates, ...] = ()
 
+    def ends(self, horizon: Horizon) -> tuple[float, float]:
+        """Return the upper ends of the intervals of its rate, of 95 % and of `SURE`."""
+        if self.repeats:
+            return horizon.rate, horizon.rate
+        return horizon.ci_high, rate_interval(horizon.safe, self.episodes, SURE)[1]
+
 
 def judged(
     bounds: Sequence[Bound], measurements: Sequence[Measurement], verification: Verification
@@ -94,7 +102,7 @@ def judged(
     for m in measurements:
         for h in m.horizons:
             for bound in h.bounds:
-                below = by_rate(bound.value, h.rate if m.repeats else h.ci_high)
+                below = by_rate(bound.value, end_for(bound.status, *m.ends(h)))
                 if below:
                     of_each.setdefault(bound.name, f"from {m.start}, up to {h.time:g} s, {below}")
 

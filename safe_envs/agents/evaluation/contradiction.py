@@ -1,10 +1,17 @@
-"""The one place that decides which estimated bounds the episodes contradict.
+"""The one place that decides which bounds the episodes contradict, or a table of the env.
 
 A bound is withheld, and the reason said, where the episodes themselves show that it, or a number it
-uses, is wrong: a start or a visited state has a b_j above the supremum c_j that was found, the
-filter violated a condition by more than the shortfall m that was found, or the interval of the
-measured rate lies below the bound. See
-`safe_envs.wrappers.verification.guarantee.ChainGuarantee.contradiction` for the first two.
+uses, is wrong: a start or a visited state has a b_j above the supremum c_j, the filter violated a
+condition by more than the shortfall m, or the interval of the measured rate lies below the bound.
+See `safe_envs.wrappers.verification.guarantee.ChainGuarantee.contradiction` for the first two.
+
+A bound that is proved is withheld only where an interval lies below it that is so wide that this
+hardly happens by chance.
+
+A bound for the env's own steps and the rates stand in a chain: bound <= rate <= what any policy can
+attain. Where the bound is above the last number, one of both is wrong; see `above_attainable`. A
+bound for continuous control is of another process, which the episodes come near to where dt is
+small: a rate below it contradicts that the two are near, or the bound.
 """
 
 from __future__ import annotations
@@ -21,17 +28,17 @@ Bounded = TypeVar("Bounded", bound=BoundSummary)
 
 ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 
-COMPUTED = "computed: the table is of floating-point numbers"
-"""Note on the bound of a promise filter, which is of the env's own steps."""
-
+_ADVICE_PROVED = "an interval misses the truth at times: try more episodes; else report an error"
 _ADVICE_COMPUTED = "an interval misses the truth at times: try more episodes, or another table"
+_DEVIATIONS = 3.0
+_SURE_WORDS = ("proved", "certified")
 
 
 def by_states(bound: Guarantee, visited: Sequence[VisitedStates]) -> str:
     """Return how the states of episodes contradict the numbers of a bound; "" if they do not.
 
     Args:
-        bound: that was estimated.
+        bound: for continuous control.
         visited: states of the episodes.
     """
     found = (
@@ -57,30 +64,90 @@ def by_rate(bound: float | None, ci_high: float, advice: str = ADVICE) -> str:
     )
 
 
-def judged(row: Bounded, ci_high: float) -> Bounded:
+def end_for(word: str, ci_high: float, sure_high: float) -> float:
+    """Return the end of an interval that a bound may not be above.
+
+    Args:
+        word: what the bound is worth.
+        ci_high: upper end of the interval of a rate.
+        sure_high: that of a wider one, for what is proved.
+    """
+    return max(ci_high, sure_high) if word in _SURE_WORDS else ci_high
+
+
+def judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
     """Return a row without the bounds that a measured rate contradicts; `withheld` says why.
 
     Args:
         row: of an evaluation.
         ci_high: upper end of the interval of the rate.
+        sure_high: upper end of a wider one, which a proved bound is held against.
+    """
+    advice = _ADVICE_COMPUTED if row.held_word == "computed" else _ADVICE_PROVED
+    reason = by_rate(row.held_bound, end_for(row.held_word, ci_high, sure_high), advice)
+    return continuous_judged(without_held(row, reason) if reason else row, ci_high, sure_high)
+
+
+def continuous_judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
+    """Return a row without the bounds of continuous control that a rate contradicts.
+
+    Args:
+        row: of an evaluation.
+        ci_high: upper end of the interval of a rate, maybe with a smaller control period.
+        sure_high: upper end of a wider one, which a proved bound is held against.
     """
     posterior = row.posterior_bound
-    advice = _ADVICE_COMPUTED if row.bound_note == COMPUTED else ADVICE
-    reason = by_rate(row.estimated_bound, ci_high, advice) or by_rate(
+    end = end_for(row.continuous_word, ci_high, sure_high)
+    reason = by_rate(row.continuous_bound, end) or by_rate(
         posterior and posterior.probability, ci_high
     )
-    return withheld(row, reason) if reason else row
+    return without_continuous(row, reason) if reason else row
 
 
-def withheld(row: Bounded, reason: str) -> Bounded:
-    """Return a row without its bounds, and with the reason.
+def above_attainable(row: BoundSummary, upper: float | None) -> str:
+    """Return how the bound for the env's own steps contradicts what is attainable; "" if not.
+
+    Args:
+        row: with the bound, whose mean over some starts may be off by a few of its errors.
+        upper: bound from above of what any policy attains, counted as the rates are; None for none.
+    """
+    if row.held_bound is None or upper is None:
+        return ""
+    if row.held_bound - _DEVIATIONS * row.held_error <= upper:
+        return ""
+    return (
+        f"the bound for held input, {100 * row.held_bound:.4f} %, is above what any policy can"
+        f" attain, {100 * upper:.4f} %"
+    )
+
+
+def without_held(row: Bounded, reason: str) -> Bounded:
+    """Return a row without its bound for the env's own steps, and with the reason.
+
+    Args:
+        row: with the bound.
+        reason: how it is contradicted.
+    """
+    return replace(
+        row,
+        withheld=row.withheld or reason,
+        held_bound=None,
+        held_word="withheld",
+        held_note=f"withheld: {reason}",
+        held_error=0.0,
+    )
+
+
+def without_continuous(row: Bounded, reason: str) -> Bounded:
+    """Return a row without its bounds for continuous control, and with the reason.
 
     Args:
         row: with bounds.
         reason: how they are contradicted.
     """
     note, posterior = f"withheld: {reason}", row.posterior_bound
-    row = replace(row, withheld=reason, estimated_bound=None)
+    row = replace(row, withheld=row.withheld or reason, continuous_bound=None)
     if posterior is None:
-        return replace(row, bound_note=note)
-    return replace(row, posterior_bound=replace(posterior, probability=None, note=note))
+        return replace(row, continuous_word="withheld", continuous_note=note, continuous_error=0.0)
+    none = replace(posterior, probability=None, note=note, word="withheld")
+    return replace(row, posterior_bound=none)

@@ -9,22 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.bound_averages import BoundAverager
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.guarantees import together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
 from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
 from safe_envs.agents.evaluation.players import Player, player_of
-from safe_envs.agents.evaluation.promise_bound import Averager, averager_of
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts, conditions_of
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.trajectories import Trajectories
-from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, held_against
+from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained, sure_high
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
 from safe_envs.wrappers.learning import LearnedModel
@@ -64,9 +65,10 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     no longer counted: the conditions mean nothing outside the safe set. Its simulation goes on, and
     its return and minimum h are of the whole episode.
 
-    Each row has the largest bound that is estimated for the filter, averaged over the starts: see
-    `safe_envs.wrappers.verification.bounds`. It is of continuous time and uses suprema from a
-    search. A bound that the episodes contradict is withheld: see
+    Each row has two bounds, averaged over the starts: one for the env's own steps, see
+    `safe_envs.agents.evaluation.held_input`, and the largest one for continuous control, see
+    `safe_envs.wrappers.verification.bounds`, which is proved where a judge proves its hypotheses
+    and numbers, and estimated otherwise. A bound that the episodes contradict is withheld: see
     `safe_envs.agents.evaluation.contradiction`.
 
     Episode i has a seed of its own, `episode_seed(seed, i)`, the same for all filters: it is the
@@ -184,6 +186,7 @@ class _Runner:
                 safe[name] = [each.safe for each in totals]
                 visited[name] = [each.visited for each in totals]
                 timings.append(self._timing(name, totals, players[name][0], seconds))
+        best, rows = chained(best, rows)
         return Evaluation(
             resolved.problem,
             spec,
@@ -197,7 +200,7 @@ class _Runner:
             resolved.learning.models(),
             resolved.is_deterministic,
             kept and kept.joined(),
-            best and held_against(best, rows),
+            best,
         )
 
     def _best(self) -> AttainableSafety | None:
@@ -216,13 +219,20 @@ class _Runner:
         players: Sequence[Player],
         trajectories: Trajectories | None,
         sinks: Sequence[EpisodeSink],
-    ) -> tuple[list[EpisodeStatistics], list[Averager], float]:
+    ) -> tuple[list[EpisodeStatistics], list[BoundAverager], float]:
         """Run the episodes under a filter, with each identification, and take the time in s."""
         resolved, episodes = self._resolved, self._spec.episodes
         found = []
+        spec, given = self._spec, self._spec.policy
+        # The name of an object says nothing.
+        policy = given if isinstance(given, str) else ""
         averagers = [
-            averager_of(c, resolved.problem, self._spec, self._why_no_bound)
-            for c in resolved.filters[name]
+            BoundAverager(
+                FilteredPolicy(resolved.problem, parts, spec.knowledge, policy),
+                spec.monitoring,
+                self._why_no_bound,
+            )
+            for parts in resolved.filters[name]
         ]
         # The search for bounds is over: what is timed are episodes.
         begun = time.perf_counter()
@@ -244,7 +254,7 @@ class _Runner:
         self,
         name: str,
         totals: Sequence[EpisodeStatistics],
-        averagers: Sequence[Averager],
+        averagers: Sequence[BoundAverager],
         policy: str,
     ) -> EvaluationRow:
         conditions = [conditions_of(each) for each in self._resolved.filters[name]]
@@ -260,7 +270,7 @@ class _Runner:
         row = EvaluationRow(
             filter=name, policy=policy, learning=learning, **vars(pool), **vars(together(bounds))
         )
-        return judged(row, row.ci_high)
+        return judged(row, row.ci_high, sure_high(row))
 
     def _timing(
         self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float

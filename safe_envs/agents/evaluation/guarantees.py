@@ -1,4 +1,4 @@
-"""The bounds of a filter, averaged over starts, unless the episodes contradict them."""
+"""The bounds of a filter for continuous control, averaged over starts."""
 
 from __future__ import annotations
 
@@ -9,24 +9,32 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.contradiction import by_states, withheld
-from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
-from safe_envs.agents.evaluation.running_sum import RunningSum
+from safe_envs.agents.evaluation.contradiction import by_states, without_continuous
+from safe_envs.agents.evaluation.rows import BoundSummary, ContinuousWord, PosteriorSummary
+from safe_envs.agents.evaluation.running_sum import RunningMean
 from safe_envs.agents.evaluation.statistics import share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
+from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
+from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
+from safe_envs.wrappers.verification.judge import Word
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""
 
+_OPEN = ("refuted", "undecided")
+"""The judge's words for what is not proved, the worst one first."""
+
 
 class GuaranteeAverager:
-    """The estimated bound on P(safe up to the horizon) of conditions, averaged over the starts.
+    """The bound on P(safe up to the horizon) of conditions, averaged over the starts.
+
+    It is of conditions that are met at every instant.
 
     For conditions that are robust over a posterior it is a bound of its own; see
     `safe_envs.wrappers.verification.posterior_guarantee`.
@@ -53,7 +61,7 @@ class GuaranteeAverager:
         self._of_posterior = any(c.credible_set is not None for c in conditions)
         self._found: Guarantee | None = None
         self._why_none: str | None = why_not if conditions else "there is no filter"
-        self._total, self._count = RunningSum(), 0
+        self._values = RunningMean()
         self._outside = _outside_of(conditions, problem, knowledge)
         self._lost, self._starts = 0, 0
         self._against, self._nothing = "", VisitedStates.nothing(problem)
@@ -65,7 +73,7 @@ class GuaranteeAverager:
     ) -> None:
         try:
             self._found = guarantee_of(problem, conditions, knowledge)
-            self._why_none = self._found.note
+            self._why_none = self._found.note or _refuted(self._found) or None
         except SafeEnvsError as error:
             # The search covers the whole safe set, where the episodes may never be.
             self._why_none = str(error)
@@ -73,11 +81,10 @@ class GuaranteeAverager:
     def add(self, starts: np.ndarray) -> None:
         """Add the starts of a batch, shape (E, n)."""
         if self._found is not None and not self._why_none:
-            self._total.add(self._found.at(starts, self._horizon))
+            self._values.add(self._found.at(starts, self._horizon))
             self._against = self._against or by_states(
                 self._found, [replace(self._nothing, deepest=starts)]
             )
-            self._count += len(starts)
         if self._outside is not None:
             self._lost += int(np.count_nonzero(self._outside(starts)))
             self._starts += len(starts)
@@ -89,34 +96,69 @@ class GuaranteeAverager:
             visited: states of the episodes; where they contradict the bound, it is withheld.
         """
         bound, note = self._mean()
+        word = "none" if bound is None else self._word
         found = BoundSummary(
-            outside_rate=share(self._lost, self._starts), estimated_bound=bound, bound_note=note
+            outside_rate=share(self._lost, self._starts),
+            continuous_bound=bound,
+            continuous_word=word,
+            continuous_note=note,
+            continuous_error=0.0 if bound is None else self._values.error,
         )
         if self._of_posterior:
             of_posterior = isinstance(self._found, PosteriorGuarantee)
             sizes = {name: getattr(self._found, name) for name in _SIZES} if of_posterior else {}
             found = replace(
                 found,
-                estimated_bound=None,
-                bound_note="the condition is learned: see its bound over the posterior",
-                posterior_bound=PosteriorSummary(bound, note, **sizes),
+                continuous_bound=None,
+                continuous_word="none",
+                continuous_error=0.0,
+                continuous_note="the condition is learned: see its bound over the posterior",
+                posterior_bound=PosteriorSummary(bound, note, word, **sizes),
             )
         reason = (
             ""
             if bound is None or self._found is None
             else self._against or by_states(self._found, [visited])
         )
-        return withheld(found, reason) if reason else found
+        return without_continuous(found, reason) if reason else found
+
+    @property
+    def _word(self) -> ContinuousWord:
+        """What the bound is worth."""
+        return "proved" if self._found and self._found.word == "proved" else "estimated"
 
     def _mean(self) -> tuple[float | None, str | None]:
         if self._found is None or self._why_none:
             return None, self._why_none
-        mean, remark = share(self._total.total, self._count), self._found.remark
-        return (
-            (mean, remark)
-            if mean
-            else (None, remark or "it is 0 at these starts up to this horizon")
-        )
+        mean, remark = self._values.mean, self._found.remark
+        if not mean:
+            return None, remark or "it is 0 at these starts up to this horizon"
+        return mean, "; ".join(filter(None, [remark, _undecided(self._found)]))
+
+
+def _judgement(found: Guarantee | CertificateGuarantee) -> tuple[Word, str]:
+    """Return what the judge says of all that a bound asks for, and why it is not proved."""
+    if isinstance(found, ChainGuarantee):
+        return found.proof.word_of(any(found.stages.shortfalls))
+    if isinstance(found, CertificateGuarantee):
+        open_ = [v for w in _OPEN for _, v in found.statements if v.word == w]
+        return (open_[0].word, open_[0].reason) if open_ else ("proved", "")
+    # That of a posterior says so in its remark.
+    return "proved", ""
+
+
+def _refuted(found: Guarantee) -> str:
+    """Return what the judge refutes of a bound; "" if nothing."""
+    if found.note:
+        return ""
+    word, reason = _judgement(found)
+    return reason * (word == "refuted")
+
+
+def _undecided(found: Guarantee) -> str:
+    """Return what the judge leaves undecided of a bound; "" if nothing."""
+    word, reason = _judgement(found)
+    return f"undecided: {reason}" * (word == "undecided")
 
 
 def _outside_of(
@@ -178,5 +220,7 @@ def together(summaries: Sequence[BoundSummary]) -> BoundSummary:
         for key in ("probability", *_SIZES)
         if key == "probability" or all(getattr(c, key) is not None for c in found)
     }
-    merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, **mean))
-    return withheld(merged, reason) if reason else merged
+    proved = all(c.word == "proved" for c in found)
+    word: ContinuousWord = "proved" if proved else "estimated"
+    merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, word=word, **mean))
+    return without_continuous(merged, reason) if reason else merged

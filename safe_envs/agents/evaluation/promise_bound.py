@@ -1,18 +1,12 @@
-"""The bound of a filter averaged over starts, whatever the filter is made of."""
+"""The bound of a promise filter for the env's own steps."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Literal
 
 import numpy as np
 
-from safe_envs.agents.evaluation.contradiction import COMPUTED, withheld
-from safe_envs.agents.evaluation.guarantees import GuaranteeAverager
-from safe_envs.agents.evaluation.resolved import FilterParts
-from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.running_sum import RunningSum
-from safe_envs.agents.evaluation.spec import EvaluationSpec
-from safe_envs.agents.evaluation.statistics import share
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.promise_memory import ROUNDING
@@ -23,21 +17,12 @@ from safe_envs.wrappers.value.promise_tables import (
 )
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 
-
-class Averager(Protocol):
-    """Averages the bound of a filter over the starts of episodes."""
-
-    def add(self, starts: np.ndarray) -> None:
-        """Add the starts of a batch, shape (E, n)."""
-        ...
-
-    def summary(self, visited: VisitedStates) -> BoundSummary:
-        """Return the mean of the bound, or why there is none, given states of the episodes."""
-        ...
+COMPUTED = "computed: the table is of floating-point numbers"
+"""Note on such a bound."""
 
 
-class PromiseAverager:
-    """The guarantee of a promise filter: the mean of p_0 = min(p, one step of look-ahead).
+class PromiseBound:
+    """The guarantee of a promise filter: p_0 = min(p, one step of look-ahead).
 
     It holds for every policy, up to the horizon, as `safe_envs.wrappers.value.promise_filter`
     proves, where the filter's table is of the plant. With a specification it is of the probability
@@ -47,63 +32,47 @@ class PromiseAverager:
     Args:
         settings: of the filter.
         problem: what is simulated.
-        spec: what is asked for.
-        why_not: why not to look for a bound at all, if so.
+        knowledge: of the filter, "model" or "plant".
+
+    Attributes:
+        word: "computed".
+        note: why it is no more than that.
+        why_none: why there is none at any start; "" where there may be one.
+        nowhere: what to say where it is 0 at all starts.
     """
 
-    def __init__(
-        self,
-        settings: PromiseSettings,
-        problem: SafetyProblem,
-        spec: EvaluationSpec,
-        why_not: str | None = None,
-    ) -> None:
-        if spec.monitoring == "continuous":
-            why_not = "it is of control instants, not of the time between them"
-        self._filter = promise_filter_for(problem, settings, spec.knowledge)
-        self._why_none = (
-            why_not
-            or why_not_of_plant(problem, settings, spec.knowledge)
-            or why_not_of_safety(problem, settings)
+    word: Literal["computed"] = "computed"
+    note = COMPUTED
+    nowhere = "no start is in the table's safe set"
+
+    def __init__(self, settings: PromiseSettings, problem: SafetyProblem, knowledge: str) -> None:
+        self._filter = promise_filter_for(problem, settings, knowledge)
+        self.why_none = why_not_of_plant(problem, settings, knowledge) or why_not_of_safety(
+            problem, settings
         )
-        self._total, self._count = RunningSum(), 0
 
-    def add(self, starts: np.ndarray) -> None:
-        """Add the starts of a batch, shape (E, n)."""
-        if not self._why_none:
-            self._total.add(self._filter.start(tuple(np.ascontiguousarray(starts.T))))
-            self._count += len(starts)
+    def at(self, starts: np.ndarray) -> np.ndarray:
+        """Return p_0 at starts; see `HeldInputBound.at`."""
+        return self._filter.start(tuple(np.ascontiguousarray(starts.T)))
 
-    def summary(self, visited: VisitedStates) -> BoundSummary:
-        """Return the mean of p_0, or why there is none.
-
-        It is withheld where p_k had to be lowered in an episode, which a right table never makes
-        necessary.
+    def contradiction(self, visited: VisitedStates) -> str:
+        """Return by how much p_k had to be lowered, which a right table never makes necessary.
 
         Args:
             visited: states of the episodes; their slack is by how much p_k was lowered.
         """
-        mean = share(self._total.total, self._count)
-        if self._why_none or not mean:
-            return BoundSummary(bound_note=self._why_none or "no start is in the table's safe set")
         lost = float(visited.slack.max(initial=0.0))
-        if lost > ROUNDING:
-            reason = f"no input kept p_k in a step, which fell by {lost:.2g}: the table is wrong"
-            return withheld(BoundSummary(), reason)
-        return BoundSummary(estimated_bound=mean, bound_note=COMPUTED)
+        if lost <= ROUNDING:
+            return ""
+        return f"no input kept p_k in a step, which fell by {lost:.2g}: the table is wrong"
 
 
-def averager_of(
-    parts: FilterParts, problem: SafetyProblem, spec: EvaluationSpec, why_not: str | None
-) -> Averager:
-    """Return what averages the bound of a filter.
+def promise_bound(of: FilteredPolicy) -> PromiseBound | None:
+    """Return the bound of a promise filter; None for other filters.
 
     Args:
-        parts: of the filter.
-        problem: what is simulated.
-        spec: what is asked for.
-        why_not: why not to look for a bound at all, if so.
+        of: a policy, which does not matter, and the filter.
     """
-    if isinstance(parts, PromiseSettings):
-        return PromiseAverager(parts, problem, spec, why_not)
-    return GuaranteeAverager(parts, problem, spec.knowledge, why_not)
+    if not isinstance(of.parts, PromiseSettings):
+        return None
+    return PromiseBound(of.parts, of.problem, of.knowledge)

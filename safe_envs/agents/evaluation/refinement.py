@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.comparison import pair_counts
-from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.contradiction import continuous_judged
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
+from safe_envs.agents.evaluation.yardstick import sure_high
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 
@@ -147,9 +148,13 @@ def refine(
 
 
 def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
-    """Return a row without bounds that a rate with a finer period contradicts."""
+    """Return a row without bounds of continuous control that the rate of a finer one contradicts.
+
+    What is of the env's own steps is of its own period, and no other one contradicts it.
+    """
     for evaluation in finer:
-        row = judged(row, evaluation.row(row.filter).ci_high)
+        finer_row = evaluation.row(row.filter)
+        row = continuous_judged(row, finer_row.ci_high, sure_high(finer_row))
     return row
 
 

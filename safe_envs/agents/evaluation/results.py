@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.bound_text import continuous_text, held_text
 from safe_envs.agents.evaluation.comparison import Comparison
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
@@ -21,7 +22,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning import LearnedModel
 
-_TEXT_TITLES = ("bound", "min h, median", "violations", "intervened", "infeasible", "return")
+_TEXT_TITLES = ("continuous", "min h, median", "violations", "intervened", "infeasible", "return")
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class Evaluation:
 
     def __str__(self) -> str:
         level = f"{100 * self.spec.confidence:.10g}"
-        titles = ("filter", f"safe [{level} % interval]", *_TEXT_TITLES)
+        titles = ("filter", "held input", f"safe [{level} % interval]", *_TEXT_TITLES)
         table = [titles, *map(_text_cells, self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
@@ -197,8 +198,9 @@ def _text_cells(row: EvaluationRow) -> tuple[str, ...]:
     filtered = row.filter != UNFILTERED
     return (
         row.filter,
+        held_text(row),
         percent_in(row.safety_rate, row.ci_low, row.ci_high),
-        percent(row.estimated_bound),
+        continuous_text(row),
         f"{row.min_h_median:.3g}",
         str(row.violations),
         percent(row.intervention_rate) if filtered else "-",

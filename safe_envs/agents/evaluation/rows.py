@@ -4,11 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from safe_envs.agents.evaluation.safety_curve import Curve
+
+HeldWord = Literal["proved", "certified", "computed", "withheld", "none"]
+"""What a bound for the env's own steps is worth: the judge proved it; it is of a table that was
+checked by outward-rounded arithmetic; it is of a table of floating-point numbers; episodes or a
+table contradict it; or there is none."""
+
+ContinuousWord = Literal["proved", "estimated", "withheld", "none"]
+"""What a bound for continuous control is worth: the judge proved all hypotheses and numbers; it
+left one undecided, which a search did not find to fail; episodes contradict it; or there is
+none."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +134,8 @@ class PosteriorSummary:
 
     Attributes:
         probability: the bound; None where there is none.
-        note: why there is none, or why it is weak.
+        note: why there is none, or why it is weak or not proved.
+        word: what it is worth, given the posterior.
         delta: probability that the identification does not contain the system; None, as those
             below, where no bound was looked for.
         supremum: c.
@@ -134,6 +145,7 @@ class PosteriorSummary:
 
     probability: float | None
     note: str | None
+    word: ContinuousWord = "none"
     delta: float | None = None
     supremum: float | None = None
     shortfall: float | None = None
@@ -142,7 +154,7 @@ class PosteriorSummary:
     def as_dict(self) -> dict[str, Any]:
         """Return it as JSON-able data, less the numbers that are not there."""
         given = asdict(self)
-        head = {name: given.pop(name) for name in ("probability", "note")}
+        head = {name: given.pop(name) for name in ("probability", "note", "word")}
         return head | {name: value for name, value in given.items() if value is not None}
 
 
@@ -150,19 +162,36 @@ class PosteriorSummary:
 class BoundSummary:
     """The bounds of a filter, averaged over starts, unless the episodes contradict them.
 
+    They are two claims: one is of the env's own steps, where the input is held between control
+    instants, and one of conditions that are met at every instant.
+
     Attributes:
         withheld: how the episodes contradict a bound, which is withheld then.
-        outside_rate: share of the starts in the safe set outside the sets C_j, which no bound
-            covers; None without a filter, and where the sets are not known.
-        estimated_bound: on the probability of being safe; None where there is none.
-        bound_note: why there is none, or why it is weak.
+        outside_rate: share of the starts in the safe set outside the sets C_j, which no bound of
+            continuous control covers; None without a filter, and where the sets are not known.
+        held_bound: on the probability of being safe in the env's own steps; None where there is
+            none.
+        held_word: what it is worth.
+        held_note: what it is of, or why there is none.
+        held_error: its standard error as the mean over all starts; 0 for one start.
+        continuous_bound: on the probability of being safe in continuous control; None where there
+            is none.
+        continuous_word: what it is worth.
+        continuous_note: why there is none, or why it is weak or not proved.
+        continuous_error: its standard error as the mean over all starts; 0 for one start.
         posterior_bound: that over the posterior; None where the filter is not robust over one.
     """
 
     withheld: str | None = None
     outside_rate: float | None = None
-    estimated_bound: float | None = None
-    bound_note: str | None = None
+    held_bound: float | None = None
+    held_word: HeldWord = "none"
+    held_note: str | None = None
+    held_error: float = 0.0
+    continuous_bound: float | None = None
+    continuous_word: ContinuousWord = "none"
+    continuous_note: str | None = None
+    continuous_error: float = 0.0
     posterior_bound: PosteriorSummary | None = None
 
 

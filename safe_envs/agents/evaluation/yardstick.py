@@ -22,14 +22,18 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from safe_envs.agents.evaluation.attainable import (
+    SURE,
     AttainableSafety,
     attainable_safety,
     contradicted,
     of_table,
+    withheld,
 )
+from safe_envs.agents.evaluation.contradiction import Bounded, above_attainable, without_held
 from safe_envs.agents.evaluation.countings import leaves_safely
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
@@ -131,6 +135,58 @@ def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> Attai
     """
     judging = [r for r in rows if r.learning is None or r.learning.repeats == 1]
     return contradicted(best, [(row.filter, row.safe, row.episodes) for row in judging])
+
+
+def sure_high(row: EvaluationRow) -> float:
+    """Return the upper end of the interval of a row's rate that a proved bound is held against.
+
+    Args:
+        row: of an evaluation; over several identifications its own interval is all there is.
+    """
+    if row.learning is not None and row.learning.repeats > 1:
+        return row.ci_high
+    return rate_interval(row.safe, row.episodes, SURE)[1]
+
+
+def chained(
+    best: AttainableSafety | None, rows: Sequence[EvaluationRow]
+) -> tuple[AttainableSafety | None, list[EvaluationRow]]:
+    """Return the attainable safety and the rows, without what breaks bound <= rate <= attainable.
+
+    Where a bound for the env's own steps is above the attainable upper bound, a table is wrong: the
+    attainable safety is withheld, and so is a bound that is only computed.
+
+    Args:
+        best: attainable safety, if it is known.
+        rows: of an evaluation.
+    """
+    if best is None:
+        return None, list(rows)
+    upper, found = best.upper, []
+    best = held_against(best, rows)
+    for row in rows:
+        best, judged = against_attainable(best, upper, row.filter, row)
+        found.append(judged)
+    return best, found
+
+
+def against_attainable(
+    best: AttainableSafety, upper: float | None, name: str, row: Bounded
+) -> tuple[AttainableSafety, Bounded]:
+    """Return both without what contradicts the other; see `chained`.
+
+    Args:
+        best: attainable safety, maybe withheld by now.
+        upper: its upper end.
+        name: of the filter.
+        row: with its bounds.
+    """
+    reason = above_attainable(row, upper)
+    if not reason:
+        return best, row
+    if best.upper is not None:
+        best = withheld(best, f"{name}: {reason}")
+    return best, without_held(row, reason) if row.held_word == "computed" else row
 
 
 def best_document(

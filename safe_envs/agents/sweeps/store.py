@@ -34,8 +34,10 @@ _STATISTICS = (
     "infeasible_rate",
     "effort_mean",
     "return_mean",
-    "estimated_bound",
+    "held_bound",
+    "continuous_bound",
 )
+_WORDS = ("held_word", "continuous_word")
 _BEST = ("lower", "upper")
 _ADVICE = "remove it and start the sweep again"
 
@@ -193,6 +195,7 @@ def _kinds() -> dict[str, pa.DataType]:
     import pyarrow as pa
 
     kinds = dict.fromkeys(_COUNTS, pa.int64()) | dict.fromkeys(_STATISTICS, pa.float64())
+    kinds |= dict.fromkeys(_WORDS, pa.string())
     kinds |= {f"best_{name}": pa.float64() for name in _BEST}
     kinds |= {"error": pa.string(), "seconds": pa.float64()}
     return kinds | dict.fromkeys(("files", "versions", "config", "row"), pa.string())
@@ -206,7 +209,7 @@ def _columns(document: Mapping[str, Any]) -> dict[str, Any]:
     statistics: Mapping[str, Any] = row or {}
     best: Mapping[str, Any] = document.get("best") or {}
     return (
-        {name: statistics.get(name) for name in (*_COUNTS, *_STATISTICS)}
+        {name: statistics.get(name) for name in (*_COUNTS, *_STATISTICS, *_WORDS)}
         | {f"best_{name}": best.get(name) for name in _BEST}
         | {"error": document["error"], "seconds": document["seconds"]}
         | {name: None if part is None else json.dumps(part) for name, part in texts.items()}

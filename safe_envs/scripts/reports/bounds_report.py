@@ -8,21 +8,40 @@ from rich.console import Console
 from rich.markup import escape
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
+from safe_envs.agents.evaluation.bound_text import (
+    bound_text,
+    continuous_text,
+    held_text,
+    rounded_down,
+)
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.best_text import COMPUTED
+from safe_envs.scripts.reports.bound_notes import attainable_text, is_certified
 from safe_envs.scripts.reports.quantities import share_text, state_text
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
-from safe_envs.wrappers.verification.results import Bound
+from safe_envs.wrappers.verification.results import HOLDING, Bound
 
 _NO_BOUND = ("hypothesis fails", "not established")
 _COLORS = {
-    "estimated": "green",
+    "proved": "green",
+    "estimated": "yellow",
     "hypothesis fails": "red",
     "withheld": "red",
     "no bound": "yellow",
     "not established": "yellow",
 }
+
+_PROVED = (
+    "Proved: a theorem, whose hypotheses and numbers c and m the judge proved by interval branch"
+    " and bound, rounded outwards, with exact rational parameters."
+)
+_ESTIMATED = (
+    "Estimated: a theorem, of which the judge left a hypothesis or a number undecided. A search"
+    " found no counterexample, and the numbers are its own where none is proved: what it missed"
+    " would make the value smaller, or void."
+)
 
 
 def print_bounds(console: Console, answer: VerifyAnswer) -> None:
@@ -42,19 +61,16 @@ def print_bounds(console: Console, answer: VerifyAnswer) -> None:
     console.print(
         f"\n[bold]Bounds on the probability of no violation[/] {heading}", highlight=False
     )
-    titles = ("", "bound", "value", "status with the c and m found", "why")
+    titles = ("", "bound", "value", "status", "why")
     table = make_table("lprp", *titles, indent=True)
     for i, bound in enumerate(bounds, start=1):
-        empty = bound.status == "estimated" and not bound.value
+        empty = bound.status in HOLDING and not bound.value
         status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
         table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
     console.print(table)
-    if any(bound.status == "estimated" for bound in bounds):
-        say(
-            console,
-            "Estimated: a theorem, with the c and m found. Larger ones that the search missed would"
-            " make the bound smaller.",
-        )
+    statuses = {bound.status for bound in bounds}
+    for text in [_PROVED] * ("proved" in statuses) + [_ESTIMATED] * ("estimated" in statuses):
+        say(console, text)
     if any(_in_brackets(bound) for bound in bounds):
         say(
             console,
@@ -89,11 +105,47 @@ def print_measurements(console: Console, answer: VerifyAnswer) -> None:
         say(console, f"\n{_verdict(answer.measurements, numbers)}")
 
 
+def print_chain(console: Console, answer: VerifyAnswer) -> None:
+    """Print the bound for held input, the measured rate, and what is attainable, in this order.
+
+    Args:
+        console: to print on.
+        answer: with the chain.
+    """
+    chain, problem = answer.chain, answer.problem
+    heading = f"from the start {problem.start!r}, up to {problem.duration:g} s"
+    console.print(f"\n[bold]The env's own steps[/] {escape(heading)}", highlight=False)
+    attainable = attainable_text(chain.best)
+    titles = ("bound,\nheld input", "safe [95 % interval]", *["attain-\nable"] * len(attainable))
+    table = make_table("r", *titles, "bound,\ncontinuous", indent=True)
+    rate = (
+        "not measured"
+        if chain.rate is None or chain.ci_low is None or chain.ci_high is None
+        else percent_in(chain.rate, chain.ci_low, chain.ci_high)
+    )
+    cells = (held_text(chain.bounds), rate, *attainable, continuous_text(chain.bounds))
+    table.add_row(*map(escape, cells))
+    console.print(table)
+    held = chain.bounds.held_note
+    if held:
+        none = chain.bounds.held_bound is None
+        say(console, f"Held input: {'no bound, ' * none}{held}.")
+    if chain.best is not None and chain.best.contradiction:
+        say(console, f"The attainable safety is withheld: {chain.best.contradiction}.")
+    elif chain.best is not None and attainable:
+        how = "certified" if is_certified(chain.best) else COMPUTED
+        say(console, f"Attainable: what no policy exceeds, {how}.")
+
+
 def _in_brackets(bound: Bound) -> bool:
     return bound.status in _NO_BOUND and bound.value is not None
 
 
 def _value(bound: Bound) -> str:
+    if bound.status == "proved":
+        return bound_text(bound.value, "proved")
+    if bound.status == "estimated" and bound.value is not None:
+        return f"{rounded_down(bound.value)} %"
     return f"({share_text(bound.value)})" if _in_brackets(bound) else share_text(bound.value)
 
 

@@ -18,11 +18,10 @@ from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.best_text import best_line, best_notes, times_column
+from safe_envs.scripts.reports.bound_notes import bound_notes, chain_cells, chain_titles
 from safe_envs.scripts.reports.engine_notes import engine_notes
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
-from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole
-from safe_envs.wrappers.conditions.text_parts import names_promise
 
 _COLUMNS = (
     "min h\nmedian",
@@ -34,12 +33,6 @@ _COLUMNS = (
     "return",
     "steps/s",
 )
-ESTIMATED = (
-    "a bound is estimated: a theorem, with a supremum and a shortfall from a search of the safe"
-    " set, as far as these episodes do not contradict it; leaving the workspace is no violation."
-)
-"""What an estimated bound is."""
-
 _VERDICTS = {
     "converged": "converged, {}",
     "not resolved": "not resolved, {}: more episodes are needed",
@@ -62,12 +55,12 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     learned = learned_columns(evaluation.rows)
     times = times_column(evaluation.best, evaluation.rows)
     extra = [*learned, *["times un-\navoidable"] * bool(times)]
-    titles = ("filter", f"safe [{interval}]", *extra, "estimated\nbound", *_COLUMNS)
-    table = make_table("pr", *titles)
+    chain = chain_titles(interval, evaluation.best)
+    table = make_table("pr", "filter", *chain, *extra, *_COLUMNS)
     for i, (row, speed) in enumerate(zip(evaluation.rows, evaluation.timing.rows, strict=True)):
-        name, rate, *rest = _cells(row, speed.steps_per_second)
         cells = [*[cell(row, speed) for cell in learned.values()], *times[i : i + 1]]
-        table.add_row(Text(name), rate, *cells, *rest)
+        rest = _cells(row, speed.steps_per_second)
+        table.add_row(Text(row.filter), *chain_cells(row, evaluation.best), *cells, *rest)
     print_whole(console, table)
     compared = (
         []
@@ -195,13 +188,10 @@ def _notes(evaluation: Evaluation) -> list[str]:
     """Return what has to be known to read the table."""
     steps = evaluation.problem.steps
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
-    notes += [note for row in evaluation.rows for note in (*_of_bound(row), *_of_violations(row))]
+    notes += [note for row in evaluation.rows for note in (*_of_starts(row), *_of_violations(row))]
+    notes += bound_notes(evaluation.rows)
     notes += best_notes(evaluation.best)
     notes += learned_notes(evaluation.rows, evaluation.problem)
-    bounded = [row.filter for row in evaluation.rows if row.estimated_bound is not None]
-    if not all(map(names_promise, bounded)):
-        notes.append(ESTIMATED)
-    notes += computed_notes(bounded)
     for row, speed in zip(evaluation.rows, evaluation.timing.rows, strict=True):
         length = speed.steps / row.episodes  # With repeats both are of all identifications.
         if length < 0.99 * steps:
@@ -217,17 +207,14 @@ def _notes(evaluation: Evaluation) -> list[str]:
     return notes
 
 
-def _of_bound(row: EvaluationRow) -> list[str]:
-    """Return why a row has no bound, or none from some of its starts."""
-    name, notes = row.filter, []
-    if name != UNFILTERED and row.estimated_bound is None and row.learning is None:
-        notes.append(f"no bound for {name}: {row.bound_note}")
-    if row.outside_rate:
-        notes.append(
-            f"{100 * row.outside_rate:.3g} % of the starts lie outside the sets C_j = {{b_j >="
-            f" 0}}, j >= 1, that {name} keeps: no bound holds from there"
-        )
-    return notes
+def _of_starts(row: EvaluationRow) -> list[str]:
+    """Return from which of its starts a row has no bound for continuous control."""
+    if not row.outside_rate:
+        return []
+    return [
+        f"{100 * row.outside_rate:.3g} % of the starts lie outside the sets C_j = {{b_j >="
+        f" 0}}, j >= 1, that {row.filter} keeps: no bound holds from there"
+    ]
 
 
 def _of_violations(row: EvaluationRow) -> list[str]:
@@ -270,9 +257,6 @@ def early_end(name: str, which: str, length: float, steps: int) -> str:
 def _cells(row: EvaluationRow, speed: float) -> list[str]:
     filtered = row.filter != UNFILTERED
     return [
-        row.filter,
-        percent_in(row.safety_rate, row.ci_low, row.ci_high),
-        _bound(row),
         f"{row.min_h_median:.3g}",
         f"{row.min_h_p05:.3g}",
         str(row.violations),
@@ -282,14 +266,6 @@ def _cells(row: EvaluationRow, speed: float) -> list[str]:
         f"{row.return_mean:.4g}",
         _thousands(speed),
     ]
-
-
-def _bound(row: EvaluationRow) -> str:
-    if row.filter == UNFILTERED:
-        return "-"
-    if row.estimated_bound is None:
-        return "withheld" if row.withheld and row.posterior_bound is None else "none"
-    return percent(row.estimated_bound)
 
 
 def _points(difference: float, low: float, high: float) -> str:

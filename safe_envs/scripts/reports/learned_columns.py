@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from safe_envs.agents.evaluation.bound_text import bound_text
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import FilterTiming
 from safe_envs.agents.evaluation.rows import EvaluationRow
@@ -25,7 +26,7 @@ def learned_columns(rows: Sequence[EvaluationRow]) -> dict[str, Cell]:
     if repeats > 1:
         columns["worst\nident."] = _worst
     if any(row.posterior_bound for row in rows):
-        columns["estimated,\nposterior"] = _posterior_bound
+        columns["bound,\nposterior"] = _posterior_bound
     return columns
 
 
@@ -41,9 +42,7 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
         return []
     untried = not any(row.posterior_bound for row in rows) and _may_have_a_bound(problem)
     hint = (
-        "; for bayesian-scbf:simultaneous=P one may be estimated over the posterior"
-        if untried
-        else ""
+        "; for bayesian-scbf:simultaneous=P there may be one over the posterior" if untried else ""
     )
     notes = [f"no bound for learned filters{hint}."]
     if repeats > 1:
@@ -67,9 +66,10 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
         if bound and bound.note:
             notes.append(f"bound of {name} over the posterior: {bound.note}")
         if bound and bound.delta is not None:
+            word = "" if bound.probability is None else f" {bound.word} given the posterior,"
             notes.append(
-                f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,"
-                f" estimated, with probability delta = {bound.delta:.3g} that the identification"
+                f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,{word}"
+                f" with probability delta = {bound.delta:.3g} that the identification"
                 f" does not contain the system, shortfall m = {bound.shortfall:.3g}, bias of the"
                 f" steps e = {bound.bias:.3g}, c = {bound.supremum:.3g}."
             )
@@ -107,8 +107,4 @@ def _worst(row: EvaluationRow, _: FilterTiming) -> str:
 
 def _posterior_bound(row: EvaluationRow, _: FilterTiming) -> str:
     bound = row.posterior_bound
-    if bound is None:
-        return _NONE
-    if bound.probability is None:
-        return "withheld" if row.withheld else "none"
-    return percent(bound.probability)
+    return _NONE if bound is None else bound_text(bound.probability, bound.word)

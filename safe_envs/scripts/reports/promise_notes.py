@@ -19,8 +19,9 @@ def computed_notes(names: Iterable[str]) -> list[str]:
         return []
     which = f"the bound of {found[0]} is" if len(found) == 1 else "bounds of promise filters are"
     notes = [
-        f"{which} computed, not estimated: the mean of p_0 over the starts, which the filter keeps"
-        " for every policy up to the horizon, in the floating-point numbers of its table."
+        f"held input, comp.: {which} computed, not proved: the mean of p_0 over the starts, which"
+        " the filter keeps for every policy up to the horizon, in the floating-point numbers of its"
+        " table."
     ]
     tasks = [name for name in found if PromiseSettings.of_text(name).specification]
     if tasks:

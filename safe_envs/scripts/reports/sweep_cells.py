@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
+from safe_envs.agents.evaluation.bound_text import bound_cells
 from safe_envs.agents.evaluation.rate_text import percent, rate_of
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.evaluation.yardstick import times_between
@@ -23,6 +24,7 @@ Row = dict[str, Any]
 
 _SHOWN = 10
 _SAFE = "safe [95 % interval]"
+_CONTINUOUS = "continuous_bound"
 _BEST_TITLES = ("best", "times unavoidable")
 _TITLES = ("min h 5 %", "violations", "intervened", "infeasible", "return")
 _DOCUMENTS = ("row", "config", "versions", "files")
@@ -46,16 +48,22 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
     )
     shown = _worst(rows, worst)
     best = _BEST_TITLES if any(row["best_lower"] is not None for row in shown) else ()
-    table = make_table("l" * len(names) + "r", *names, _SAFE, *best, *_TITLES, tight=False)
+    bounded = any(row[name] is not None for row in shown for name in ("held_bound", _CONTINUOUS))
+    held, continuous = (("held input",), ("continuous",)) if bounded else ((), ())
+    titles = (*names, *held, _SAFE, *best, *continuous, *_TITLES)
+    table = make_table("l" * len(names) + "r", *titles, tight=False)
     for row in shown:
         filtered = row["filter"] != UNFILTERED
         rates = [
             row[name] if filtered else None for name in ("intervention_rate", "infeasible_rate")
         ]
+        bounds = bound_cells(row)
         table.add_row(
             *(Text(_value(row[name])) for name in names),
+            *bounds[: len(held)],
             rate_of(row),
             *_best_cells(row)[: len(best)],
+            *bounds[1 : 1 + len(continuous)],
             f"{row['min_h_p05']:.3g}",
             str(row["violations"]),
             *map(percent, rates),

@@ -10,9 +10,12 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.bound_check import Measurement
+from safe_envs.agents.evaluation.safety_chain import SafetyChain
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
+from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
 from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
+from safe_envs.wrappers.verification.judge import Verdict
 from safe_envs.wrappers.verification.results import Bound
 
 
@@ -28,6 +31,7 @@ class VerifyAnswer:
         starts: for which the bounds are, shape (B, n).
         bounds: on the probability of no violation.
         measurements: of that probability; none without a simulation.
+        chain: the bound for held input, the measured rate, and what any policy can attain.
     """
 
     title: str
@@ -37,6 +41,23 @@ class VerifyAnswer:
     starts: np.ndarray
     bounds: Sequence[Bound]
     measurements: Sequence[Measurement]
+    chain: SafetyChain
+
+    @property
+    def statements(self) -> list[tuple[str, Verdict]]:
+        """All that a bound asks for, with the judge's word; none without an invariant set."""
+        if self.verification.invariant_set is None:
+            return []
+        found = self.verification.guarantee.statements
+        # Where no number is proved, none is finite.
+        return [(text.replace("<= inf", "is finite"), verdict) for text, verdict in found]
+
+    @property
+    def judged_region(self) -> str:
+        """What the G of the statements is, in words."""
+        of_certificate = isinstance(self.verification.guarantee, CertificateGuarantee)
+        positive = "psi and all h are" if of_certificate else "all b_j are"
+        return f"G is where {positive} positive, in the workspace"
 
     @property
     def problem(self) -> SafetyProblem:
@@ -75,8 +96,12 @@ class VerifyAnswer:
                     {**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)}
                     for b in found.barriers
                 ],
+                "statements": [
+                    {"statement": text, **verdict._asdict()} for text, verdict in self.statements
+                ],
                 "bounds": [vars(b) for b in self.bounds],
                 "measurements": [_measured(m) for m in self.measurements],
+                "chain": self.chain.as_dict(),
             }
         )
 

@@ -11,8 +11,9 @@ from rich.markup import escape
 from rich.text import Text
 
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.bounds_report import print_bounds, print_measurements
+from safe_envs.scripts.reports.bounds_report import print_bounds, print_chain, print_measurements
 from safe_envs.scripts.reports.evaluation_report import describe_system
+from safe_envs.scripts.reports.judge_report import print_statements
 from safe_envs.scripts.reports.quantities import number_text, share_text, state_text
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.feasibility import (
@@ -49,13 +50,16 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
     _section(
         console, f"Where no action within the input bounds meets the {conditions}", _parts(found)
     )
+    print_statements(console, answer)
     print_bounds(console, answer)
     print_measurements(console, answer)
+    print_chain(console, answer)
     say(
         console,
-        "\nSuprema, shortfalls and shares are estimates from samples and a local search. The"
-        f" bounds are about conditions that are met at every instant, not every {problem.dt:g} s,"
-        " and count leaving the workspace as an end, not as a violation.",
+        "\nShares, worst states and what is said of each barrier are estimates from samples and a"
+        " local search; what the judge proved is not. The bounds but for that of held input are of"
+        f" a filter that acts at every instant, not every {problem.dt:g} s, and count leaving the"
+        " workspace as an end, not as a violation.",
     )
 
 

@@ -1,9 +1,10 @@
-"""Results of episodes that nothing simulated."""
+"""Results of episodes that nothing simulated, and of tables that nothing computed."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.rows import EpisodeResults
 
 STEPS = 100
@@ -31,3 +32,10 @@ def made_up(count, seed=0):
         infeasible=rng.integers(0, counted + 1).astype(np.int32),
         effort=effort,
     )
+
+
+def attainable(lower, upper):
+    """Return what a table of no problem in particular says."""
+    nothing = {"simulated": None, "contradiction": "", "knowledge": "plant", "leaving": "safe"}
+    sizes = {"coordinates": (), "cells": (), "inputs": 1, "steps": 1, "seconds": 0.0, "memory": 0}
+    return AttainableSafety(lower=lower, upper=upper, specification="", **nothing, **sizes)

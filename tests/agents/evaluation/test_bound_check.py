@@ -53,7 +53,8 @@ def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch)
     # = 3 and v = 2.
     rho = np.linspace(0.0, 3.0, 100_001)
     largest = ((9 - rho**2) * (4 * rho - 0.32)).max() / ((9 - 0.08**2) * 11.68)
-    assert product.value == pytest.approx(largest, rel=1e-5)
+    # The suprema are proved, to 1e-3 of them.
+    assert largest * (1 - 2e-3) <= product.value <= largest * (1 + 1e-9)
     assert last.ci_high < product.value
     assert product.name in last.contradicted
     assert not any("repaired" in name for name in contradicted(at_best))
@@ -71,19 +72,24 @@ def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
     assert contradicted(at_best) == {"Prop. 4.2.8: h/c, for ever"}
     for horizon in (*from_start.horizons, *at_best.horizons):
         assert horizon.ci_low <= horizon.rate == horizon.safe / 200 <= horizon.ci_high
-        (estimated,) = [b.value for b in horizon.bounds if b.status == "estimated"]
-        assert estimated is not None
-        assert estimated <= horizon.ci_high
+        (proved,) = [b.value for b in horizon.bounds if b.status == "proved"]
+        assert proved is not None
+        assert proved <= horizon.ci_high
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_the_estimated_bound_of_the_pendulum_holds(monkeypatch):
+def test_the_bounds_of_the_pendulum_hold(monkeypatch):
     monkeypatch.setattr(bound_check, "_MULTIPLES", (1, 4))
     measurements = measured("safe_envs/Pendulum-v0")
     assert len(measurements) == 2
     assert not any(contradicted(m) for m in measurements)
-    assert all(b.status == "estimated" for m in measurements for h in m.horizons for b in h.bounds)
+    # The best input is worth 0 along a line of states, which no box is narrow enough for; but that
+    # it misses the condition by a tiny number at most is proved.
+    found = {
+        (b.name.split()[0], b.status) for m in measurements for h in m.horizons for b in h.bounds
+    }
+    assert found == {("Prop.", "estimated"), ("repaired", "proved")}
 
 
 @pytest.mark.usefixtures("short")

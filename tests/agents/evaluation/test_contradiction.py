@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,13 +13,14 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import bound_check, refinement
-from safe_envs.agents.evaluation.contradiction import by_rate, judged
+from safe_envs.agents.evaluation.contradiction import above_attainable, by_rate, judged
 from safe_envs.agents.evaluation.refinement import refine
 from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.verification import safe_set_analysis
+from safe_envs.wrappers.verification import proof, safe_set_analysis
 from safe_envs.wrappers.verification.feasibility import verify
+from safe_envs.wrappers.verification.judge import Supremum, Verdict
 from tests.oracles import false_bounds
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
@@ -27,25 +29,25 @@ FALSE = [
         false_bounds.kink,
         "szcbf:alphas=0.1",
         "h is not twice differentiable",
-        "the interval of the measured rate ends at",
+        "withheld: the interval of the measured rate ends at",
     ),
     (
         false_bounds.pole,
         "cbf:alpha=1",
         "h has a pole near",
-        "the interval of the measured rate ends at",
+        "it is 0 at these starts",
     ),
     (
         false_bounds.island,
         "scbf",
         "no action meets the condition somewhere, by up to",
-        "h reaches 28.66, above the supremum of 1 that",
+        "no action meets the condition somewhere, by up to",
     ),
     (
         false_bounds.rotated,
         "cbf:alpha=0.1",
         "no action meets the condition somewhere, by up to 0.",
-        "the filter violated the condition by",
+        "it is 0 at these starts",
     ),
 ]
 HORIZON = 0.5
@@ -61,21 +63,47 @@ def credulous(monkeypatch):
     )
 
 
+@pytest.fixture
+def undecided(monkeypatch):
+    """A judge that decides nothing but that C is bounded."""
+    verdict = Verdict("undecided", 0, reason="not looked at")
+    monkeypatch.setattr(proof, "judge", lambda *_: verdict)
+    monkeypatch.setattr(
+        proof, "supremum", lambda *_: Supremum(math.inf, -math.inf, None, 0, "not looked at")
+    )
+
+
 @pytest.mark.parametrize(("make", "text", "reason"), [case[:3] for case in FALSE])
 def test_false_bounds_are_not_estimated(make, text, reason):
     (row,) = evaluate(make(), filters=text, episodes=40).rows
     assert row.safety_rate < 0.2
-    assert row.estimated_bound is None
-    assert row.bound_note.startswith(reason)
+    assert row.continuous_bound is None
+    assert row.continuous_note.startswith(reason)
 
 
 @pytest.mark.parametrize(("make", "text", "reason"), [(*case[:2], case[3]) for case in FALSE])
 @pytest.mark.usefixtures("credulous")
-def test_what_the_search_misses_the_episodes_contradict(make, text, reason):
+def test_what_the_search_misses_the_judge_finds_or_the_episodes_contradict(make, text, reason):
     (row,) = evaluate(make(), filters=text, episodes=40).rows
-    assert row.estimated_bound is None
+    assert row.continuous_bound is None
+    assert row.continuous_note.startswith(reason)
+    withheld = row.continuous_word == "withheld"
+    assert withheld == (row.withheld is not None) == reason.startswith("withheld")
+
+
+@pytest.mark.parametrize(
+    ("make", "text", "reason"),
+    [
+        (*FALSE[2][:2], "h reaches 28.66, above the supremum of 1 that"),
+        (*FALSE[3][:2], "the filter violated the condition by"),
+    ],
+)
+@pytest.mark.usefixtures("credulous", "undecided")
+def test_what_search_and_judge_miss_the_episodes_contradict(make, text, reason):
+    (row,) = evaluate(make(), filters=text, episodes=40).rows
+    assert (row.continuous_bound, row.continuous_word) == (None, "withheld")
     assert row.withheld.startswith(reason)
-    assert row.bound_note == f"withheld: {row.withheld}"
+    assert row.continuous_note == f"withheld: {row.withheld}"
 
 
 def test_margins_of_first_order_that_conflict_leave_no_bound():
@@ -83,7 +111,7 @@ def test_margins_of_first_order_that_conflict_leave_no_bound():
         false_bounds.corridor(), filters="cbf:alpha=10:sampling_margin=first-order", episodes=2
     ).rows
     assert (row.infeasible_rate, row.safe) == (1.0, 0)
-    assert (row.estimated_bound, row.bound_note) == (
+    assert (row.continuous_bound, row.continuous_note) == (
         None,
         "the shortfall of several conditions together is not established",
     )
@@ -110,7 +138,8 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     )
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
     assert row.posterior_bound.probability is None
-    assert row.withheld.startswith("the interval of the measured rate ends at")
+    # The judge looks at the kink, where the condition has no value.
+    assert "has no finite value at x = 0" in row.posterior_bound.note
 
 
 @pytest.mark.slow
@@ -125,7 +154,7 @@ def test_nothing_converges_beside_a_bound_that_is_contradicted():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("credulous")
+@pytest.mark.usefixtures("credulous", "undecided")
 def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
     monkeypatch.setattr(bound_check, "_MULTIPLES", (1,))
     monkeypatch.setattr(bound_check, "_LONG_MULTIPLES", ())
@@ -145,6 +174,7 @@ def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
         assert "estimated" not in {bound.status for bound in horizons}
 
 
+@pytest.mark.usefixtures("undecided")
 def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
     monkeypatch.setattr(
         safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points
@@ -160,18 +190,20 @@ def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
 
 def test_a_rate_with_a_smaller_period_withholds_too():
     (row,) = evaluate("Scalar-v0", filters="scbf", episodes=2, bounds=False).rows
-    row = replace(row, estimated_bound=0.5, bound_note="")
+    row = replace(row, continuous_bound=0.5, continuous_word="estimated", continuous_note="")
     finer = [
-        SimpleNamespace(row=lambda name, high=high: SimpleNamespace(ci_high=high))
-        for high in (0.6, 0.4)
+        SimpleNamespace(row=lambda _, high=high: replace(row, ci_high=high)) for high in (0.6, 0.4)
     ]
     assert refinement._judged(row, finer[:1]) == row
     assert refinement._judged(row, finer).withheld.startswith(
         "the interval of the measured rate ends at 40.0 %, below 50.0 %"
     )
+    # What is of the env's own steps is of its own period.
+    held = replace(row, continuous_bound=None, held_bound=0.5, held_word="proved")
+    assert refinement._judged(held, finer) == held
 
 
-def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
+def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch, request):
     """h = 1 + x and b_1 = v + .1 h: a start with a large v brakes, so that no later state has as
     large a b_1."""
     x, v, u = sp.symbols("x v u", real=True)
@@ -187,11 +219,13 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
         nominal=-5,
     )
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
-    assert (row.estimated_bound, row.withheld) == (
+    assert (row.continuous_bound, row.withheld) == (
         pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3),
         None,
     )
+    assert row.continuous_word == "proved"
     monkeypatch.setattr(safe_set_analysis.SafeSetAnalysis, "suprema", np.array([2.0, 0.8]))
+    request.getfixturevalue("undecided")
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
     assert row.withheld == "b_1 reaches 1, above the supremum of 0.8 that the search found"
 
@@ -203,14 +237,53 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
 def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, reason):
     assert reason in by_rate(bound, high)
     assert bool(by_rate(bound, high)) == bool(reason)
-    row = BoundSummary(estimated_bound=bound, bound_note="")
-    assert (judged(row, high) == row) == (not reason)
+    for row in (
+        BoundSummary(continuous_bound=bound, continuous_word="estimated"),
+        BoundSummary(held_bound=bound, held_word="proved"),
+    ):
+        assert (judged(row, high) == row) == (not reason)
+
+
+def test_one_claim_is_withheld_without_the_other():
+    row = BoundSummary(
+        held_bound=0.9, held_word="proved", continuous_bound=0.4, continuous_word="estimated"
+    )
+    found = judged(row, 0.85)
+    assert (found.held_bound, found.held_word, found.held_error) == (None, "withheld", 0.0)
+    assert found.held_note == f"withheld: {found.withheld}"
+    assert "report an error" in found.withheld
+    assert (found.continuous_bound, found.continuous_word) == (0.4, "estimated")
+    both = judged(replace(row, continuous_bound=0.95), 0.85)
+    assert (both.held_word, both.continuous_word) == ("withheld", "withheld")
+    other = judged(replace(row, continuous_bound=0.95), 0.92)
+    assert (other.held_bound, other.continuous_word) == (0.9, "withheld")
+    assert "try a smaller dt" in other.withheld
+
+
+@pytest.mark.parametrize("word", ["proved", "certified", "computed"])
+def test_what_is_proved_is_held_against_a_wider_interval(word):
+    sure = word != "computed"
+    row = BoundSummary(held_bound=0.9, held_word=word)
+    assert (judged(row, 0.89, 0.91) == row) == sure
+    assert judged(row, 0.89, 0.895).held_word == "withheld"
+    given = {"continuous_bound": 0.9, "continuous_word": "proved" if sure else "estimated"}
+    assert (judged(BoundSummary(**given), 0.89, 0.91).continuous_bound == 0.9) == sure
+
+
+def test_a_held_bound_above_what_is_attainable_is_a_contradiction():
+    row = BoundSummary(held_bound=0.9, held_word="computed", held_error=0.01)
+    assert above_attainable(row, None) == ""
+    assert above_attainable(row, 0.88) == ""
+    assert "90.0000 %, is above what any policy can attain, 86.0000 %" in above_attainable(
+        row, 0.86
+    )
+    assert above_attainable(BoundSummary(), 0.1) == ""
 
 
 def test_a_posterior_keeps_its_numbers_where_its_bound_is_withheld():
-    bound = PosteriorSummary(0.9, "", delta=0.1)
-    row = BoundSummary(bound_note="learned", posterior_bound=bound)
+    bound = PosteriorSummary(0.9, "", "estimated", delta=0.1)
+    row = BoundSummary(continuous_note="learned", posterior_bound=bound)
     found = judged(row, 0.2)
     note = f"withheld: {found.withheld}"
-    assert found.posterior_bound == PosteriorSummary(None, note, delta=0.1)
-    assert found.bound_note == "learned"
+    assert found.posterior_bound == PosteriorSummary(None, note, "withheld", delta=0.1)
+    assert found.continuous_note == "learned"

@@ -26,8 +26,8 @@ def test_the_filter_of_the_spec_makes_the_difference():
     bare, filtered = evaluate("Pendulum-v1", **FEW).rows
     assert (bare.safe, filtered.safe) == (0, 4)
     assert filtered.filter == SPEC.filter
-    assert filtered.estimated_bound is None
-    assert "may differ from the model" in filtered.bound_note
+    assert filtered.continuous_bound is None
+    assert "may differ from the model" in filtered.continuous_note
 
 
 def test_the_rate_is_that_of_episodes_played_by_hand():

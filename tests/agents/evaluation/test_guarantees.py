@@ -57,7 +57,7 @@ def test_where_there_is_no_chain_no_start_is_outside_of_it():
 
 
 def test_of_several_identifications_the_mean_counts():
-    rates = [BoundSummary(bound_note="", outside_rate=rate) for rate in (0.25, 0.5)]
+    rates = [BoundSummary(continuous_note="", outside_rate=rate) for rate in (0.25, 0.5)]
     assert together(rates).outside_rate == 0.375
     assert together([rates[0], BoundSummary()]).outside_rate is None
     robust = [replace(each, posterior_bound=PosteriorSummary(0.5, "")) for each in rates]

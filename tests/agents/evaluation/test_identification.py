@@ -191,7 +191,7 @@ def test_bounds_over_posteriors_stand_beside_the_rates():
     found = evaluate(DISK, filters=["bayesian-scbf", name], episodes=30, repeats=2)
     plain, row = found.rows
     assert plain.posterior_bound is None
-    assert "its bound over the posterior" in row.bound_note
+    assert "its bound over the posterior" in row.continuous_note
     assert row.posterior_bound.delta == pytest.approx(0.1)
     # (1 - delta)(h_0 - m T)/c, of h = 1 - x_1^2 - x_2^2 with c = 1, for the mean m of both
     # identifications.

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.contradiction import COMPUTED, judged
+from safe_envs.agents.evaluation.bound_averages import STEPS_ONLY
+from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.evaluate import evaluate, run_evaluation
+from safe_envs.agents.evaluation.promise_bound import COMPUTED
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.spec import EvaluationSpec
@@ -43,24 +45,30 @@ def found():
 def test_a_promise_filter_is_a_row_with_its_own_bound(found):
     none, row, scbf = found.rows
     assert row.filter == NAME
-    assert row.estimated_bound == pytest.approx(0.9, abs=1e-6)
-    assert row.bound_note == COMPUTED
-    assert row.ci_high >= row.estimated_bound
+    assert row.held_bound == pytest.approx(0.9, abs=1e-6)
+    assert (row.held_word, row.held_note) == ("computed", COMPUTED)
+    assert (row.continuous_bound, row.continuous_word) == (None, "none")
+    assert row.continuous_note == STEPS_ONLY
+    # Equal values at all starts.
+    assert row.held_error == 0.0
+    assert row.ci_high >= row.held_bound
     assert row.outside_rate is None
     # Nominal control stays below the limit for so short a time: nothing is to be done.
     assert 0.0 <= row.intervention_rate < scbf.intervention_rate
     assert row.learning is None
     assert found.timing.rows[1].engine == "numpy"
     assert found.config["filters"][1] == {"name": NAME, "spec": NAME}
-    assert none.bound_note != COMPUTED
+    assert (none.held_bound, none.held_note) == (None, "there is no filter")
+    assert (scbf.held_bound, scbf.held_word) == (None, "none")
+    assert "neither a table nor a certificate" in scbf.held_note
 
 
 def test_the_bound_is_the_mean_of_p_0_over_the_starts(found):
     # Of each start no more than p, and 0 outside C: here .9 from half of them.
     options = {**SHORT, "start": [1.5]}
     (row,) = evaluate(SCALAR, "nominal", [NAME], options=options, episodes=10).rows
-    assert row.estimated_bound is None
-    assert row.bound_note == "no start is in the table's safe set"
+    assert row.held_bound is None
+    assert row.held_note == "no start is in the table's safe set"
     assert row.safety_rate == 0.0
 
 
@@ -147,8 +155,8 @@ def test_between_control_instants_there_is_no_bound():
         SCALAR, filters=[NAME], options=SHORT, episodes=5, monitoring="continuous"
     )
     (row,) = run_evaluation(spec).rows
-    assert row.estimated_bound is None
-    assert "not of the time between" in row.bound_note
+    assert row.held_bound is None
+    assert "not of the time between" in row.held_note
 
 
 def test_the_guarantee_is_of_the_plant_where_the_table_covers_it():
@@ -181,17 +189,17 @@ def test_a_bound_is_withheld_where_the_table_lets_p_k_fall(tmp_path):
         text = f"promise:p=0.95:table={tmp_path / name}"
         options = {"horizon": 0.3, "noise": 4.0}
         (row,) = evaluate(SCALAR, "nominal", [text], options=options, episodes=300).rows
-        notes.append((row.estimated_bound is None, row.withheld))
+        notes.append((row.held_bound is None, row.withheld))
     assert notes[0] == (False, None)
     assert notes[1][0]
     assert "the table is wrong" in notes[1][1]
 
 
 def test_a_bound_that_the_rate_contradicts_is_withheld():
-    row = BoundSummary(estimated_bound=0.9, bound_note=COMPUTED)
+    row = BoundSummary(held_bound=0.9, held_word="computed", held_note=COMPUTED)
     assert judged(row, 0.9) == row
     found = judged(row, 0.85)
-    assert found.estimated_bound is None
+    assert (found.held_bound, found.held_word) == (None, "withheld")
     assert "ends at 85.0 %, below 90.0 %" in (found.withheld or "")
     assert "continuous time" not in (found.withheld or "")
     assert "another table" in (found.withheld or "")
@@ -200,6 +208,6 @@ def test_a_bound_that_the_rate_contradicts_is_withheld():
 def test_notes_say_that_the_bound_is_computed():
     assert computed_notes(["scbf"]) == []
     (one,) = computed_notes(["scbf", NAME])
-    assert one.startswith(f"the bound of {NAME} is computed, not estimated")
+    assert one.startswith(f"held input, comp.: the bound of {NAME} is computed, not proved")
     (several,) = computed_notes([NAME, "promise:p=0.5"])
-    assert several.startswith("bounds of promise filters are computed")
+    assert several.startswith("held input, comp.: bounds of promise filters are computed")

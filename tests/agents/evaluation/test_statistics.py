@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binom, binomtest, multinomial, norm
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.running_sum import RunningSum
+from safe_envs.agents.evaluation.running_sum import RunningMean, RunningSum
 from safe_envs.agents.evaluation.statistics import (
     log_normal_interval,
     mcnemar_p,
@@ -283,3 +283,17 @@ def test_the_interval_of_two_log_normal_estimates_by_hand(estimates):
     assert log_normal_interval(estimates) == pytest.approx(
         (mean * math.exp(-half), mean * math.exp(half)), rel=1e-12
     )
+
+
+def test_a_running_mean_has_a_standard_error():
+    values = np.random.default_rng(3).random(1000)
+    found = [RunningMean() for _ in range(2)]
+    found[0].add(values)
+    for part in np.split(values, [1, 400]):
+        found[1].add(part)
+    assert found[0].mean == found[1].mean == pytest.approx(values.mean())
+    assert found[0].error == found[1].error
+    assert found[0].error == pytest.approx(values.std(ddof=1) / np.sqrt(1000))
+    equal, empty = RunningMean(), RunningMean()
+    equal.add(np.full(1000, 0.1))
+    assert (equal.error, empty.mean, empty.error) == (0.0, None, 0.0)

@@ -53,7 +53,9 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(
                 "ci_low",
                 "min_h_p05",
                 "return_mean",
-                "estimated_bound",
+                "held_bound",
+                "continuous_bound",
+                "continuous_word",
             )
         )
         assert json.loads(row["row"]) == outcome.result["row"]

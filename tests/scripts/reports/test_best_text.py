@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 
 from safe_envs.agents.evaluation.yardstick import TimesUnavoidable
 from safe_envs.scripts.reports.best_text import ends_text, outwards, times_text
+from safe_envs.scripts.reports.bound_notes import attainable_text
+from tests.agents.evaluation.made_up import attainable
 
 
 @pytest.mark.parametrize(
@@ -47,3 +52,12 @@ def test_times_are_rounded_outwards(low, high, text):
 
 def test_there_may_be_no_times():
     assert times_text(None) == "-"
+
+
+def test_only_a_certified_end_stands_after_a_sign():
+    found = attainable(0.9, 0.99981)
+    certified = replace(found, check=SimpleNamespace(lower=1e-6, upper=1e-6))
+    of_lower = replace(found, check=SimpleNamespace(lower=1e-6, upper=None))
+    texts = [attainable_text(best) for best in (None, found, of_lower, certified)]
+    assert texts == [[], ["99.99 %"], ["99.99 %"], ["<= 99.99 %"]]
+    assert attainable_text(replace(found, upper=None)) == []

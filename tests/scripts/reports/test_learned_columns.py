@@ -34,10 +34,7 @@ def row(learning=None, bound=None, name="bayesian-scbf"):
         (
             "CubicSDEDisk-v0",
             [row(LEARNING)],
-            (
-                f"{NO_BOUND}; for bayesian-scbf:simultaneous=P one may be estimated over the"
-                " posterior."
-            ),
+            f"{NO_BOUND}; for bayesian-scbf:simultaneous=P there may be one over the posterior.",
         ),
         ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, POSTERIOR_BOUND)], f"{NO_BOUND}."),
         ("CubicSDEDisk-v0", [row(LEARNING, PosteriorSummary(None, "none"))], f"{NO_BOUND}."),

@@ -10,9 +10,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from safe_envs import ConfigurationError, InvalidInputError
-from safe_envs.agents.evaluation.promise_bound import PromiseAverager
-from safe_envs.agents.evaluation.spec import EvaluationSpec
-from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.agents.evaluation.promise_bound import PromiseBound
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.render import split_filters
@@ -289,25 +287,19 @@ def test_a_table_of_another_specification_is_refused():
 def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
     problem = walk()
     starts = np.array([[0.0], [0.5], [-0.9]])
-    spec = EvaluationSpec("safe_envs/Scalar-v0", knowledge="model")
-    nothing = VisitedStates(*[np.empty((0, 1))] * 5)
     with pytest.MonkeyPatch.context() as patch:
         made = "safe_envs.agents.evaluation.promise_bound.promise_filter_for"
         patch.setattr(made, lambda problem, settings, knowledge: filter_of(REACH, 0.9))
-        averager = PromiseAverager(PromiseSettings(0.9, specification=REACH), problem, spec)
-        averager.add(starts)
-        assert averager.summary(nothing).estimated_bound == pytest.approx(0.6)
+        bound = PromiseBound(PromiseSettings(0.9, specification=REACH), problem, "model")
+        assert (bound.why_none, bound.at(starts).mean()) == ("", pytest.approx(0.6))
         settings = PromiseSettings(0.9, specification="eventually goal")
         assert "unsafe episodes may meet" in why_not_of_safety(problem, settings)
-        averager = PromiseAverager(settings, problem, spec)
-        averager.add(starts)
-        found = averager.summary(nothing)
-    assert found.estimated_bound is None
-    assert (
-        found.bound_note == "it is of meeting 'eventually goal', which unsafe episodes may meet too"
-    )
+        assert (
+            PromiseBound(settings, problem, "model").why_none
+            == "it is of meeting 'eventually goal', which unsafe episodes may meet too"
+        )
     assert why_not_of_safety(problem, PromiseSettings(0.9)) == ""
     first, second = computed_notes(["promise:p=0.9", f"promise:p=0.9:spec={REACH}"])
-    assert first.startswith("bounds of promise filters are computed")
+    assert first.startswith("held input, comp.: bounds of promise filters are computed")
     assert "at least the mean of min(p, L_0)" in second
     assert len(computed_notes(["promise:p=0.9"])) == 1

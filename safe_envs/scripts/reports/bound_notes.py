@@ -1,0 +1,142 @@
+"""The bounds of filters in the table of an evaluation: columns that read as a chain, and notes.
+
+Lower bound for held input <= measured rate <= attainable upper bound is one claim, of the env's own
+steps. The bound for continuous control is another one, and stands by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.bound_text import continuous_text, held_text
+from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
+from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.scripts.reports.best_text import outwards
+from safe_envs.scripts.reports.promise_notes import computed_notes
+from safe_envs.wrappers.conditions.text_parts import names_promise
+
+CHAIN = (
+    "from left to right, for the env's own steps: the bound for held input, the measured rate, and"
+    " what any policy can attain."
+)
+"""What the columns of the chain are."""
+
+PROVED = (
+    "continuous control, >=: proved at these starts for every policy, if the filter acts at every"
+    " instant: the judge proved all hypotheses and numbers of a theorem by interval branch and"
+    " bound, rounded outwards, with exact rational parameters; leaving the workspace is an end."
+)
+"""What a proved bound for continuous control is."""
+
+ESTIMATED = (
+    "continuous control, est.: the value of a theorem in which the judge left a hypothesis or a"
+    " number undecided, for which a search found no counterexample; not a bound that is proved."
+)
+"""What an estimated bound for continuous control is."""
+
+
+def chain_titles(interval: str, best: AttainableSafety | None) -> list[str]:
+    """Return the titles of the columns with the bounds and the rate.
+
+    Args:
+        interval: name of the interval of the rate.
+        best: attainable safety, if it is known.
+    """
+    attainable = ["attain-\nable"] * _is_known(best)
+    return ["bound,\nheld input", f"safe [{interval}]", *attainable, "bound,\ncontinuous"]
+
+
+def chain_cells(row: EvaluationRow, best: AttainableSafety | None) -> list[str]:
+    """Return the cells of these columns.
+
+    Args:
+        row: of an evaluation.
+        best: attainable safety, if it is known.
+    """
+    rate = percent_in(row.safety_rate, row.ci_low, row.ci_high)
+    return [held_text(row), rate, *attainable_text(best), continuous_text(row)]
+
+
+def attainable_text(best: AttainableSafety | None) -> list[str]:
+    """Return the upper end of the attainable safety, rounded up; none where it is not known.
+
+    Args:
+        best: attainable safety, if it is known; only a certified end stands after a sign.
+    """
+    if best is None or best.lower is None or best.upper is None:
+        return []
+    return [f"{'<= ' * is_certified(best)}{outwards(best.lower, best.upper)[1]} %"]
+
+
+def is_certified(best: AttainableSafety) -> bool:
+    """Return whether the upper end of the attainable safety is of a table that was checked."""
+    return best.check is not None and best.check.upper is not None
+
+
+def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
+    """Return what has to be known to read the bounds of an evaluation.
+
+    Args:
+        rows: of the evaluation.
+    """
+    filtered = [row for row in rows if row.filter != UNFILTERED]
+    known = [row for row in filtered if row.learning is None]
+    notes = _why_none("held input", ((r, r.held_note) for r in filtered if r.held_bound is None))
+    without = ((r, r.continuous_note) for r in known if r.continuous_bound is None)
+    # What a table of steps has no bound for, its name says.
+    notes += _why_none("continuous control", (w for w in without if not names_promise(w[0].filter)))
+    notes += [
+        f"continuous control, {row.filter}: {row.continuous_note}"
+        for row in filtered
+        if row.continuous_word == "estimated" and row.continuous_note
+    ]
+    notes += held_notes(rows)
+    notes += _of_drawn_starts(filtered)
+    notes += [PROVED] * _any(rows, "proved") + [ESTIMATED] * _any(rows, "estimated")
+    return notes
+
+
+def held_notes(rows: Sequence[EvaluationRow]) -> list[str]:
+    """Return what the bounds for held input are.
+
+    Args:
+        rows: of an evaluation.
+    """
+    bounded = [row for row in rows if row.held_bound is not None]
+    computed = [row.filter for row in bounded if row.held_word == "computed"]
+    others = dict.fromkeys(
+        f"held input, {row.filter}: {row.held_word}, {row.held_note}"
+        for row in bounded
+        if not names_promise(row.filter)
+    )
+    return [*[CHAIN] * bool(bounded), *others, *computed_notes(computed)]
+
+
+def _why_none(claim: str, rows: Iterable[tuple[EvaluationRow, str | None]]) -> list[str]:
+    """Return why filters have no bound, in a line for each reason."""
+    names: dict[str, list[str]] = {}
+    for row, note in rows:
+        names.setdefault(note or "", []).append(row.filter)
+    return [f"no bound, {claim}, for {', '.join(of)}: {note}" for note, of in names.items()]
+
+
+def _of_drawn_starts(rows: Sequence[EvaluationRow]) -> list[str]:
+    """Return how far the bounds at the starts of these episodes may be from those of all starts."""
+    error = max((max(row.held_error, row.continuous_error) for row in rows), default=0.0)
+    if not error:
+        return []
+    return [
+        "bounds are means over the starts of these episodes, as the rates are; these starts are"
+        f" drawn, and over all starts the standard error of such a mean is {100 * error:.2g} points"
+        " at most."
+    ]
+
+
+def _any(rows: Sequence[BoundSummary], word: str) -> bool:
+    return any(row.continuous_word == word for row in rows)
+
+
+def _is_known(best: AttainableSafety | None) -> bool:
+    return bool(attainable_text(best))
