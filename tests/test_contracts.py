@@ -46,6 +46,7 @@ NAMES = {
 DEFINITIONS = {
     "chosen": "assumptions",
     "corrections": "errata",
+    "doubts": "failures",
     "elsewhere": "alternative_settings",
     "kept": "invariant_set",
     "leading": "control_authority",

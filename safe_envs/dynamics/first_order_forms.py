@@ -1,9 +1,9 @@
 """First-order forms: enclosures of functions on many boxes that follow their slopes.
 
 On a box the states are x_i = mid_i + rad_i t_i with t_i in [-1, 1]. A form encloses a function as
-center + sum_i slopes_i t_i + e with |e| <= radius, and has its range as an interval too. The error of a
-smooth function falls with the square of the width of a box, that of interval arithmetic alone with
-the width. These are Taylor models of first order (Makino and Berz 2003), or affine arithmetic
+center + sum_i slopes_i t_i + e with |e| <= radius, and has its range as an interval too. The error
+of a smooth function falls with the square of the width of a box, that of interval arithmetic alone
+with the width. These are Taylor models of first order (Makino and Berz 2003), or affine arithmetic
 with the states as its only symbols (de Figueiredo and Stolfi 2004).
 
 Every operation notes where it is not known to be twice continuously differentiable on the whole
