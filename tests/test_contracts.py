@@ -46,7 +46,7 @@ NAMES = {
 DEFINITIONS = {
     "chosen": "assumptions",
     "corrections": "errata",
-    "doubts": "unverified_assumptions",
+    "doubts": "failures",
     "elsewhere": "alternative_settings",
     "kept": "invariant_set",
     "leading": "control_authority",

@@ -43,7 +43,7 @@ _INVERSES = {
 
 
 class Arithmetic(Protocol):
-    """Operations on enclosures of numbers."""
+    """Operations on enclosures of numbers: a, b, x and y, a whole number n, a constant exponent."""
 
     def constant(self, number: Any) -> Any:
         """Return the enclosure of a real number."""
@@ -54,11 +54,11 @@ class Arithmetic(Protocol):
         ...
 
     def add(self, a: Any, b: Any) -> Any:
-        """Return a + b."""
+        """Return a + b; see `Arithmetic`."""
         ...
 
     def multiply(self, a: Any, b: Any) -> Any:
-        """Return a b."""
+        """Return a b; see `Arithmetic`."""
         ...
 
     def reciprocal(self, a: Any) -> Any:
@@ -70,11 +70,11 @@ class Arithmetic(Protocol):
         ...
 
     def integer_power(self, a: Any, n: int) -> Any:
-        """Return a^n."""
+        """Return a^n; see `Arithmetic`."""
         ...
 
     def real_power(self, a: Any, exponent: Any) -> Any:
-        """Return a^e for a constant e."""
+        """Return a^exponent; see `Arithmetic`."""
         ...
 
     def function(self, kind: Any) -> Operation:
@@ -90,7 +90,7 @@ class Arithmetic(Protocol):
         ...
 
     def atan2(self, y: Any, x: Any) -> Any:
-        """Return the angle of (x, y)."""
+        """Return the angle of (x, y); see `Arithmetic`."""
         ...
 
 

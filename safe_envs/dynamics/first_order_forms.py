@@ -1,8 +1,8 @@
 """First-order forms: enclosures of functions on many boxes that follow their slopes.
 
 On a box the states are x_i = mid_i + rad_i t_i with t_i in [-1, 1]. A form encloses a function as
-center + sum_i slopes_i t_i + e with |e| <= radius, beside its range as an interval. The error of a
-smooth function falls with the square of the width of the box, that of interval arithmetic alone
+center + sum_i slopes_i t_i + e with |e| <= radius, and has its range as an interval too. The error
+of a smooth function falls with the square of the width of a box, that of interval arithmetic alone
 with the width. These are Taylor models of first order (Makino and Berz 2003), or affine arithmetic
 with the states as its only symbols (de Figueiredo and Stolfi 2004).
 
@@ -73,7 +73,12 @@ def variables(low: np.ndarray, high: np.ndarray) -> list[Form]:
 
 
 def middle(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return midpoints and half widths, not finite where an interval is not."""
+    """Return midpoints and half widths, not finite where an interval is not.
+
+    Args:
+        low: lower ends.
+        high: upper ends.
+    """
     with np.errstate(invalid="ignore"):
         return 0.5 * low + 0.5 * high, 0.5 * high - 0.5 * low
 
@@ -97,7 +102,15 @@ def with_range(
     known: Interval,
     smooth: np.ndarray,
 ) -> Form:
-    """Return a form, with the range that follows from it cut to the one that is known."""
+    """Return a form, with the range that follows from it cut to the one that is known.
+
+    Args:
+        center: see `Form`.
+        slopes: see `Form`.
+        radius: see `Form`; may be NaN where nothing is known.
+        known: range.
+        smooth: see `Form`.
+    """
     radius = np.where(np.isfinite(center + radius), radius * MORE + TINY, np.inf)
     lost = ~(np.isfinite(radius) & np.isfinite(slopes).all(axis=0))
     if lost.any():
@@ -115,8 +128,14 @@ def opposite(a: Form) -> Form:
     return Form(-a.center, -a.slopes, a.radius, negative(a.range), a.smooth)
 
 
-def chosen(where: np.ndarray, a: Form, b: Form) -> Form:
-    """Return a on some boxes and b on the others."""
+def merged(where: np.ndarray, a: Form, b: Form) -> Form:
+    """Return a on some boxes and b on the others.
+
+    Args:
+        where: flags of the boxes, shape (B,).
+        a: taken where they are true.
+        b: taken where they are not.
+    """
     return Form(
         np.where(where, a.center, b.center),
         np.where(where, a.slopes, b.slopes),

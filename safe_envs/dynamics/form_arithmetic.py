@@ -25,7 +25,10 @@ _INTERVALS = IntervalOperations()
 
 
 class FormArithmetic:
-    """Operations on forms; constants have one entry, which broadcasts over the boxes."""
+    """Operations on forms a, b, x and y; constants have one entry, which broadcasts over the boxes.
+
+    Powers have a whole number n or a constant exponent.
+    """
 
     def __init__(self, n: int) -> None:
         """Prepare for boxes of n states."""
@@ -37,7 +40,12 @@ class FormArithmetic:
         return self.of_interval(Interval(low, low if low == high else high))
 
     def of_interval(self, a: Interval, smooth: np.ndarray | None = None) -> Form:
-        """Return a form that knows nothing but a range."""
+        """Return a form that knows nothing but a range.
+
+        Args:
+            a: the range.
+            smooth: see `Form`; by default true.
+        """
         mid, rad = middle(*a)
         radius = rad + EPS * (np.abs(mid) + rad)
         radius = np.where(np.equal(a.low, a.high), 0.0, radius)
@@ -52,14 +60,14 @@ class FormArithmetic:
         return int(np.size(a.center))
 
     def add(self, a: Form, b: Form) -> Form:
-        """Return a + b."""
+        """Return a + b; see `FormArithmetic`."""
         center, slopes = a.center + b.center, a.slopes + b.slopes
         error = EPS * (np.abs(center) + np.abs(slopes).sum(axis=0))
         known = _INTERVALS.add(a.range, b.range)
         return with_range(center, slopes, a.radius + b.radius + error, known, a.smooth & b.smooth)
 
     def multiply(self, a: Form, b: Form) -> Form:
-        """Return a b."""
+        """Return a b; see `FormArithmetic`."""
         known = _INTERVALS.multiply(a.range, b.range)
         center = a.center * b.center
         slopes = a.center * b.slopes + b.center * a.slopes
@@ -104,7 +112,7 @@ class FormArithmetic:
         )
 
     def integer_power(self, a: Form, n: int) -> Form:
-        """Return a^n."""
+        """Return a^n; see `FormArithmetic`."""
         if n < 0:
             return self.reciprocal(self.integer_power(a, -n))
         if n == 1:
@@ -120,7 +128,7 @@ class FormArithmetic:
         )
 
     def real_power(self, a: Form, exponent: Form) -> Form:
-        """Return a^e for a constant e; not smooth where a reaches 0."""
+        """Return a^exponent, not smooth where a reaches 0; see `FormArithmetic`."""
         e = Interval(float(exponent.range.low[0]), float(exponent.range.high[0]))
         less = [_INTERVALS.add(e, Interval(-k, -k)) for k in (0.0, 1.0, 2.0)]
         factor = _INTERVALS.multiply(e, less[1])

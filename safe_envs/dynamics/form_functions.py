@@ -9,7 +9,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.expression_program import Operation
-from safe_envs.dynamics.first_order_forms import EPS, Form, chosen, is_finite, opposite, with_range
+from safe_envs.dynamics.first_order_forms import EPS, Form, is_finite, merged, opposite, with_range
 from safe_envs.dynamics.form_arithmetic import FormArithmetic
 from safe_envs.dynamics.interval_arithmetic import Interval, negative
 from safe_envs.dynamics.intervals import IntervalOperations
@@ -79,7 +79,7 @@ class FormOperations(FormArithmetic):
         def larger_one(a: Form, b: Form) -> Form:
             known_a, known_b = np.isfinite(a.radius), np.isfinite(b.radius)
             first = np.where(known_a == known_b, a.center >= b.center, known_a)
-            top, other = chosen(first, a, b), chosen(first, b, a)
+            top, other = merged(first, a, b), merged(first, b, a)
             gap = self.add(other, opposite(top)).range.high
             excess = np.maximum(gap, 0.0)
             half = 0.5 * excess
@@ -99,7 +99,7 @@ class FormOperations(FormArithmetic):
         return larger_one
 
     def atan2(self, y: Form, x: Form) -> Form:
-        """Return the angle of (x, y), by one of the quotients that is regular on the box."""
+        """Return the angle of (x, y), by a quotient that is regular; see `FormArithmetic`."""
         known = _INTERVALS.atan2(y.range, x.range)
         arctan = self.function(sp.atan)
         by_x = arctan(self.multiply(y, self.reciprocal(x)))
@@ -109,7 +109,7 @@ class FormOperations(FormArithmetic):
         upper, lower = self.add(by_y, quarter), self.add(by_y, opposite(quarter))
         found = self.of_interval(known, np.zeros(np.size(known.low), dtype=bool))
         for where, form in ((below, lower), (above, upper), (right, by_x)):
-            found = chosen(where, form, found)
+            found = merged(where, form, found)
         return found._replace(
             range=Interval(
                 np.maximum(known.low, found.range.low), np.minimum(known.high, found.range.high)

@@ -46,7 +46,14 @@ class IntervalOperations(IntervalArithmetic):
     """Interval arithmetic with the functions of expressions, by their SymPy classes."""
 
     def constant(self, number: Any) -> Interval:
-        """Return the floats around a real number, or a point if it is one."""
+        """Return the floats around a real number, or a point if it is one.
+
+        Args:
+            number: of SymPy.
+
+        Raises:
+            SystemDefinitionError: It is not real.
+        """
         exact = number.is_Rational or number.is_Float
         try:
             value = float(number if exact else sp.N(number, 40))

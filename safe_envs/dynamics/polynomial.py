@@ -16,14 +16,14 @@ from safe_envs.errors import SystemDefinitionError
 
 @dataclass(frozen=True)
 class Polynomial:
-    """A polynomial in z_i = (x_i - center_i)/scale_i, which lie in [-1, 1] on the box of interest.
+    """A polynomial in z_i = (x_i - center_i)/scale_i, which lie in [-1, 1] on a box of interest.
 
     Scaled variables keep the coefficients of high degrees near 1, so that few decimals state them.
 
     Attributes:
         states: symbols x_1, ..., x_n.
-        center: of the box.
-        scale: half of the width of the box, each > 0.
+        center: of that box.
+        scale: half of its widths, each > 0.
         coefficients: of the monomials, by the exponents of z_1, ..., z_n.
 
     Raises:

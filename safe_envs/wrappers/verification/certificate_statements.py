@@ -175,8 +175,11 @@ class CertificateStatements:
 
 
 def _slope_across(plant: Plant, psi: Polynomial, barrier: Any) -> Witness:
-    """Return the slope of psi per slope of h across its edge, at states."""
-    slopes = tabulated(plant.states, [sp.diff(barrier, s) for s in plant.states])
+    """Return the slope of psi per slope of h across its edge, at states; 0 where it jumps."""
+    derivatives = [sp.diff(barrier, s) for s in plant.states]
+    if any(d.has(sp.Derivative, sp.DiracDelta, sp.Subs) for d in derivatives):
+        return lambda x: np.zeros((len(x), 1))
+    slopes = tabulated(plant.states, derivatives)
     gradient = [psi.derivative(i) for i in range(psi.n)]
 
     def multiples(x: np.ndarray) -> np.ndarray:

@@ -169,10 +169,7 @@ class Formulas:
         return self.independent or (self.problem.plant.m == 1 and not sampled)
 
     def _changes(self, x: np.ndarray) -> np.ndarray:
-        """Return the change of each a over states that rounding cannot tell apart, (B, k, m).
-
-        It is of first order, with slopes from central differences.
-        """
+        """Return the change of each a, to first order, over states that rounding cannot tell."""
         found, width = 0.0, self.region.high - self.region.low
         for step in np.diag(_STEP * width):
             ahead, behind = (self._entries(x + sign * step)[:, :, :-1] for sign in (1.0, -1.0))
@@ -291,9 +288,8 @@ class Formulas:
 
     def slack(self, x: np.ndarray) -> np.ndarray:
         """Return by how much the filter violates each condition, shape (B, k)."""
-        return self.safety_filter.filter(
-            x, np.broadcast_to(self._rest, (len(x), len(self._rest)))
-        ).slack
+        rest = np.broadcast_to(self._rest, (len(x), len(self._rest)))
+        return self.safety_filter.filter(x, rest).slack
 
 
 def _typical(values: np.ndarray) -> np.ndarray:

@@ -102,6 +102,9 @@ def supremum(
         tolerance: largest difference between the bounds that is wanted.
         budget: what it may cost; the upper bound is one also where it does not suffice.
         hints: states where it may be large, shape (B, n).
+
+    Returns:
+        The bounds.
     """
     budget = budget or Budget()
     try:

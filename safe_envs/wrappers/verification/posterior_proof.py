@@ -48,6 +48,9 @@ def proved_numbers_of(
         robust: filter with the robust condition.
         barrier: h, with numbers for all parameters.
         found: c and m of a search.
+
+    Returns:
+        The numbers, or what is not proved.
     """
     row, inputs = robust.constraints[0], robust.model.inputs
     if row.uncertainty is None or row.terms is not None or row.change is not None:
