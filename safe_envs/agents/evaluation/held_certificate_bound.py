@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -49,7 +48,7 @@ class HeldCertificateBound:
         self._certificate, self._conditions, self._problem = certificate, conditions, problem
         self._bound = stated_bound(certificate)
 
-    @cached_property
+    @property
     def why_none(self) -> str:
         """Why there is none at any start; "" where there may be one."""
         if any(condition != self._conditions[0] for condition in self._conditions):

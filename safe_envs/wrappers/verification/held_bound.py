@@ -63,6 +63,7 @@ from safe_envs.wrappers.verification.statement import Statement
 
 _POWERS = (1.5, 2.0, 4.0, 8.0, 16.0, 32.0)
 _LARGE = 700.0
+_SMALLEST = 1e-15
 _SIGNS = "c > 0, dt > 0, and m1, m2 and e >= 0"
 _LEAVES = "E max(psi(X'), 0) outside the box of psi <= e"
 _ROUNDING = 1e-9
@@ -179,7 +180,7 @@ def prove_held_bound(
     if work.reason:
         return work.without_bound()
     if excess > 0.0:
-        psi = _lowered(psi, rounded_up(excess))
+        psi = _lowered(psi, _up(excess))
         parts = HeldStatements(plant, psi, period)
     region = parts.region("the region of psi", sp.Integer(0))
     top = work.bound(region, parts.value, 5.0 * tolerance)
@@ -190,12 +191,17 @@ def prove_held_bound(
     return replace(
         work.found,
         psi=psi,
-        supremum=rounded_up(top),
-        shortfall=rounded_up(lacks[0]),
-        sag=rounded_up(lacks[1]) if len(lacks) > 1 else Fraction(0),
-        tail=rounded_up(tail),
+        supremum=_up(top),
+        shortfall=_up(lacks[0]),
+        sag=_up(lacks[1]) if len(lacks) > 1 else Fraction(0),
+        tail=_up(tail),
         boxes=work.boxes,
     )
+
+
+def _up(value: float) -> Fraction:
+    """Return a decimal that is not below a number, and not too small for a file."""
+    return rounded_up(max(value, _SMALLEST)) if value > 0.0 else Fraction(0)
 
 
 class _Numbers:
