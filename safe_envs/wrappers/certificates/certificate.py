@@ -133,14 +133,14 @@ class HeldCertificate(Certificate):
         options: see `Certificate`.
         plant: the system; without a policy the bound is of every policy whose input meets the
             constraint `HeldStep.constraint(shortfall)`.
-        psi: the barrier, on the box where its scaled variables lie in [-1, 1].
+        psi: the barrier, on B, where its scaled variables lie in [-1, 1].
         period: control period in s.
         steps: K, control periods of an episode.
         supremum: c > 0.
         shortfall: m >= 0, what the policy, or the constraint, lets psi fall in a period.
         sag: s >= 0, how far an input between its bounds may be below the constraint; 0 for a
             policy.
-        tail: e >= 0, for steps that leave the box.
+        tail: e >= 0, for steps that leave B.
     """
 
     period: Fraction

@@ -53,12 +53,16 @@ def kept_certificate(problem: SafetyProblem, control: Control = "continuous") ->
         if differing
         else f"there is none of {problem.name} (there are: {_names()})"
     )
-    held = " of held input" if control == "held" else ""
-    option = " --held" if control == "held" else ""
+    if control == "held":
+        raise ConfigurationError(
+            "filter 'certified' needs a certificate of held input, and this package has none of"
+            f" this problem: {reason}. Prove one with `prove_held_bound`, as the guide of"
+            " `safe-envs certify` shows, and give certified:file=psi.json"
+        )
     raise ConfigurationError(
-        f"filter 'certified' needs a certificate{held}, and this package has none of this problem:"
-        f" {reason}. Run `safe-envs certify ENV_ID{option} --out psi.json` with the options of this"
-        " env, and give certified:file=psi.json"
+        f"filter 'certified' needs a certificate, and this package has none of this problem:"
+        f" {reason}. Run `safe-envs certify ENV_ID --out psi.json` with the options of this env,"
+        " and give certified:file=psi.json"
     )
 
 

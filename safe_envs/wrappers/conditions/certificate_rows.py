@@ -55,7 +55,7 @@ class Places:
             *inside,
         )
         if isinstance(certificate, HeldCertificate):
-            # It states nothing outside the box of psi.
+            # It states nothing where a scaled state is not in [-1, 1].
             self.domain += tuple(1 - sp.Abs(z) for z in self._nearest_z.values())
 
     def at(self, expression: sp.Expr) -> sp.Expr:

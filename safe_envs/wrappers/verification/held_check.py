@@ -77,6 +77,9 @@ def check_held(certificate: HeldCertificate, seconds: float) -> CheckResult:
     Args:
         certificate: to check, which may be a stranger's.
         seconds: limit of time of each statement.
+
+    Returns:
+        A word for each statement; the bound is proved where all are checked.
     """
     verdicts = stated_bound(certificate).judged(Budget(seconds=seconds))
     return combined([_check_of(name, verdict) for name, verdict in verdicts])
