@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,7 +15,16 @@ from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.certificates import checker
 from safe_envs.wrappers.certificates.checker import Bands, check
-from tests.wrappers.certificates.examples import FALSE, TRUE, UNDECIDED, R, brownian, with_plant, x
+from tests.wrappers.certificates.examples import (
+    FALSE,
+    TRUE,
+    UNDECIDED,
+    R,
+    brownian,
+    in_line,
+    with_plant,
+    x,
+)
 
 
 def test_it_is_one_file_that_a_person_can_read():
@@ -68,6 +78,32 @@ def test_what_it_cannot_know_is_undecided_with_the_reason(name):
 def test_limits_end_a_check_as_undecided():
     assert check(TRUE["the disk"], boxes=10).word == "undecided"
     assert check(TRUE["the disk"], seconds=0.0).word == "undecided"
+
+
+def test_it_finds_the_same_in_small_parts(monkeypatch):
+    monkeypatch.setattr(checker, "BATCH", 20)
+    for examples, word in ((TRUE, "checked"), (FALSE, "refuted")):
+        for name in ("rate", "the disk") if word == "checked" else ("m smaller", "a pole"):
+            assert check(examples[name], boxes=20_000).word == word
+
+
+def test_a_psi_that_is_a_barrier_needs_no_room_on_its_edge():
+    found = in_line(["0", "1", "-1"], h=x - x**2, shortfall="1.0001", supremum="0.2501")
+    assert check(found).word == "checked"
+    assert [part.name for part in check(found).parts][1:] == ["psi <= c", "A psi >= -a psi - m"]
+    for h in (x * (1 - x), x - x**2 / 2 - x**3 / 2):
+        assert check(with_plant(found, barriers=(h,))).statement == "psi <= 0 where h_1 = 0"
+
+
+def test_an_input_has_to_help_where_no_other_term_does():
+    # A psi = -2 (x - 1) u - 1 for psi = 2 x - x^2 - 1/100: only 0 at x = 1.
+    steered = in_line(["-0.01", "2", "-1"], h=x, shortfall="1.000001", supremum="1.1")
+    steered = with_plant(steered, input_matrix=((R(1),),))
+    assert check(steered).word == "checked"
+    assert check(replace(steered, shortfall=Fraction("0.999999"))).word == "refuted"
+    # Without an input at the other end of its bounds it is false.
+    one_sided = with_plant(steered, bounds=((R(1, 2), R(1)),))
+    assert check(one_sided).word == "refuted"
 
 
 def test_functions_that_it_does_not_know_are_an_error():
