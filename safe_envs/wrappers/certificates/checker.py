@@ -59,8 +59,8 @@ class Band:
         half, steep = np.abs(high / 2 - low / 2), slope(self.c)
         rho = np.abs(steep) * self.rho + bend(least, self.high) * self.size**2 / 2
         flat = half < rho
-        c = np.where(flat, low / 2 + high / 2, y(self.c)) + 0 * self.size  # none if it is the line
-        rho = np.where(flat, half, rho) + EPS * (1 + self.size)
+        c = np.where(flat, low / 2 + high / 2, y(self.c))
+        rho = np.where(flat, half, rho) + EPS * (1 + self.size)  # sin(1/x) has no value at 0
         return Band(c, np.where(flat, 0.0, steep * self.b), rho)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import math
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -24,6 +25,7 @@ from tests.wrappers.certificates.examples import (
     in_line,
     with_plant,
     x,
+    y,
 )
 
 
@@ -136,9 +138,19 @@ def test_enclosures_hold_the_values(e):
             assert abs(value - linear) <= found.rho[k] + slack
 
 
+def test_the_roundings_of_a_polynomial_are_held():
+    binomials = {(k,): Fraction(math.comb(20, k) * (-1) ** k) for k in range(21)}
+    psi = Polynomial((x,), (Fraction(0),), (Fraction(1),), binomials)  # (1 - x)^20
+    middles = np.linspace(0.9, 1.1, 101)[None]
+    found = Bands((x,), {x * y: psi}, middles, 0 * middles)[x * y]
+    exact = [(1 - Fraction(v)) ** 20 for v in middles[0]]
+    lows, highs = ([Fraction(v) for v in ends] for ends in (found.low, found.high))
+    assert all(low <= v <= high for low, v, high in zip(lows, exact, highs, strict=True))
+    assert found.rho.max() < 1e-6
+
+
 def test_the_forms_of_a_polynomial_hold_its_derivatives():
     rng = np.random.default_rng(1)
-    y = sp.Symbol("y", real=True)
     coefficients = {
         (i, j): Fraction(int(rng.integers(-999, 999)), 37) for i in range(9) for j in range(7)
     }
