@@ -25,7 +25,7 @@ _MOST_SATURATED, _LONGEST = 12, sp.Integer(10) ** 50
 def is_zero(expression: Any) -> bool:
     """Return whether an expression is zero for all real values, except at points of jumps.
 
-    An analytic function that is not zero everywhere is zero at random points with probability 0. Its
+    An analytic function that is not 0 everywhere is zero at random points with probability 0. Its
     value says so unless a part is lost in rounding to the others, as at a point where 1 + tanh(10^6
     (x - 5)) is less than 10^-10^6: such a point tells nothing. An expression with kinks and jumps
     is one in each region of the signs of what switches there: of a for |a|, of a - b for max(a, b),

@@ -46,7 +46,7 @@ def _made(
 
 
 def _linear(n: int, seed: int) -> Any:
-    """A plant with one unstable axis, turned, which the box holds almost everywhere in C."""
+    """A plant with one unstable axis, turned, which its input holds almost everywhere in C."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.standard_normal((n, n)))[0]
     rates = axes.T @ np.diag([2.0] + [-1.0] * (n - 1)) @ axes

@@ -23,7 +23,7 @@ _CANDIDATES, _CORNERS = 512, 4
 
 
 class Rate(NamedTuple):
-    """Episodes under one policy from one start, beside the bound.
+    """Episodes under one policy from one start, with the bound.
 
     Attributes:
         policy: who acts.
