@@ -243,7 +243,13 @@ def rates(
         for label, policy in policies(problem):
             if label.startswith(only):
                 (row,) = evaluate(
-                    begun, policy, [text], episodes=episodes, bounds=False, keep_episodes=False
+                    begun,
+                    policy,
+                    [text],
+                    episodes=episodes,
+                    bounds=False,
+                    best=False,
+                    keep_episodes=False,
                 ).rows
                 found.append(Rate(label, start, bound, row.safe, episodes))
     return found
