@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import sympy as sp
@@ -17,20 +17,25 @@ _ANALYTIC = (
 _SWITCHING = (sp.Abs, sp.sign, sp.Heaviside, sp.Max, sp.Min)
 _MOST_SWITCHES = 6
 _SCALES = (1, 1, 3)
+_SMALLER = (sp.Rational(1, 100), sp.Rational(1, 10**4), sp.Rational(1, 10**7))
+_SATURATED = (sp.tanh, sp.coth, sp.erf)
+_MOST_SATURATED, _LONGEST = 12, sp.Integer(10) ** 50
 
 
 def is_zero(expression: Any) -> bool:
     """Return whether an expression is zero for all real values, except at points of jumps.
 
-    An analytic function that is not zero everywhere is zero at random points with probability 0. An
-    expression with kinks and jumps is one in each region of the signs of what switches there: of a
-    for |a|, of a - b for max(a, b), of the root's branch for sqrt(a), which may hide a kink as
-    well. Every region is looked at, wherever it lies; one that is empty, which cannot be told in
-    general, counts like the others.
+    An analytic function that is not 0 everywhere is zero at random points with probability 0. Its
+    value says so unless a part is lost in rounding to the others, as at a point where 1 + tanh(10^6
+    (x - 5)) is less than 10^-10^6: such a point tells nothing. An expression with kinks and jumps
+    is one in each region of the signs of what switches there: of a for |a|, of a - b for max(a, b),
+    of the root's branch for sqrt(a), which may hide a kink as well. Every region is looked at,
+    wherever it lies; one that is empty, which cannot be told in general, counts like the others.
 
     Returns:
         True where that is shown; False also where it is not, because of functions that are not
-        looked into (logarithms, floors, inverse functions) or of too many regions.
+        looked into (logarithms, floors, inverse functions), of too many regions, or of points that
+        all tell nothing.
     """
     expression = _rational(expression)
     if expression == 0:
@@ -50,19 +55,39 @@ def _rational(expression: Any) -> Any:
 
 
 def _nonzero_somewhere(expression: Any) -> bool:
-    """Return whether an expression is nonzero at one of a few random points."""
+    """Return whether an expression is nonzero at one of a few random points, or none tells."""
     if expression.is_zero:
         return False
-    points = random.Random(0)
+    points, told = random.Random(0), False
     symbols = sorted(expression.free_symbols, key=sp.default_sort_key)
-    for scale in _SCALES:
+    for scale in (*_SCALES, *_SMALLER):
+        if scale in _SMALLER and told:
+            break
         at = {s: sp.Rational(points.randint(-(10**6), 10**6) or 1, 10**6) * scale for s in symbols}
         if any(
             _told_from_zero(part)
             for part in expression.xreplace(at).evalf(30, maxn=200).as_real_imag()
         ):
             return True
-    return False
+        told = told or not any(_loses(part, at) for part in sp.preorder_traversal(expression))
+    return not told
+
+
+def _loses(part: Any, at: Mapping[Any, Any]) -> bool:
+    """Return whether a part of an expression may be lost in rounding to others at a point.
+
+    That is where a saturated function is next to its limit, or a power or a number of a size that
+    the digits of an evaluation do not hold.
+    """
+    if isinstance(part, _SATURATED):
+        argument: Any = part.args[0].xreplace(at)
+        argument = argument.evalf(15, maxn=200)
+        return not abs(argument) <= _MOST_SATURATED
+    if not isinstance(part, (sp.exp, sp.Pow, sp.Number)):
+        return False
+    value: Any = part.xreplace(at)
+    value = abs(value.evalf(15, maxn=200))
+    return _told_from_zero(value) and not 1 / _LONGEST <= value <= _LONGEST
 
 
 def _told_from_zero(value: Any) -> bool:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
+
+if TYPE_CHECKING:
+    from safe_envs.problem.problem import SafetyProblem
 
 
 @with_env

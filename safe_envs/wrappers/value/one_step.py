@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,6 +16,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number
 
+_MOST_TERMS = 120
 _LARGEST = 600
 """Parts of an expression that is too large to be expanded to see whether it gets shorter."""
 
@@ -131,13 +133,22 @@ def tidied(expression: Any) -> Any:
     The fewer times a symbol occurs, the narrower is what interval arithmetic makes of it. Large
     expressions stay as they are.
     """
-    if len(list(itertools.islice(sp.preorder_traversal(expression), _LARGEST))) == _LARGEST:
+    parts = list(itertools.islice(sp.preorder_traversal(expression), _LARGEST))
+    if len(parts) == _LARGEST or any(map(_has_many_terms, parts)):
         return expression
     expanded = sp.expand(expression, trig=False, power_base=False, power_exp=False, log=False)
     best: Any = min(expression, expanded, _with_mean_angles(expanded), key=occurrences)
     for symbol in sorted(best.free_symbols, key=sp.default_sort_key):
         best = min(best, _collected(best, symbol), key=occurrences)
     return best
+
+
+def _has_many_terms(part: Any) -> bool:
+    """Return whether a power of a sum, multiplied out, has more terms than a large expression."""
+    if not (isinstance(part, sp.Pow) and part.base.is_Add and part.exp.is_Integer):
+        return False
+    n = int(part.exp)
+    return n > 1 and math.comb(len(part.base.args) + n - 1, n) > _MOST_TERMS
 
 
 def occurrences(expression: Any) -> int:

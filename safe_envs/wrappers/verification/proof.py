@@ -252,13 +252,12 @@ class ChainProof:
     @property
     def statements(self) -> list[tuple[str, Verdict]]:
         """All that a bound asks for, with the judge's word."""
-        noisy, certain = self._formulas.noisy, self._formulas.certain
+        certain = self._formulas.certain
         found = [
             ("G is bounded", self.bounded),
             ("f, g and sigma are continuous on G", self.continuous),
+            ("the barrier is twice differentiable on G", self.smooth),
         ]
-        if noisy:
-            found.append(("the barrier is twice differentiable on G", self.smooth))
         if not certain:
             found += [(f"{n.name} <= {n.value:.6g}", n.verdict) for n in self.suprema]
         found.append(("the condition can be met everywhere on G", self.feasible))

@@ -83,7 +83,7 @@ TRUE = {
     "a line": brownian(),
     "rate": brownian(rate="0.5"),
     "the disk": disk(),
-    "the disk without any room": disk(shortfall="0.08", supremum=1),
+    "the disk by 1e-6": disk(shortfall="0.080001", supremum="1.000001"),
     "several barriers": with_plant(brownian(), barriers=(x, sp.pi - x)),
     "a root": in_line(
         ["-0.01", "2", "-1"], drift=sp.sqrt(1 + x**2), h=2 - x, shortfall=6, supremum="1.1"
@@ -111,9 +111,15 @@ FALSE = {
     "m smaller": brownian(shortfall="0.999999999"),
     "c smaller": brownian(supremum="2.401499999"),
     "more noise": with_plant(brownian(), diffusion=((R(11, 10),),)),
+    "the disk with m smaller by 1e-6": disk(shortfall="0.079999", supremum="1.000001"),
     "the disk with a smaller m": disk(shortfall="0.079999999"),
     "psi above 0 on the edge": in_line(["0.01", "3.1", "-1"], shortfall=2, supremum="2.5"),
     "a bad policy": with_plant(disk(), policy=(R(10),)),
+    "a policy beyond the bounds": with_plant(
+        in_line(["-0.01", "2", "-1"], drift=3, h=x, shortfall="1.01", supremum="1.1"),
+        input_matrix=((R(1),),),
+        policy=(R(-3),),
+    ),
     "a wider workspace": in_line(["1", "-0.1"], drift=-x, h=11 - x, ends=(-20, 4), supremum=2),
     "psi above 0 at the ends of a turn": in_line(
         ["10", "0", "-1"], drift=sp.sin(x), h=R(1), ends=(-sp.pi, sp.pi), shortfall=9, supremum=11
@@ -123,7 +129,11 @@ FALSE = {
 }
 
 UNDECIDED = {
+    "the disk without any room": disk(shortfall="0.08", supremum=1),
     "a pole that the input avoids": with_plant(brownian(), input_matrix=((1 / (x - 2),),)),
+    "a policy with a pole, of an input that does nothing": with_plant(
+        brownian(), policy=(1 / (x - 2),)
+    ),
     "a root of a negative number": with_plant(brownian(), input_matrix=((sp.sqrt(x - 1),),)),
     "no value, but a bounded one": with_plant(brownian(), input_matrix=((sp.sin(1 / (x - 2)),),)),
     "true without any room on a line": disk(

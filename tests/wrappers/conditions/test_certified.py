@@ -283,8 +283,9 @@ def test_evaluations_by_both_engines(psi_file):
     assert rows[0].safe == rows[1].safe
     assert rows[0].infeasible_rate == pytest.approx(rows[1].infeasible_rate, abs=1e-4)
     assert rows[0].intervention_rate > 0
-    assert rows[0].estimated_bound is None
-    assert "that of the certificate" in str(rows[0].bound_note)
+    # A certificate that the judge proves has its bound, and the filter keeps it.
+    assert rows[0].continuous_word == "proved"
+    assert 0.0 < rows[0].continuous_bound <= rows[0].ci_high
 
 
 def test_wrappers_take_its_text(psi_file):

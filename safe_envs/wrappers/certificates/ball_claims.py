@@ -1,4 +1,4 @@
-"""What has to hold for a certificate to be a proof, as statements for the two checkers.
+"""What has to hold for a certificate to be a proof, as statements for the check by balls.
 
 Let G be the states in the workspace with psi > 0 and all h_i > 0. Until a path leaves the workspace
 it leaves G only where psi <= 0: psi is continuous, and <= 0 where an h_i is 0. On the way e^(a t)
@@ -15,13 +15,15 @@ from typing import Any, NamedTuple
 
 import sympy as sp
 
+from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.certificates.check_result import StatementCheck
-from safe_envs.wrappers.certificates.divisibility import divides
+
+_LARGEST_DEGREE = 4
 
 
-class Statement(NamedTuple):
-    """Claim + sum of w u >= 0, for some u of each (w, low, high) in inputs, in a region.
+class BallClaim(NamedTuple):
+    """That the claim + sum of w u >= 0, for some u of each (w, low, high) in inputs, in a region.
 
     Attributes:
         name: of the statement.
@@ -42,7 +44,7 @@ class Statement(NamedTuple):
     faces: tuple[tuple[int, Any], ...] = ()
 
 
-def statements_of(certificate: BarrierCertificate, psi: dict[Any, sp.Symbol]) -> list[Statement]:
+def statements_of(certificate: BarrierCertificate, psi: dict[Any, sp.Symbol]) -> list[BallClaim]:
     """Return all statements but the first one.
 
     Args:
@@ -64,23 +66,27 @@ def statements_of(certificate: BarrierCertificate, psi: dict[Any, sp.Symbol]) ->
         inputs = ()
     used = (*plant.drift, *h, *plant.policy, *sum((*plant.input_matrix, *plant.diffusion), ()))
     found = [
-        Statement(
+        BallClaim(
             "f, g, sigma, h and the policy are defined", sp.Integer(1), (p, *h), defined=used
         ),
-        Statement("psi <= c", c - p, (p, *h)),
-        Statement("A psi >= -a psi - m", claim, (p, *h), inputs=inputs),
+        BallClaim("psi <= c", c - p, (p, *h)),
+        BallClaim("A psi >= -a psi - m", claim, (p, *h), inputs=inputs),
     ]
     for i, e in enumerate(h):
-        if not divides(e, certificate.psi):
+        if not _is_same(e, certificate.psi):
             rest = (p, *h[:i], *h[i + 1 :])
-            found.append(Statement(f"psi <= 0 where h_{i + 1} = 0", -p, rest, zero=e))
+            found.append(BallClaim(f"psi <= 0 where h_{i + 1} = 0", -p, rest, zero=e))
     for i, (x, (low, high)) in enumerate(zip(plant.states, plant.workspace, strict=True)):
-        turn = sp.simplify(high - low - 2 * sp.pi) == 0
-        repeats = turn and all(e.subs(x, x + 2 * sp.pi) == e for e in used)
-        if repeats and any(key[i] for key in certificate.psi.coefficients):
+        if plant.angles[i] and any(key[i] for key in certificate.psi.coefficients):
             name, faces = f"psi <= 0 at the ends of the turn of {x}", ((i, low), (i, high))
-            found.append(Statement(name, -p, (p, *h), faces=faces))
+            found.append(BallClaim(name, -p, (p, *h), faces=faces))
     return found
+
+
+def _is_same(e: sp.Expr, psi: Polynomial) -> bool:
+    # Only sums of monomials are compared, for others may be huge.
+    small = psi.degree <= _LARGEST_DEGREE and not e.atoms(sp.Add) - {e}
+    return small and sp.expand(psi.expression - e) == 0
 
 
 def first_statement(certificate: BarrierCertificate) -> StatementCheck:
@@ -89,4 +95,4 @@ def first_statement(certificate: BarrierCertificate) -> StatementCheck:
     ends = (*certificate.plant.workspace, *certificate.plant.bounds)
     sound = all(e.is_finite and f.is_finite and e < f for e, f in ends)
     word = "checked" if signs and certificate.horizon > 0 and sound else "refuted"
-    return StatementCheck("bounded workspace; a, m >= 0; c, T > 0", word)
+    return StatementCheck("finite box; a, m >= 0; c, T > 0", word)
