@@ -37,7 +37,7 @@ def test_the_bounds_are_shown_and_verify_reads_them(safe_envs_command, tmp_path)
     chain = json.loads((tmp_path / "v.json").read_text())["chain"]
     assert chain["held_word"] == "certified"
     assert chain["held_bound"] == pytest.approx(rows[1]["held_bound"])
-    assert "Held input: by a table of this policy, 401 cells" in " ".join(out.split())
+    assert "Held input: certified, by a table of this policy, 401 cells" in " ".join(out.split())
 
 
 def test_a_policy_that_is_no_formula_has_a_note(safe_envs_command):
