@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 _MOST_COEFFICIENT = 1000.0
+_SECONDS, _TIME_OVER = 10.0, 1
+"""Of a linear program, and what SciPy says where they did not suffice."""
+
 _SLACK = 1e-9
 
 
@@ -86,8 +89,13 @@ def solve(claims: Claims, bound: MeanBound, weights: np.ndarray) -> tuple[np.nda
     ranges = [(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)] * len(weights) + [(0.0, None)]
     for method in ("highs-ds", "highs-ipm"):
         found = linprog(
-            cost, matrix / sizes[:, None], limits / sizes - _SLACK, bounds=ranges, method=method
+            cost,
+            matrix / sizes[:, None],
+            limits / sizes - _SLACK,
+            bounds=ranges,
+            method=method,
+            options={"time_limit": _SECONDS},
         )
-        if found.x is not None:
+        if found.x is not None and found.status != _TIME_OVER:
             return found.x[:-1], max(0.0, float(found.x[-1]))
     return None
