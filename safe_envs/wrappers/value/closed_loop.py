@@ -7,15 +7,13 @@ least. U(Z) is an interval that holds what the policy proposes, and the filter m
 in Z; it is cut into parts, of which the worst counts. The table is computed with proved bounds, and
 rounded down as it is stored: there is nothing to be taken off it.
 
-What is executed is taken from exact states. Observations and actions that are rounded to single
-precision are in U(Z), and so are the roundings of the filter.
+Roundings of observations and actions to single precision are in U(Z), and so are the filter's.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -42,17 +40,16 @@ from safe_envs.wrappers.value.windows import Bordered
 _PARTS = 4
 """Of the interval of the inputs of a cell."""
 
-_REFINED = 4
+_REFINED = 2
 """Parts of a cell of the means along each axis."""
 
 _STARTS = 20_000
 _AT_ONCE = 4_000_000
 _STARTS_AT_ONCE = 20_000
 
-_LEAVING = "violation"
-"""How an episode counts that leaves the workspace: a lower bound may count it so."""
+_LEAVING = "violation"  # Leaving the workspace is one: a lower bound may count it so.
 
-CELLS = {1: 10_000, 2: 360_000}
+CELLS = {1: 20_000, 2: 1_000_000}
 """Of a table where no numbers are asked for, by the number of states."""
 
 _WORK = 100_000_000
@@ -65,7 +62,7 @@ class ClosedLoopTable:
 
     Attributes:
         grid: of the states.
-        lower: shape (K + 1, cells), float32; of a table that was kept, the first two instants.
+        lower: shape (K + 1, cells), float32; of `ClosedLoop.table` the first instants.
         chain: of the problem on this grid.
         executed: inputs of the controller.
         parts: into which their intervals are cut.
@@ -166,9 +163,9 @@ class ClosedLoop:
         if cells is None:
             require_few_states(self.problem)
             wanted = min(CELLS[len(small.coordinates)], _WORK // small.steps)
-            shape = suitable_grid(small, given, sets, step).shape
-            scale = (wanted / math.prod(shape)) ** (1 / len(shape))
-            given = replace(given, cells=tuple(max(8, round(scale * c)) for c in shape))
+            usual = suitable_grid(small, given, sets, step)
+            scale = (wanted / usual.cells) ** (1 / len(usual.axes))
+            given = replace(given, cells=tuple(max(8, round(scale * c)) for c in usual.shape))
         return suitable_grid(small, given, sets, step)
 
     def chain(self, grid: Grid) -> ProvedChain:
@@ -180,25 +177,29 @@ class ClosedLoop:
         grid: Grid,
         parts: int | None = None,
         progress: Callable[[float], None] | None = None,
+        kept: int = 2,
     ) -> ClosedLoopTable:
-        """Compute the table on a grid; see `closed_loop_table`."""
+        """Compute a table; see `closed_loop_table`.
+
+        Args:
+            grid: of the states.
+            parts: of the intervals of inputs.
+            progress: called with the part of the work that is done.
+            kept: first instants to keep; bounds of starts need two.
+
+        Returns:
+            The table.
+        """
         begun = time.perf_counter()
         chain = self.chain(grid)
         parts = parts or (_PARTS if chain.step.noise.low.size else 1)
-        lower = _lower(chain, self.executed, parts, progress)
+        lower = _lower(chain, self.executed, parts, kept, progress)
         seconds = time.perf_counter() - begun
         return ClosedLoopTable(grid, lower, chain, self.executed, parts, seconds)
 
 
 def require_few_states(problem: SafetyProblem) -> None:
-    """Check that tables of closed loops take minutes and not days.
-
-    Args:
-        problem: whose controllers are to be bounded.
-
-    Raises:
-        ConfigurationError: It has several inputs, or too many states.
-    """
+    """Check that tables of a problem's closed loops take minutes; raise ConfigurationError."""
     require_one_input(problem)
     n = problem.plant.n
     if n not in CELLS:
@@ -233,7 +234,7 @@ def closed_loop_table(
         ConfigurationError: Such a closed loop is not bounded.
     """
     loop = ClosedLoop(problem, condition, policy)
-    return loop.table(loop.grid(cells), parts, progress)
+    return loop.table(loop.grid(cells), parts, progress, loop.small.steps + 1)
 
 
 def _chain_of_states(problem: SafetyProblem) -> ReducedProblem:
@@ -250,9 +251,10 @@ def _lower(
     chain: ProvedChain,
     executed: ExecutedInputs,
     parts: int,
+    kept: int,
     progress: Callable[[float], None] | None,
 ) -> np.ndarray:
-    """Return the envelope, shape (K + 1, cells)."""
+    """Return the first instants of the envelope, shape (kept, cells)."""
     sets, steps = chain.sets, chain.steps
     numbers = np.flatnonzero(sets.touches & ~sets.ends)
     images = _images(chain, executed, parts, sets.corners(numbers))
@@ -266,15 +268,17 @@ def _lower(
         ]
         for b in blocks
     ]
-    lower = np.zeros((steps + 1, chain.grid.cells), dtype=np.float32)
-    lower[:, sets.touches & sets.ends] = 1.0
-    lower[-1, sets.touches] = 1.0
-    for k in range(steps - 1, -1, -1):
-        ahead = chain.ahead(lower[k + 1], sets.inside, 1)
-        for block, own in zip(blocks, groups, strict=True):
-            bounds = [chain.of_groups(ahead, each, images.shape) for each in own]
-            worst = np.minimum.reduce(bounds).clip(0.0, 1.0)
-            lower[k, numbers[block]] = rounded_down(worst)
+    lower = np.zeros((kept, chain.grid.cells), dtype=np.float32)
+    values = sets.touches.astype(np.float32)
+    for k in range(steps, -1, -1):
+        if k < steps:
+            ahead = chain.ahead(values, sets.inside, 1)
+            for block, own in zip(blocks, groups, strict=True):
+                bounds = [chain.of_groups(ahead, each, images.shape) for each in own]
+                worst = np.minimum.reduce(bounds).clip(0.0, 1.0)
+                values[numbers[block]] = rounded_down(worst)
+        if k < kept:
+            lower[k] = values
         if progress:
             progress((steps - k) / steps)
     return lower
