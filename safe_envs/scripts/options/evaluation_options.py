@@ -102,7 +102,7 @@ ClosedLoop = Annotated[
         "--closed-loop/--no-closed-loop",
         help=(
             "Compute a certified lower bound for each filter whose controller has a formula, by"
-            " tables of closed loops: up to two states, one to three minutes each. By default those"
+            " tables of closed loops: up to two states, about a minute each. By default those"
             " in the cache are read."
         ),
         show_default=False,

@@ -53,7 +53,7 @@ CELLS = {1: 20_000, 2: 1_000_000}
 """Of a table where no numbers are asked for, by the number of states."""
 
 _WORK = 100_000_000
-"""Cells times instants of such a table: one to three minutes."""
+"""Cells times instants of such a table: a minute or so."""
 
 
 @dataclass(frozen=True, eq=False)
