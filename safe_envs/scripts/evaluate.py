@@ -31,6 +31,7 @@ def evaluate(
     refine: of.Refine = False,
     monitoring: of.Monitoring = "discrete",
     best: of.Best = None,
+    closed_loop: of.ClosedLoop = None,
     rare: of.Rare = False,
     particles: of.Particles = None,
     repetitions: of.Repetitions = None,
@@ -72,6 +73,7 @@ def evaluate(
             "--refine": refine,
             "--plot": plot,
             "--best": best,
+            "--closed-loop": closed_loop,
             "--policy best": policy == "best",
             "--episodes-out": episodes_out,
             "--repeats": repeats != 1,
@@ -89,6 +91,7 @@ def evaluate(
         )
     third_party = filter_spec and env.env_id and not env.system
     common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "best": best}
+    common |= {"closed_loop": closed_loop}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id

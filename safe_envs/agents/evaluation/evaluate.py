@@ -10,6 +10,7 @@ from typing import Any
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.bound_averages import BoundAverager
+from safe_envs.agents.evaluation.closed_loop_bound import compute_closed_loop
 from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
@@ -50,6 +51,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     repeats: int = 1,
     monitoring: str = "discrete",
     best: bool | None = None,
+    closed_loop: bool | None = None,
     jobs: int | None = None,
     progress: Progress | None = None,
     record: bool = False,
@@ -98,6 +100,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         monitoring: where h is checked, "discrete" or "continuous".
         best: whether to compute how safe any policy can be, see
             `safe_envs.agents.evaluation.yardstick`; None to tell it if its table is in the cache.
+        closed_loop: whether to compute certified tables for the bound of the env's own steps, see
+            `safe_envs.wrappers.value.closed_loop`; None to read those in the cache.
         jobs: number of processes, or of threads of the compiled engine; the result is the same.
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
@@ -128,6 +132,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         repeats=repeats,
         monitoring=monitoring,
         best=best,
+        closed_loop=closed_loop,
     )
     settings = RunSettings(num_envs, jobs, record, progress, engine, keep_episodes, episodes_out)
     return run_evaluation(spec, settings)
@@ -150,6 +155,8 @@ class _Runner:
         self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
         parts = resolved.parts + sum(map(resolved.repeats, resolved.names))
         parts += resolved.prepares + bool(resolved.spec.best)
+        if resolved.spec.closed_loop:
+            parts += sum(map(resolved.repeats, resolved.names))
         self._work = WorkParts(settings.progress, parts)
         identifications = sum(map(resolved.repeats, resolved.names))
         self._keeps = settings.keeps(self._spec.episodes * identifications)
@@ -161,6 +168,12 @@ class _Runner:
         resolved, spec, settings = self._resolved, self._spec, self._settings
         resolved.learn(self._work.part)
         best = self._best()
+        bounded = {name: self._bounded(name) for name in resolved.names}
+        # The bounds find the tables as long as they are in use here.
+        tables = [
+            compute_closed_loop(of, self._work.part())
+            for of in (of for each in bounded.values() for of in each if spec.closed_loop)
+        ]
         # Made before the first episode: what is wrong with any of them shows at once.
         players = {
             name: [player_of(resolved, conditions, settings) for conditions in each]
@@ -179,13 +192,15 @@ class _Runner:
                 path = Path(settings.episodes_out)
                 sinks.append(opened.enter_context(episodes_file(path, resolved.problem.dt)))
             for name in resolved.names:
-                totals, averagers, seconds = self._simulated(
-                    name, players[name], trajectories.get(name), sinks
+                averagers = [self._averager(of) for of in bounded[name]]
+                totals, seconds = self._simulated(
+                    name, list(zip(players[name], averagers, strict=True)), trajectories, sinks
                 )
                 rows.append(self._row(name, totals, averagers, config["policy"]["name"]))
                 safe[name] = [each.safe for each in totals]
                 visited[name] = [each.visited for each in totals]
                 timings.append(self._timing(name, totals, players[name][0], seconds))
+        del tables
         best, rows = chained(best, rows)
         return Evaluation(
             resolved.problem,
@@ -213,32 +228,32 @@ class _Runner:
             return None
         return best_at_hand(resolved.problem)
 
+    def _bounded(self, name: str) -> list[FilteredPolicy]:
+        """Return what the bounds of a filter are of, for each identification."""
+        spec, problem = self._spec, self._resolved.problem
+        # The name of an object says nothing.
+        policy = spec.policy if isinstance(spec.policy, str) else ""
+        given = (spec.knowledge, policy, spec.objective, spec.closed_loop)
+        return [FilteredPolicy(problem, parts, *given) for parts in self._resolved.filters[name]]
+
+    def _averager(self, of: FilteredPolicy) -> BoundAverager:
+        return BoundAverager(of, self._spec.monitoring, self._why_no_bound)
+
     def _simulated(
         self,
         name: str,
-        players: Sequence[Player],
-        trajectories: Trajectories | None,
+        played: Sequence[tuple[Player, BoundAverager]],
+        trajectories: Mapping[str, Trajectories],
         sinks: Sequence[EpisodeSink],
-    ) -> tuple[list[EpisodeStatistics], list[BoundAverager], float]:
+    ) -> tuple[list[EpisodeStatistics], float]:
         """Run the episodes under a filter, with each identification, and take the time in s."""
         resolved, episodes = self._resolved, self._spec.episodes
         found = []
-        spec, given = self._spec, self._spec.policy
-        # The name of an object says nothing.
-        policy = given if isinstance(given, str) else ""
-        averagers = [
-            BoundAverager(
-                FilteredPolicy(resolved.problem, parts, spec.knowledge, policy),
-                spec.monitoring,
-                self._why_no_bound,
-            )
-            for parts in resolved.filters[name]
-        ]
         # The search for bounds is over: what is timed are episodes.
         begun = time.perf_counter()
-        for repeat, (player, averager) in enumerate(zip(players, averagers, strict=True)):
+        for repeat, (player, averager) in enumerate(played):
             statistics = EpisodeStatistics(resolved.problem)
-            recorded = trajectories if repeat == 0 else None
+            recorded = trajectories.get(name) if repeat == 0 else None
             for sink in sinks:
                 sink.begin(name, repeat)
             for batch in player.play(self._work.part(episodes), recorded):
@@ -248,7 +263,7 @@ class _Runner:
                     sink.add(batch.results)
             player.close()
             found.append(statistics)
-        return found, averagers, time.perf_counter() - begun
+        return found, time.perf_counter() - begun
 
     def _row(
         self,

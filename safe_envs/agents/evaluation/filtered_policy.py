@@ -17,9 +17,14 @@ class FilteredPolicy:
         parts: of the filter; no conditions for the unfiltered env.
         knowledge: of the filter, "model" or "plant".
         policy: its name, "nominal" for the problem's own; "" for an object.
+        objective: of the filter, "nearest" or "clf".
+        closed_loop: whether a table of its closed loop was asked for; None to read one that is
+            kept.
     """
 
     problem: SafetyProblem
     parts: FilterParts
     knowledge: str
     policy: str
+    objective: str = "nearest"
+    closed_loop: bool | None = None

@@ -134,6 +134,7 @@ def refine(
         "filters": first.spec.filters or [row.filter for row in first.rows],
         "bounds": False,
         "best": False,
+        "closed_loop": None,
         "learned": first.learned,
     }
     finer = [

@@ -31,6 +31,7 @@ from safe_envs.wrappers import (
     spec_of,
 )
 from safe_envs.wrappers.conditions.text_parts import learned_parts, names_promise, require_known
+from safe_envs.wrappers.value.closed_loop import require_few_states
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_tables import promise_filter_for
 from safe_envs.wrappers.value.promise_text import PromiseSettings
@@ -91,6 +92,8 @@ class ResolvedEvaluation:
         self.filters: dict[str, list[FilterParts]] = {}
         if spec.best:
             reduced(self.problem, "plant")  # What has no table is known at once.
+        if spec.closed_loop:
+            require_few_states(self.problem)
 
     @property
     def prepares(self) -> bool:
@@ -163,14 +166,11 @@ class ResolvedEvaluation:
         return env
 
     def filtered(self, env: Any, conditions: FilterParts) -> Env:
-        """Return a batch of envs behind a filter.
+        """Return a batch of envs behind a filter, or the env itself without conditions.
 
         Args:
             env: unfiltered.
             conditions: see `FilterParts`.
-
-        Returns:
-            The env itself without conditions.
         """
         if not conditions:
             return env
@@ -248,15 +248,14 @@ def _require_third_party(spec: EvaluationSpec) -> None:
             "monitoring = 'continuous': the path of a third-party env between its steps is"
             " unknown; use 'discrete'"
         )
-    if spec.best:
-        raise ConfigurationError(
-            "best = True: the best attainable safety needs the step of the env, and of a"
-            " third-party env only a model is known; leave it out"
-        )
+    for name in ("best", "closed_loop"):
+        if getattr(spec, name):
+            raise ConfigurationError(
+                f"{name} = True needs the step of the env, not only a model of it; leave it out"
+            )
     if spec.knowledge != "model":
         raise ConfigurationError(
-            f"knowledge = {shown(spec.knowledge)}: of a third-party env nothing is known but the"
-            " model"
+            f"knowledge = {shown(spec.knowledge)}: nothing is known but the model of such an env"
         )
 
 

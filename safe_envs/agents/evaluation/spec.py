@@ -66,6 +66,8 @@ class EvaluationSpec:
             too.
         best: whether to compute how safe any policy can be; None to tell that only where the table
             for it is in the cache.
+        closed_loop: whether to compute certified tables of the closed loops, which bound from below
+            how safe each filter is with this policy; None to read only those in the cache.
 
     Raises:
         ConfigurationError: A value is out of range, or parts do not go together.
@@ -87,6 +89,7 @@ class EvaluationSpec:
     repeats: int = 1
     monitoring: str = "discrete"
     best: bool | None = None
+    closed_loop: bool | None = None
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
@@ -102,12 +105,21 @@ class EvaluationSpec:
                 )
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
-        if not isinstance(self.best, bool | None):
-            raise ConfigurationError(f"best = {shown(self.best)}; give True, False or None")
+        for name in ("best", "closed_loop"):
+            if not isinstance(getattr(self, name), bool | None):
+                raise ConfigurationError(
+                    f"{name} = {shown(getattr(self, name))}; give True, False or None"
+                )
         if self.best and self.monitoring == "continuous":
             raise ConfigurationError(
                 "best = True with monitoring = 'continuous': the best attainable safety is of"
                 " control instants, and not of the time between them; leave one of the two out"
+            )
+        if self.closed_loop and (self.monitoring == "continuous" or not self.bounds):
+            raise ConfigurationError(
+                "closed_loop = True: tables of closed loops are bounds, of control instants and not"
+                " of the time between them; leave it out, or take monitoring = 'discrete' and"
+                " bounds = True"
             )
         if not isinstance(self.options or {}, Mapping):
             raise ConfigurationError(f"options = {shown(self.options)}; give a dictionary")

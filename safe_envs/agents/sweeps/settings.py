@@ -22,11 +22,16 @@ _OTHERWISE = ("problem", "filters", "options", "filter_spec", "learned", "trust"
 
 EVALUATION_DEFAULTS: dict[str, Any] = {
     field.name: field.default for field in fields(EvaluationSpec) if field.name not in _OTHERWISE
-} | {"bounds": False, "best": False}
+} | {"bounds": False, "best": False, "closed_loop": False}
 """Settings that are fields of an `EvaluationSpec`, with the values of a cell without them."""
 
 _SECTIONS = ("fixed", "grid", "cells")
-_KINDS = get_type_hints(EvaluationSpec) | {"substeps": int, "policy": str, "best": bool}
+_KINDS = get_type_hints(EvaluationSpec) | {
+    "substeps": int,
+    "policy": str,
+    "best": bool,
+    "closed_loop": bool,
+}
 _WORDS = ("env", "system", "filter", *(name for name in EVALUATION_DEFAULTS if _KINDS[name] is str))
 _NAMES = ("env", "filter", *ENV_OPTIONS, *EVALUATION_DEFAULTS)
 _GROUPS = tuple(f"{group}.NAME" for group in PARAMETER_GROUPS)

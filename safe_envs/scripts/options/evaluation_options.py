@@ -96,6 +96,18 @@ Best = Annotated[
         show_default=False,
     ),
 ]
+ClosedLoop = Annotated[
+    bool | None,
+    typer.Option(
+        "--closed-loop/--no-closed-loop",
+        help=(
+            "Compute a certified lower bound for each filter whose controller has a formula, by"
+            " tables of closed loops: up to two states, about a minute each. By default those"
+            " in the cache are read."
+        ),
+        show_default=False,
+    ),
+]
 Monitoring = Annotated[
     str,
     typer.Option(

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.bound_text import continuous_text, held_text
+from safe_envs.agents.evaluation.held_input import NO_FILTER
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
@@ -83,7 +84,9 @@ def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
     """
     filtered = [row for row in rows if row.filter != UNFILTERED]
     known = [row for row in filtered if row.learning is None]
-    notes = _why_none("held input", ((r, r.held_note) for r in filtered if r.held_bound is None))
+    none = (row for row in rows if row.held_bound is None)
+    # That there is no filter needs no saying, but why its table of a closed loop is missing does.
+    notes = _why_none("held input", ((r, r.held_note) for r in none if r.held_note != NO_FILTER))
     without = ((r, r.continuous_note) for r in known if r.continuous_bound is None)
     # What a table of steps has no bound for, its name says.
     notes += _why_none("continuous control", (w for w in without if not names_promise(w[0].filter)))
@@ -93,7 +96,7 @@ def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
         if row.continuous_word == "estimated" and row.continuous_note
     ]
     notes += held_notes(rows)
-    notes += _of_drawn_starts(filtered)
+    notes += _of_drawn_starts(rows)
     notes += [PROVED] * _any(rows, "proved") + [ESTIMATED] * _any(rows, "estimated")
     return notes
 

@@ -129,7 +129,9 @@ def print_chain(console: Console, answer: VerifyAnswer) -> None:
     held = chain.bounds.held_note
     if held:
         none = chain.bounds.held_bound is None
-        say(console, f"Held input: {'no bound, ' * none}{held}.")
+        word = chain.bounds.held_word
+        worth = "no bound, " if none else f"{word}, " * (word in ("proved", "certified"))
+        say(console, f"Held input: {worth}{held}.")
     if chain.best is not None and chain.best.contradiction:
         say(console, f"The attainable safety is withheld: {chain.best.contradiction}.")
     elif chain.best is not None and attainable:

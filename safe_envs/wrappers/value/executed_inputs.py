@@ -14,7 +14,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.interval_arithmetic import IntervalArithmetic, negative
-from safe_envs.dynamics.intervals import Interval, IntervalFunction, interval_function
+from safe_envs.dynamics.intervals import Interval, interval_function
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
@@ -26,6 +26,8 @@ _SINGLE = 2.0**-23
 _EXECUTED = 1e-6
 """Of the width of the input bounds: rounding of actions and of the filter."""
 
+POLICIES = ("any", "nominal", "zero")
+
 Ends = tuple[np.ndarray, np.ndarray]
 
 
@@ -35,29 +37,44 @@ class ExecutedInputs:
     Args:
         problem: with one input.
         condition: of the filter, on a problem with one barrier; None without a filter.
-        policy: "any", or "nominal" for the problem's own controller.
+        policy: "any", "nominal" for the problem's own controller, or "zero".
+        knowledge: of the filter, "model" or "plant".
+
+    Attributes:
+        described: all that determines the inputs, as JSON-able data.
 
     Raises:
         ConfigurationError: Such a closed loop is not bounded.
     """
 
-    def __init__(self, problem: SafetyProblem, condition: Condition | None, policy: str) -> None:
-        if policy not in ("any", "nominal"):
-            raise ConfigurationError(f"policy = {policy!r}; allowed: any, nominal")
-        if len(problem.inputs) != 1:
-            raise ConfigurationError(
-                f"{problem.name} has {len(problem.inputs)} inputs; closed loops of one are bounded"
-            )
+    def __init__(
+        self,
+        problem: SafetyProblem,
+        condition: Condition | None,
+        policy: str,
+        knowledge: str = "model",
+    ) -> None:
+        if policy not in POLICIES:
+            raise ConfigurationError(f"policy = {policy!r}; allowed: {', '.join(POLICIES)}")
+        require_one_input(problem)
         self._low, self._high = map(float, problem.box[0])
+        states = problem.plant.states
         self._law = self._features = self._constraint = None
-        if policy == "nominal":
-            law = problem.model.numeric(problem.nominal[0])
-            self._features = interval_function(
-                problem.plant.states, _known([f.expression for f in problem.features])
-            )
-            self._law = interval_function([f.symbol for f in problem.features], _known([law]))
+        law, features, constraint = [], [], []
+        if policy != "any":
+            given = problem.nominal[0] if policy == "nominal" else 0
+            law = _known([problem.model.numeric(sp.sympify(given))])
+            features = _known([f.expression for f in problem.features])
+            self._features = interval_function(states, features)
+            self._law = interval_function([f.symbol for f in problem.features], law)
         if condition is not None:
-            self._constraint = _constraint(problem, condition)
+            constraint = _constraint(problem, condition, knowledge)
+            self._constraint = interval_function(states, constraint)
+        self.described = [
+            [list(map(sp.srepr, each)) for each in (states, features, law, constraint)],
+            [sp.srepr(f.symbol) for f in problem.features],
+            [self._low, self._high, _SINGLE, _EXECUTED],
+        ]
 
     def of_boxes(self, low: Sequence[np.ndarray], high: Sequence[np.ndarray]) -> Ends:
         """Return the ends of the executed inputs, arrays (B,).
@@ -102,21 +119,32 @@ class ExecutedInputs:
         return found[0], found[1]
 
 
-def _constraint(problem: SafetyProblem, condition: Condition) -> IntervalFunction:
+def require_one_input(problem: SafetyProblem) -> None:
+    """Check that what a filter executes in a problem is known here; raise ConfigurationError."""
+    if len(problem.inputs) != 1:
+        raise ConfigurationError(
+            f"{problem.name} has {len(problem.inputs)} inputs; closed loops of one are bounded"
+        )
+
+
+def _constraint(problem: SafetyProblem, condition: Condition, knowledge: str) -> list[sp.Expr]:
+    """Return a and b of the constraint a u + b >= 0."""
     if len(problem.barriers) != 1:
         raise ConfigurationError(
             f"{problem.name} has {len(problem.barriers)} barriers; closed loops with one are"
             " bounded"
         )
-    found = condition.constraint(problem.model, problem.barriers[0])
+    if condition.corrects_model:
+        raise ConfigurationError(f"{condition.name} is learned; conditions of formulas are bounded")
+    system = problem.plant if knowledge == "plant" else problem.model
+    found = condition.constraint(system, problem.barriers[0])
     parts = (found.demand, found.change, found.uncertainty, found.terms)
-    if any(part is not None for part in parts):
+    if found.domain or any(part is not None for part in parts):
         raise ConfigurationError(
             f"the constraint of {condition.name} is not of the form a u + b >= 0 with known a and"
             " b, or has a margin of first order; its closed loop is not bounded"
         )
-    known = [problem.model.numeric(e) for e in (found.coefficient[0], found.offset)]
-    return interval_function(problem.plant.states, _known(known))
+    return _known([system.numeric(e) for e in (found.coefficient[0], found.offset)])
 
 
 def _known(expressions: Sequence[sp.Expr]) -> list[sp.Expr]:

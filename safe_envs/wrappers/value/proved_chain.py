@@ -33,6 +33,7 @@ class ProvedChain:
     Attributes:
         grid: the grid.
         step: of the problem.
+        steps: control periods of an episode.
         box: (low, high) of each input.
         sets: what the cells lie in.
 
@@ -43,6 +44,7 @@ class ProvedChain:
     def __init__(self, small: ReducedProblem, leaving: str, grid: Grid, refined: int = 1) -> None:
         _require_provable(small, grid)
         self.grid, self.step, self.box = grid, Step(small), small.box
+        self.steps = small.steps
         for axis, blur in zip(grid.axes, self.step.blur, strict=True):
             if axis.period and blur > _WIDEST * axis.period:
                 raise ConfigurationError(

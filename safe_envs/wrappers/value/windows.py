@@ -159,7 +159,9 @@ class Bordered:
             half = self._of((*level[:i], level[i] - 1, *level[i + 1 :]))
             moved = np.moveaxis(half, i, 0)
             step = 1 << (level[i] - 1)
-            found = np.array(half)
-            np.minimum(moved[:-step], moved[step:], out=np.moveaxis(found, i, 0)[:-step])
+            found = np.empty_like(half)
+            kept = np.moveaxis(found, i, 0)
+            np.minimum(moved[:-step], moved[step:], out=kept[:-step])
+            kept[-step:] = moved[-step:]
             self._levels[level] = found
         return self._levels[level]
