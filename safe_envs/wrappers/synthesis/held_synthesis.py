@@ -24,7 +24,7 @@ from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.held_bound import HeldBound, prove_held_bound
 from safe_envs.wrappers.verification.held_check import held_certificate
 
-_DEGREES = {1: (8, 16), 2: (6, 10, 12)}
+_DEGREES = {1: (8, 16), 2: (6, 12)}
 _LAST_DEGREES = (4, 6)
 _DECIMALS = 10
 _STARTS = 50_000
@@ -33,8 +33,9 @@ _STARTS = 50_000
 _BETWEEN = (0.04, 0.12, 0.3, 0.5, 0.7, 0.88, 0.96)
 """Where between the ends of its bounds an input is sampled."""
 
-_SLACK = 3e-5
-"""By how much q is asked above its chord, over 4 t (1 - t), where the input acts most."""
+_SLACK, _SLACK_LOST = 3e-5, 5e-3
+"""By how much q is asked above its chord, over 4 t (1 - t), where the input acts most: at most this,
+and at most what costs this part of the bound."""
 
 _FEWEST_ROUNDS = 4
 _NEAR_ACTIVE, _NEAR_SAG = -0.03, -0.01
@@ -261,7 +262,8 @@ class _Programs:
         return ((1.0 - part) * at_low + part * at_high - between) / (4.0 * part * (1.0 - part))
 
     def _slack(self, x: np.ndarray) -> np.ndarray:
-        return _SLACK * (self._step.effect(x) ** 2).sum(axis=1) / max(self._most, 1e-300)
+        slack = min(_SLACK, _SLACK_LOST / self._steps)
+        return slack * (self._step.effect(x) ** 2).sum(axis=1) / max(self._most, 1e-300)
 
     def _extended(self, c: np.ndarray, m: float, add: bool) -> float:
         """Return the mean bound by the violations at all states, and add the worst of them."""
