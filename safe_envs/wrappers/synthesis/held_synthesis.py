@@ -34,8 +34,8 @@ _BETWEEN = (0.04, 0.12, 0.3, 0.5, 0.7, 0.88, 0.96)
 """Where between the ends of its bounds an input is sampled."""
 
 _SLACK, _SLACK_LOST = 3e-5, 5e-3
-"""By how much q is asked above its chord, over 4 t (1 - t), where the input acts most: at most this,
-and at most what costs this part of the bound."""
+"""By how much q is asked above its chord, over 4 t (1 - t), where the input acts most: no more than
+this, and what costs no more than this part of the bound. With less of it the proof takes long."""
 
 _FEWEST_ROUNDS = 4
 _NEAR_ACTIVE, _NEAR_SAG = -0.03, -0.01
@@ -200,6 +200,7 @@ class _Programs:
         psi_safe, psi_bent = np.ones(len(self._safe)), np.ones(len(self._bent))
         counted = np.ones(len(self._starts), dtype=bool)
         best: _Candidate | None = None
+        begin = time.monotonic()
         for turn in range(self._settings.rounds):
             active, bent = psi_safe > _NEAR_ACTIVE, psi_bent > _NEAR_SAG
             x = self._safe[active]
@@ -222,7 +223,8 @@ class _Programs:
             if best is None or sampled > best.sampled:
                 best = _Candidate(c, program, sampled)
             near = program - sampled < self._settings.tolerance / 2.0
-            if turn + 1 >= _FEWEST_ROUNDS and near:
+            late = time.monotonic() - begin > self._settings.seconds
+            if (turn + 1 >= _FEWEST_ROUNDS and near) or late:
                 break
             psi_safe, psi_bent = basis.values(self._safe) @ c, basis.values(self._bent) @ c
             raised = np.zeros(len(self._safe), dtype=bool)
