@@ -80,7 +80,15 @@ class SampledStep:
         return at_states(self._functions[1], x)
 
     def means(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return the mean of X' at states (B, n) and inputs (B,), shape (B, n)."""
+        """Return the mean of X'.
+
+        Args:
+            x: states, shape (B, n).
+            u: inputs, shape (B,).
+
+        Returns:
+            Shape (B, n).
+        """
         return x + self.period * (at_states(self._functions[0], x) + self.effect(x) * u[:, None])
 
     def deviations(self, x: np.ndarray) -> np.ndarray:
@@ -134,12 +142,12 @@ class SampledStep:
 
 @dataclass(frozen=True, eq=False)
 class StatePools:
-    """States of a box at which psi is looked at.
+    """States of the range of psi at which psi is looked at.
 
     Attributes:
         safe: of C inside the workspace, the ones next to its edge first, shape (B, n).
         unsafe: the others, the ones next to the edge first, shape (D, n).
-        border: unsafe ones on the border of the box and in its corners, shape (E, n).
+        border: unsafe ones on the border of the range of psi and in its corners, shape (E, n).
         near: number of states next to the edge that both begin with.
     """
 
@@ -150,11 +158,11 @@ class StatePools:
 
     @classmethod
     def of(cls, domain: Domain, basis: ChebyshevBasis, rng: np.random.Generator) -> StatePools:
-        """Return the states of a box.
+        """Return states of the range of a basis.
 
         Args:
             domain: the safe set.
-            basis: whose scaled variables are in [-1, 1] in the box.
+            basis: whose scaled variables are in [-1, 1] there.
             rng: of the draws.
         """
         n = len(basis.states)
@@ -185,8 +193,8 @@ class StatePools:
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Rows of a linear program: matrix @ (coefficients, m) <= limits.
+class LinearClaims:
+    """LinearClaims of a linear program: matrix @ (coefficients, m) <= limits.
 
     Attributes:
         matrix: shape (B, K + 1).
@@ -197,23 +205,25 @@ class Rows:
     limits: np.ndarray
 
     @classmethod
-    def of(cls, matrix: np.ndarray, limit: float | np.ndarray, m: float = 0.0) -> Rows:
-        """Return rows with one coefficient of m.
+    def of(cls, matrix: np.ndarray, limit: float | np.ndarray, m: float = 0.0) -> LinearClaims:
+        """Return claims with one coefficient of m.
 
         Args:
             matrix: of the coefficients of psi, shape (B, K).
-            limit: of each row, or of all.
+            limit: of each, or of all.
             m: coefficient of m.
         """
         last = np.full((len(matrix), 1), m)
         return cls(np.hstack([matrix, last]), np.broadcast_to(limit, len(matrix)))
 
 
-def solve_rows(rows: list[Rows], cost: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+def solve_claims(
+    claims: list[LinearClaims], cost: np.ndarray
+) -> tuple[np.ndarray, float, float] | None:
     """Return the coefficients, m and the value of a linear program.
 
     Args:
-        rows: that are met.
+        claims: that are met.
         cost: that is least, of the coefficients and of m >= 0, shape (K + 1,).
 
     Returns:
@@ -221,8 +231,8 @@ def solve_rows(rows: list[Rows], cost: np.ndarray) -> tuple[np.ndarray, float, f
     """
     from scipy.optimize import linprog
 
-    matrix = np.concatenate([r.matrix for r in rows])
-    limits = np.concatenate([r.limits for r in rows])
+    matrix = np.concatenate([r.matrix for r in claims])
+    limits = np.concatenate([r.limits for r in claims])
     sizes = np.maximum(np.abs(matrix).max(axis=1), 1e-9)
     ranges = [(-_MOST_COEFFICIENT, _MOST_COEFFICIENT)] * (len(cost) - 1) + [(0.0, None)]
     found = linprog(

@@ -16,7 +16,12 @@ from safe_envs.wrappers.certificates.statements import plant_of
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
 from safe_envs.wrappers.synthesis.certify import Named
 from safe_envs.wrappers.synthesis.domain import Domain
-from safe_envs.wrappers.synthesis.held_program import Rows, SampledStep, StatePools, solve_rows
+from safe_envs.wrappers.synthesis.held_program import (
+    LinearClaims,
+    SampledStep,
+    StatePools,
+    solve_claims,
+)
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.synthesis.synthesize import Progress, degrees_of
 from safe_envs.wrappers.value.starts import draw_starts, sampling_margin
@@ -129,9 +134,8 @@ def certify_held(
     # Other starts than those for which psi was chosen.
     x = np.stack(draw_starts(problem, _STARTS, settings.seed + 1), axis=1)
     bounds = best.bound.held_bounds_at(search.domain.wrapped(x), problem.steps)
-    mean, margin = float(bounds.mean()), sampling_margin(bounds)
-    seconds = time.monotonic() - begin
-    return HeldCertification(certificate, tuple(attempts), mean, len(x), margin, seconds)
+    numbers = (float(bounds.mean()), len(x), sampling_margin(bounds))
+    return HeldCertification(certificate, tuple(attempts), *numbers, time.monotonic() - begin)
 
 
 class _Search:
@@ -195,7 +199,7 @@ class _Programs:
     def best(self) -> _Candidate | None:
         """Return the psi with the largest mean bound at the sampled states."""
         low_end, high_end = self._step.bounds
-        basis, n = self._basis, len(self._basis.exponents)
+        basis = self._basis
         raised = self._raised_by_high(self._safe)
         psi_safe, psi_bent = np.ones(len(self._safe)), np.ones(len(self._bent))
         counted = np.ones(len(self._starts), dtype=bool)
@@ -208,14 +212,14 @@ class _Programs:
             ends = np.where(raised[active], high_end, low_end)
             falls = values[active] - self._step.expected(basis, x, ends)
             sags = self._sags(self._bent[bent], self._places[bent])
-            rows = [
-                Rows.of(falls, 0.0, -1.0),
-                Rows.of(values, 1.0),
-                Rows.of(basis.values(self._unsafe), 0.0),
-                Rows.of(sags, -self._slack(self._bent[bent])),
+            claims = [
+                LinearClaims.of(falls, 0.0, -1.0),
+                LinearClaims.of(values, 1.0),
+                LinearClaims.of(basis.values(self._unsafe), 0.0),
+                LinearClaims.of(sags, -self._slack(self._bent[bent])),
             ]
             weights = self._starts[counted].sum(axis=0) / len(self._starts)
-            found = solve_rows(rows, np.append(-weights, self._steps * counted.mean()))
+            found = solve_claims(claims, np.append(-weights, self._steps * counted.mean()))
             if found is None:
                 break
             c, m, program = found
@@ -235,7 +239,7 @@ class _Programs:
             ]
             raised[some] = at_ends[1] > at_ends[0]
             counted = self._starts @ c - m * self._steps > 0.0
-            if not counted.any() or n == 1:
+            if not counted.any():
                 break
         return best
 
