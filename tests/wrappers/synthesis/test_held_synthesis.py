@@ -15,7 +15,7 @@ from safe_envs.wrappers.certificates.statements import plant_of
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
 from safe_envs.wrappers.synthesis.certify import Named
 from safe_envs.wrappers.synthesis.domain import Domain
-from safe_envs.wrappers.synthesis.held_program import SampledStep
+from safe_envs.wrappers.synthesis.held_samples import SampledStep
 from safe_envs.wrappers.synthesis.held_synthesis import certify_held
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.verification.held_check import check_held
