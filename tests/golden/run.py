@@ -37,6 +37,7 @@ from cases import SYSTEMS, cases  # noqa: E402
 from environments import rows  # noqa: E402
 
 from safe_envs.scripts.cli import main as safe_envs_main  # noqa: E402
+from safe_envs.user_cache import VARIABLE  # noqa: E402
 
 ROWS = Path(__file__).parent / "rows"
 _TOLERANCE = 1e-9
@@ -257,9 +258,12 @@ def main() -> int:
         return 2
     wrong = 0
     with (
+        # Tables that the user has at hand would be read.
+        tempfile.TemporaryDirectory() as cache,
+        mock.patch.dict(os.environ, {VARIABLE: cache}),
         ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn"))
         if given.jobs > 1
-        else contextlib.nullcontext() as pool
+        else contextlib.nullcontext() as pool,
     ):
         answers = pool.map(_timed, chosen) if pool else map(_timed, chosen)
         for name, (found, seconds) in zip(chosen, answers, strict=True):

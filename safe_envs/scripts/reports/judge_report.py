@@ -11,7 +11,7 @@ from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.quantities import state_text
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
-from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.judge import JudgeResult
 
 _COLORS = {"proved": "green", "refuted": "red", "undecided": "yellow"}
 
@@ -41,7 +41,7 @@ def print_statements(console: Console, answer: VerifyAnswer) -> None:
         )
 
 
-def _why(problem: SafetyProblem, verdict: Verdict) -> str:
+def _why(problem: SafetyProblem, verdict: JudgeResult) -> str:
     if verdict.word == "refuted" and verdict.state is not None and len(verdict.state):
         return f"fails at {state_text(problem, verdict.state)}"
     if verdict.word == "undecided" and verdict.box is not None:

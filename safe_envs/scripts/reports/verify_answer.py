@@ -15,7 +15,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
 from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
-from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.judge import JudgeResult
 from safe_envs.wrappers.verification.results import Bound
 
 
@@ -44,7 +44,7 @@ class VerifyAnswer:
     chain: SafetyChain
 
     @property
-    def statements(self) -> list[tuple[str, Verdict]]:
+    def statements(self) -> list[tuple[str, JudgeResult]]:
         """All that a bound asks for, with the judge's word; none without an invariant set."""
         if self.verification.invariant_set is None:
             return []

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_envs.wrappers.verification.bisection import axis_of, middle_of
-from safe_envs.wrappers.verification.statement import Enclosures, Statement
+from safe_envs.wrappers.verification.statements import Enclosures, Statement
 
 _BATCH = 4096
 _TRIED = 128

@@ -17,7 +17,7 @@ from safe_envs.wrappers.conditions import Certified, Condition
 from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.certificate_statements import judged
-from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.judge import JudgeResult
 from safe_envs.wrappers.verification.results import Bound, Status
 
 _BUDGET = Budget(boxes=2_000_000, seconds=120.0)
@@ -39,7 +39,7 @@ class CertificateGuarantee:
     remark = ""
 
     @cached_property
-    def statements(self) -> list[tuple[str, Verdict]]:
+    def statements(self) -> list[tuple[str, JudgeResult]]:
         """The statements of the certificate, with the judge's word."""
         return [] if self.certificate is None else judged(self.certificate, _BUDGET)
 

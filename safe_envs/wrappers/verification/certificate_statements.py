@@ -18,8 +18,8 @@ from safe_envs.dynamics.tables import tabulated
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.input_terms import largest_input_term, not_polynomial
-from safe_envs.wrappers.verification.judge import Verdict, judge
-from safe_envs.wrappers.verification.statement import PolynomialPart, Statement, Witness
+from safe_envs.wrappers.verification.judge import JudgeResult, judge
+from safe_envs.wrappers.verification.statements import PolynomialPart, Statement, Witness
 
 _DIGITS = 9
 
@@ -198,7 +198,7 @@ def _order(n: int, *states: int) -> tuple[int, ...]:
 
 def judged(
     certificate: BarrierCertificate, budget: Budget | None = None
-) -> list[tuple[str, Verdict]]:
+) -> list[tuple[str, JudgeResult]]:
     """Judge the statements of a certificate.
 
     Args:
@@ -211,7 +211,7 @@ def judged(
     name = "a >= 0, m >= 0 and c > 0"
     if min(certificate.rate, certificate.shortfall) < 0 or certificate.supremum <= 0:
         # With a < 0 an end of the episode, at the edge of the workspace, would be worth too much.
-        return [(name, Verdict("refuted", 0, reason=f"not {name}"))]
+        return [(name, JudgeResult("refuted", 0, reason=f"not {name}"))]
     parts = CertificateStatements(certificate.plant, certificate.psi, certificate.rate)
     c, m = sp.Rational(certificate.supremum), sp.Rational(certificate.shortfall)
     statements = [

@@ -20,7 +20,7 @@ from safe_envs.wrappers.verification.assumptions import (
     unbounded,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.judge import JudgeResult
 from safe_envs.wrappers.verification.proof import ChainProof
 from safe_envs.wrappers.verification.results import (
     Bound,
@@ -66,7 +66,7 @@ class ChainGuarantee:
         return ChainProof(self.formulas, self.analysis.suprema.tolist(), shortfall, state[None])
 
     @property
-    def statements(self) -> list[tuple[str, Verdict]]:
+    def statements(self) -> list[tuple[str, JudgeResult]]:
         """The hypotheses with the judge's word; none where no theorem applies."""
         return (
             []

@@ -58,8 +58,8 @@ from safe_envs.wrappers.certificates.certificate import Plant
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.certificate_statements import rounded_up
 from safe_envs.wrappers.verification.held_statements import HeldStatements
-from safe_envs.wrappers.verification.judge import Supremum, Verdict, judge, supremum
-from safe_envs.wrappers.verification.statement import Statement
+from safe_envs.wrappers.verification.judge import JudgeResult, Supremum, judge, supremum
+from safe_envs.wrappers.verification.statements import Statement
 
 _POWERS = (1.5, 2.0, 4.0, 8.0, 16.0, 32.0)
 _LARGE = 700.0
@@ -120,7 +120,7 @@ class HeldBound:
         left = self.psi.values(starts) - _ROUNDING - steps * self.loss
         return np.where(inside, np.clip(left / float(self.supremum), 0.0, 1.0), 0.0)
 
-    def judged(self, budget: Budget | None = None) -> list[tuple[str, Verdict]]:
+    def judged(self, budget: Budget | None = None) -> list[tuple[str, JudgeResult]]:
         """Judge the statements of the bound again.
 
         Args:
@@ -130,7 +130,7 @@ class HeldBound:
             The name and the verdict of each; the bound is proved where all are.
         """
         if min(self.shortfall, self.sag, self.tail) < 0 or self.supremum <= 0 or self.period <= 0:
-            return [(_SIGNS, Verdict("refuted", 0, reason=f"not {_SIGNS}"))]
+            return [(_SIGNS, JudgeResult("refuted", 0, reason=f"not {_SIGNS}"))]
         parts = HeldStatements(self.plant, self.psi, self.period)
         top = parts.region("psi <= c", sp.Rational(self.supremum) - parts.value)
         numbers = [self.shortfall, self.sag]
@@ -143,13 +143,13 @@ class HeldBound:
         found = [(statement.name, judge(statement, budget)) for statement in statements]
         return [*found, (_LEAVES, self._judged_tail(parts, budget or Budget()))]
 
-    def _judged_tail(self, parts: HeldStatements, budget: Budget) -> Verdict:
+    def _judged_tail(self, parts: HeldStatements, budget: Budget) -> JudgeResult:
         work = _Numbers(budget, self)
         found = _tail(parts, work)
         if work.reason or found > float(self.tail):
             reason = work.reason or f"it is at most {found:.3g}, and not at most e"
-            return Verdict("undecided", work.boxes, reason=reason)
-        return Verdict("proved", work.boxes)
+            return JudgeResult("undecided", work.boxes, reason=reason)
+        return JudgeResult("proved", work.boxes)
 
 
 def prove_held_bound(

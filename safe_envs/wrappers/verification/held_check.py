@@ -17,7 +17,7 @@ from safe_envs.wrappers.certificates.check_result import (
 )
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.held_bound import HeldBound
-from safe_envs.wrappers.verification.judge import Verdict
+from safe_envs.wrappers.verification.judge import JudgeResult
 
 _BUDGET = Budget(seconds=60.0)
 
@@ -106,7 +106,7 @@ def why_not_proved(certificate: HeldCertificate) -> str:
 _KNOWN: dict[str, str] = {}
 
 
-def _check_of(name: str, verdict: Verdict) -> StatementCheck:
+def _check_of(name: str, verdict: JudgeResult) -> StatementCheck:
     state = verdict.state
     if state is None and verdict.box is not None:
         state = verdict.box.mean(axis=0)

@@ -16,7 +16,7 @@ from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.wrappers.certificates.certificate import Plant
 from safe_envs.wrappers.certificates.gaussian_moments import Order
 from safe_envs.wrappers.certificates.held_step import HeldStep
-from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
+from safe_envs.wrappers.verification.statements import PolynomialPart, Statement
 
 _NEAR = 0.05
 """Distance from the edge of C, in half widths of B, within which the slope of psi is of use."""

@@ -17,12 +17,12 @@ import sympy as sp
 
 from safe_envs.errors import SystemDefinitionError
 from safe_envs.wrappers.verification.branch_and_bound import BranchAndBound, Budget
-from safe_envs.wrappers.verification.statement import Statement
+from safe_envs.wrappers.verification.statements import Statement
 
 Word = Literal["proved", "refuted", "undecided"]
 
 
-class Verdict(NamedTuple):
+class JudgeResult(NamedTuple):
     """What is known of a statement.
 
     Attributes:
@@ -60,7 +60,7 @@ class Supremum(NamedTuple):
 
 def judge(
     statement: Statement, budget: Budget | None = None, hints: np.ndarray | None = None
-) -> Verdict:
+) -> JudgeResult:
     """Decide a statement.
 
     Args:
@@ -75,7 +75,7 @@ def judge(
     try:
         search = BranchAndBound(statement, budget, target=0.0)
     except SystemDefinitionError as error:
-        return Verdict("undecided", 0, reason=str(error))
+        return JudgeResult("undecided", 0, reason=str(error))
     if hints is not None and search.tried(np.asarray(hints, dtype=float).T):
         return _refuted(statement, search)
     while search.open_boxes:
@@ -83,8 +83,8 @@ def judge(
         if search.best > 0.0:
             return _refuted(statement, search)
         if reason:
-            return Verdict("undecided", search.boxes, box=search.widest_open, reason=reason)
-    return Verdict("proved", search.boxes)
+            return JudgeResult("undecided", search.boxes, box=search.widest_open, reason=reason)
+    return JudgeResult("proved", search.boxes)
 
 
 def supremum(
@@ -120,9 +120,9 @@ def supremum(
     return Supremum(search.upper, search.best, search.best_state, search.boxes, reason)
 
 
-def _refuted(statement: Statement, search: BranchAndBound) -> Verdict:
+def _refuted(statement: Statement, search: BranchAndBound) -> JudgeResult:
     state = search.best_state if search.best_state is not None else np.zeros(0)
     values = zip(statement.states, state.tolist(), strict=True)
     at = ", ".join(f"{s} = {value:.6g}" for s, value in values)
     reason = f"{statement.name} fails at {at}, by {search.best:.3g}"
-    return Verdict("refuted", search.boxes, state=state, reason=reason)
+    return JudgeResult("refuted", search.boxes, state=state, reason=reason)

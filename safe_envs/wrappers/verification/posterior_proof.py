@@ -15,7 +15,7 @@ from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.input_terms import exact_number
 from safe_envs.wrappers.verification.judge import judge, supremum
-from safe_envs.wrappers.verification.statement import Statement
+from safe_envs.wrappers.verification.statements import Statement
 
 _BUDGET = Budget(boxes=300_000, seconds=60.0)
 _RELATIVE, _SMALL = 1e-2, 1e-4

@@ -20,8 +20,8 @@ from safe_envs.wrappers.verification.input_terms import (
     largest_input_term,
     not_polynomial,
 )
-from safe_envs.wrappers.verification.judge import Verdict, Word, judge, supremum
-from safe_envs.wrappers.verification.statement import Statement
+from safe_envs.wrappers.verification.judge import JudgeResult, Word, judge, supremum
+from safe_envs.wrappers.verification.statements import Statement
 
 BUDGET = Budget(boxes=300_000, seconds=60.0)
 """Of each statement of a bound: a second or two, so that an evaluation does not wait for it, and
@@ -44,7 +44,7 @@ class JudgedNumber(NamedTuple):
 
     name: str
     value: float
-    verdict: Verdict
+    verdict: JudgeResult
 
 
 class ChainProof:
@@ -90,11 +90,11 @@ class ChainProof:
         return replace(self._budget, boxes=round(_QUICK * self._budget.boxes))
 
     @cached_property
-    def bounded(self) -> Verdict:
+    def bounded(self) -> JudgeResult:
         """Whether G is bounded."""
         ends = [np.array(end, dtype=float) for end in zip(*self._region.box, strict=True)]
         open_ = [i for i in range(len(ends[0])) if np.isinf([ends[0][i], ends[1][i]]).any()]
-        verdict = Verdict("proved", 0)
+        verdict = JudgeResult("proved", 0)
         for i in open_:
             for width in _WIDTHS:
                 verdict = self._empty_beyond(i, width)
@@ -104,9 +104,9 @@ class ChainProof:
                 return verdict
         return verdict
 
-    def _empty_beyond(self, i: int, width: float) -> Verdict:
+    def _empty_beyond(self, i: int, width: float) -> JudgeResult:
         """Judge whether G has no state where x_i is beyond a number."""
-        verdict = Verdict("proved", 0)
+        verdict = JudgeResult("proved", 0)
         for side in (-1, 1):
             beyond = (width, sp.oo) if side > 0 else (-sp.oo, -width)
             low, high = self._region.box[i]
@@ -119,18 +119,18 @@ class ChainProof:
             )
             if verdict.word != "proved":
                 reason = f"{name} is not established"
-                return Verdict("undecided", verdict.boxes, box=verdict.box, reason=reason)
+                return JudgeResult("undecided", verdict.boxes, box=verdict.box, reason=reason)
         return verdict
 
     @cached_property
-    def smooth(self) -> Verdict:
+    def smooth(self) -> JudgeResult:
         """Whether all b_j are twice continuously differentiable on G."""
         return judge(
             replace(self._region, name="the barrier on G", smooth=self._chain), self._budget
         )
 
     @cached_property
-    def continuous(self) -> Verdict:
+    def continuous(self) -> JudgeResult:
         """Whether f, g and sigma are continuous on G."""
         system = self._formulas.system
         entries = [
@@ -162,9 +162,9 @@ class ChainProof:
         )
         upper = max(result.upper, 0.0) if not math.isnan(result.upper) else math.inf
         if math.isfinite(upper):
-            return JudgedNumber(name, upper, Verdict("proved", result.boxes))
+            return JudgedNumber(name, upper, JudgeResult("proved", result.boxes))
         reason = result.reason or f"{name} is infinite"
-        return JudgedNumber(name, math.inf, Verdict("undecided", result.boxes, reason=reason))
+        return JudgedNumber(name, math.inf, JudgeResult("undecided", result.boxes, reason=reason))
 
     @property
     def _negligible(self) -> float:
@@ -173,11 +173,11 @@ class ChainProof:
         return _SMALL * size / self._formulas.problem.duration
 
     @cached_property
-    def feasible(self) -> Verdict:
+    def feasible(self) -> JudgeResult:
         """Whether some input within the bounds meets all conditions everywhere on G."""
         rows = self._rows
         if isinstance(rows, str):
-            return Verdict("undecided", 0, reason=rows)
+            return JudgeResult("undecided", 0, reason=rows)
         name = "the condition can be met everywhere on G"
         if self._formulas.independent:
             best = sp.Min(*[self._best(row) for row in rows])
@@ -201,7 +201,7 @@ class ChainProof:
             return verdict
         # The input that fails is one of many.
         reason = f"no input was found that meets all conditions: {verdict.reason}"
-        return Verdict("undecided", verdict.boxes, box=verdict.box, reason=reason)
+        return JudgeResult("undecided", verdict.boxes, box=verdict.box, reason=reason)
 
     @cached_property
     def shortfall(self) -> JudgedNumber:
@@ -211,9 +211,9 @@ class ChainProof:
             return JudgedNumber(name, 0.0, self.feasible)
         rows = self._rows
         if isinstance(rows, str):
-            return JudgedNumber(name, math.inf, Verdict("undecided", 0, reason=rows))
+            return JudgedNumber(name, math.inf, JudgeResult("undecided", 0, reason=rows))
         if not self._formulas.independent:
-            return JudgedNumber(name, math.inf, Verdict("undecided", 0, reason=JOINT))
+            return JudgedNumber(name, math.inf, JudgeResult("undecided", 0, reason=JOINT))
         worst = sp.Max(*[-self._best(row) for row in rows])
         return self._number(name, worst, self._lack)
 
@@ -250,7 +250,7 @@ class ChainProof:
         return np.nan_to_num(found.action)
 
     @property
-    def statements(self) -> list[tuple[str, Verdict]]:
+    def statements(self) -> list[tuple[str, JudgeResult]]:
         """All that a bound asks for, with the judge's word."""
         certain = self._formulas.certain
         found = [

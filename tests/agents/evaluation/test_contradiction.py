@@ -20,7 +20,7 @@ from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.verification import proof, safe_set_analysis
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.judge import Supremum, Verdict
+from safe_envs.wrappers.verification.judge import JudgeResult, Supremum
 from tests.oracles import false_bounds
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
@@ -66,7 +66,7 @@ def credulous(monkeypatch):
 @pytest.fixture
 def undecided(monkeypatch):
     """A judge that decides nothing but that C is bounded."""
-    verdict = Verdict("undecided", 0, reason="not looked at")
+    verdict = JudgeResult("undecided", 0, reason="not looked at")
     monkeypatch.setattr(proof, "judge", lambda *_: verdict)
     monkeypatch.setattr(
         proof, "supremum", lambda *_: Supremum(math.inf, -math.inf, None, 0, "not looked at")

@@ -16,7 +16,7 @@ from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plan
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.certificate_statements import judged
 from safe_envs.wrappers.verification.judge import judge, supremum
-from safe_envs.wrappers.verification.statement import PolynomialPart, Statement
+from safe_envs.wrappers.verification.statements import PolynomialPart, Statement
 
 x, y, z, u = sp.symbols("x y z u", real=True)
 R = sp.Rational
