@@ -45,6 +45,8 @@ def test_held_input(safe_envs_command):
     assert found["degrees"][0]["proved"] > 0.7
     status, out, _ = safe_envs_command("certify", *held, "--start", 1, "--json", "-")
     assert (status, json.loads(out)["proved"]) == (1, None)
+    status, out, _ = safe_envs_command("certify", *held, "--start", 1)
+    assert (status, "no barrier of degree 4" in out) == (1, True)
 
 
 def test_the_nominal_controller_alone(safe_envs_command):

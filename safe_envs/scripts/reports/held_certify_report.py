@@ -74,7 +74,7 @@ class HeldCertifyAnswer:
             table.add_row(
                 str(a.degree),
                 str(a.members),
-                percent(a.program),
+                percent(None if a.program is None else max(0.0, a.program)),
                 percent(None if a.program is None else a.sampled),
                 "-" if b is None else "undecided" if b.reason else percent(a.proved),
                 f"{b.boxes:,}" if b else "-",
@@ -91,6 +91,12 @@ class HeldCertifyAnswer:
             for a in found.attempts
             if a.bound is not None and a.bound.reason
         ]
+        none = [str(a.degree) for a in found.attempts if a.sampled <= 0.0]
+        if none:
+            notes.append(
+                f"Note: no barrier of degree {', '.join(none)} has a bound above 0 at the sampled"
+                " states. That says nothing of other degrees, or of other functions."
+            )
         if c is None:
             return ["No bound above 0 is proved.", *notes]
         margin = "" if found.starts == 1 else f" - {100 * found.margin:.2g} %"
