@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +18,8 @@ from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
+    from safe_envs.wrappers.synthesis.certify import Named
+    from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 
 
 @with_env
@@ -35,6 +38,12 @@ def certify(
             " psi's constraint.",
         ),
     ] = "",
+    held: Annotated[
+        bool,
+        typer.Option(
+            "--held", help="A bound for the env's own steps, with an input held for each of them."
+        ),
+    ] = False,
     rates: Annotated[
         list[float] | None,
         typer.Option("--rate", metavar="A", help="a of the bound in 1/s, at least 0. Repeatable."),
@@ -60,6 +69,9 @@ def certify(
     holds for every policy whose input meets psi's constraint, which a filter ensures; all of it
     counts leaving the workspace in the safe set as safe.
 
+    With --held the bound is of the env's own steps, with one input that is held for a control
+    period, and leaving the workspace counts as a violation.
+
     The exit status is 1 where no bound above 0 is proved.
     """
     from safe_envs.registry import make_problem, title_of
@@ -73,6 +85,11 @@ def certify(
     from safe_envs.wrappers.synthesis.certify import certify as find
     from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 
+    if held and (policy or rates):
+        raise ConfigurationError(
+            "--held is for every policy under psi's constraint and has no a: leave --policy and"
+            " --rate out, or --held"
+        )
     require_whole("seed", seed, 0)
     require_result(json)
     text_options.require_outputs(json, None, inputs=text_options.inputs_of(env.system))
@@ -91,6 +108,10 @@ def certify(
     if policy:
         _require_formula(policy, problem)
     named = Named(problem, known if env.system is None else "", arguments)
+    if held:
+        config = {"env_id": known, "options": arguments, "held": True, "seed": seed}
+        _certify_held(named, settings, _HeldOutput(title_of(known, arguments), config, out, json))
+        return
     with progress_bar("Searching") as tell:
         found = find(named, settings, bool(policy), tell)
     config = {"env_id": known, "options": arguments, "policy": policy or None, "seed": seed}
@@ -100,6 +121,41 @@ def certify(
         save_certificate(found.certificate, out)
     print_certification(stdout(), answer)
     write_result(json, answer.document)
+    if found.certificate is None:
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
+@dataclass(frozen=True)
+class _HeldOutput:
+    """Where the answer about held input goes.
+
+    Attributes:
+        title: of the env.
+        config: what was asked for, as JSON.
+        out: file of the certificate.
+        json: file of all that was found.
+    """
+
+    title: str
+    config: dict[str, Any]
+    out: Path | None
+    json: Path | None
+
+
+def _certify_held(named: Named, settings: SynthesisSettings, output: _HeldOutput) -> None:
+    """Look for a certificate of held input, prove it, print and write it."""
+    from safe_envs.scripts.reports.held_certify_report import HeldCertifyAnswer
+    from safe_envs.wrappers.certificates.files import save_certificate
+    from safe_envs.wrappers.synthesis.held_synthesis import certify_held
+
+    with progress_bar("Searching") as tell:
+        found = certify_held(named, settings, tell)
+    answer = HeldCertifyAnswer(output.title, output.config, named.problem, found, output.out)
+    if found.certificate is not None and output.out is not None:
+        save_certificate(found.certificate, output.out)
+    answer.print_on(stdout())
+    write_result(output.json, answer.document)
     if found.certificate is None:
         sys.stdout.flush()
         raise SystemExit(1)

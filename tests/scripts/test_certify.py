@@ -34,6 +34,21 @@ def test_it_prints_the_bound_and_writes_what_check_accepts(safe_envs_command):
     assert (status, "checked:" in out) == (0, True)
 
 
+def test_held_input(safe_envs_command):
+    held = ("safe_envs/Scalar-v0", "--held", "--degree", 4, "--horizon", 0.2)
+    files = ("--out", "held.json", "--json", "all.json")
+    status, out, _ = safe_envs_command("certify", *held, *files)
+    assert status == 0
+    assert "in the workspace for 20 steps of 0.01 s" in out
+    certificate, found = load_certificate("held.json"), strictly("all.json")
+    assert float(certificate.sag) == found["sag"]
+    assert found["degrees"][0]["proved"] > 0.7
+    status, out, _ = safe_envs_command("certify", *held, "--start", 1, "--json", "-")
+    assert (status, json.loads(out)["proved"]) == (1, None)
+    status, out, _ = safe_envs_command("certify", *held, "--start", 1)
+    assert (status, "no barrier of degree 4" in out) == (1, True)
+
+
 def test_the_nominal_controller_alone(safe_envs_command):
     status, out, _ = safe_envs_command("certify", *SCALAR[:-1], 0.2, "--policy", "nominal")
     assert status == 0
@@ -57,6 +72,9 @@ def test_what_is_not_found_is_said(safe_envs_command):
         (("--degree", 0), "degree = 0"),
         (("--degree", 6, "--rate", -1), "does not hold for a negative one"),
         (("--degree", 6, "--policy", "nobody"), "nobody"),
+        (("--held", "--policy", "nominal"), "leave --policy"),
+        (("--held", "--rate", 0), "--rate out"),
+        (("--held", "--substeps", 2), "substeps = 2"),
         (("--degree", 6, "--policy", "random"), "has no formula"),
         (("--degree", 6, "--out", "a.json", "--json", "a.json"), "give two files"),
         (("--degree", 6, "--seed", -1), "seed"),

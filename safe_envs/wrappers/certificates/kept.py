@@ -56,8 +56,8 @@ def kept_certificate(problem: SafetyProblem, control: Control = "continuous") ->
     if control == "held":
         raise ConfigurationError(
             "filter 'certified' needs a certificate of held input, and this package has none of"
-            f" this problem: {reason}. Prove one with `prove_held_bound`, as the guide of"
-            " `safe-envs certify` shows, and give certified:file=psi.json"
+            f" this problem: {reason}. Run `safe-envs certify ENV_ID --held --out psi.json` with"
+            " the options of this env, and give certified:file=psi.json"
         )
     raise ConfigurationError(
         f"filter 'certified' needs a certificate, and this package has none of this problem:"
