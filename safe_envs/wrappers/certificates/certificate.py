@@ -126,7 +126,7 @@ class HeldCertificate(Certificate):
     """In the env's own steps of held input, P(safe for K periods) >= (psi(x_0) - K (m + s + e))/c.
 
     Safe is who is in C and in the workspace at the start and after each period. The theorem and
-    what has to be checked are in `safe_envs.wrappers.verification.held_bound`.
+    what has to be checked are in `HeldBound`.
 
     Attributes:
         env_id: see `Certificate`.
