@@ -179,7 +179,8 @@ def test_json_holds_all_of_it(verify, tmp_path):
     assert [h["time"] for h in measured["horizons"]] == [1.0, 2.0, 5.0, 10.0, 20.0]
     assert list(measured) == ["start", "state", "episodes", "repeats", "horizons"]
     words = {each["statement"]: each["word"] for each in document["statements"]}
-    assert words["G is bounded"] == words["sup h <= 1000"] == "proved"
+    # The upper bound is shown rounded up: what is printed is what is proved.
+    assert words["G is bounded"] == words["sup h <= 1000.01"] == "proved"
     assert words["the condition can be met everywhere on G"] == "refuted"
     (refuted,) = [each for each in document["statements"] if each["word"] == "refuted"]
     assert list(refuted) == ["statement", "word", "boxes", "state", "box", "reason"]

@@ -223,7 +223,12 @@ def judged(
     return [(statement.name, judge(statement, budget)) for statement in statements]
 
 
-def rounded_up(value: float) -> Fraction:
-    """Return a decimal of few digits that is not below a number."""
-    step = Fraction(10) ** (math.floor(math.log10(abs(value))) + 1 - _DIGITS) if value else 1
+def rounded_up(value: float, digits: int = _DIGITS) -> Fraction:
+    """Return a decimal of few digits that is not below a number.
+
+    Args:
+        value: finite.
+        digits: that count.
+    """
+    step = Fraction(10) ** (math.floor(math.log10(abs(value))) + 1 - digits) if value else 1
     return Fraction(math.ceil(Fraction(value) / step)) * step

@@ -14,6 +14,7 @@ import sympy as sp
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.verification.assumptions import JOINT
 from safe_envs.wrappers.verification.branch_and_bound import Budget
+from safe_envs.wrappers.verification.certificate_statements import rounded_up
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.input_terms import (
     exact_number,
@@ -30,6 +31,7 @@ counted in boxes, so that its numbers do not depend on the machine."""
 _RELATIVE = 1e-3
 _SMALL = 1e-7
 _QUICK = 0.3
+_SHOWN = 6
 _WIDTHS = (1e1, 1e2, 1e4, 1e6)
 
 
@@ -259,11 +261,11 @@ class ChainProof:
             ("the barrier is twice differentiable on G", self.smooth),
         ]
         if not certain:
-            found += [(f"{n.name} <= {n.value:.6g}", n.verdict) for n in self.suprema]
+            found += [(f"{n.name} <= {_shown(n.value)}", n.verdict) for n in self.suprema]
         found.append(("the condition can be met everywhere on G", self.feasible))
         if self.feasible.word != "proved":
             number = self.shortfall
-            amount = f" by at most {number.value:.6g}" * math.isfinite(number.value)
+            amount = f" by at most {_shown(number.value)}" * math.isfinite(number.value)
             found.append((f"the best input violates it{amount}", number.verdict))
         return found
 
@@ -282,3 +284,8 @@ class ChainProof:
                 if verdict.word == word:
                     return word, verdict.reason
         return "proved", ""
+
+
+def _shown(value: float) -> str:
+    """Return a proved upper bound in few digits, not below it."""
+    return f"{float(rounded_up(value, _SHOWN)) if math.isfinite(value) else value:.{_SHOWN}g}"
