@@ -8,7 +8,7 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError, SystemDefinitionError
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, shown
 from safe_envs.number_text import finite_number
 
 TIME = sp.Symbol("t", nonnegative=True)
@@ -51,7 +51,7 @@ def formula(what: str, given: Any) -> sp.Expr:
         else type(given).__name__
     )
     raise SystemDefinitionError(
-        f"{what} is {kind}, {given!r}; give a sympy expression of the symbols of the system, like 1"
+        f"{what} is {kind}, {shown(given)}; give a sympy expression of the symbols of the system, like 1"
         " - x**2"
     )
 

@@ -12,7 +12,7 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Flavour, compile_function, finite, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, InvalidInputError, nearest
+from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.spec_text import Conditions, conditions_for
@@ -141,12 +141,8 @@ class SafetyFilter(ComponentFilter):
                 problem has no clf.
         """
         arguments.require_problem(problem)
-        for name, given, allowed in (
-            ("knowledge", knowledge, ("model", "plant")),
-            ("objective", objective, ("nearest", "clf")),
-        ):
-            if given not in allowed:
-                raise ConfigurationError(f"{name} = {given!r}; {nearest(str(given), allowed)}")
+        arguments.require_word("knowledge", knowledge, ("model", "plant"))
+        arguments.require_word("objective", objective, ("nearest", "clf"))
         if objective == "clf" and problem.clf is None:
             raise ConfigurationError(
                 f"objective = 'clf', but {problem.name} has no control Lyapunov function; use"

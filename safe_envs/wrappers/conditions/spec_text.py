@@ -76,8 +76,8 @@ def conditions_for(problem: SafetyProblem, given: Conditions) -> tuple[Condition
     each = (read,) * count if isinstance(read, Condition) else read
     if not isinstance(each, Sequence) or not all(isinstance(c, Condition) for c in each):
         raise ConfigurationError(
-            f"condition = {given!r}; give a Condition, one for each barrier, or their text, like"
-            " 'scbf'"
+            f"condition = {shown(given)}; give a Condition, one for each barrier, or their text,"
+            " like 'scbf'"
         )
     if len(each) != count:
         raise ConfigurationError(

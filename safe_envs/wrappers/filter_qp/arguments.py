@@ -67,6 +67,18 @@ def require_problem(given: Any) -> SafetyProblem:
     )
 
 
+def require_word(name: str, given: Any, allowed: Sequence[str]) -> None:
+    """Raise ConfigurationError unless an argument is one of a few words.
+
+    Args:
+        name: of the argument.
+        given: as users give it.
+        allowed: words.
+    """
+    if not isinstance(given, str) or given not in allowed:
+        raise ConfigurationError(f"{name} = {shown(given)}; {nearest(str(given), allowed)}")
+
+
 def with_adjustable(system: ControlAffineSDE, adjustable: Any) -> ControlAffineSDE:
     """Return a system with some of its parameters as signals that do not change by themselves.
 
@@ -77,7 +89,7 @@ def with_adjustable(system: ControlAffineSDE, adjustable: Any) -> ControlAffineS
     Raises:
         ConfigurationError: One is no parameter, or more than the sign of its symbol is declared.
     """
-    several = isinstance(adjustable, Iterable) and not isinstance(adjustable, str)
+    several = isinstance(adjustable, list | tuple | set | frozenset)
     by_name = {p.name: p for p in system.parameters}
     chosen: dict[sp.Symbol, int] = {}
     for given in adjustable if several else [adjustable]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import math
@@ -76,6 +77,11 @@ class CompiledQP:
     def compile(self) -> None:
         """Compile all functions that a decision may call; else each is at its first call."""
         _ = self._values, self._demands, self._changes, self.planes
+        zero = np.zeros(1) if self._flavour == "arrays" else 0.0
+        for term in self._terms:
+            # Learned terms compile themselves when they are first read, wherever that is.
+            with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
+                term((zero,) * self._qp.model.n)
 
     @cached_property
     def planes(self) -> dict[int, tuple[list[Any], Any]]:

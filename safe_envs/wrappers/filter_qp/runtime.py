@@ -105,10 +105,8 @@ class RuntimeArguments:
             InvalidInputError: A value is no finite number, or not of the declared sign.
         """
         found = self._start.copy()
-        if parameters:
+        if parameters is not None:
             self._read(parameters, found, batch)
-        elif parameters is not None and not isinstance(parameters, Mapping):
-            raise _no_mapping(parameters)
         if None in found if batch is None else any(value is None for value in found):
             raise self._missing(found)
         if self._timed:
@@ -132,7 +130,10 @@ class RuntimeArguments:
 
     def _read(self, parameters: Any, found: list[Any], batch: tuple[int, ...] | None) -> None:
         if not isinstance(parameters, Mapping):
-            raise _no_mapping(parameters)
+            raise ConfigurationError(
+                f"parameters = {shown(parameters)}; give a dict of values by name, such as"
+                " {'mass': 1.2}"
+            )
         seen = 0
         for key, value in parameters.items():
             place = self._place.get(key.name if isinstance(key, sp.Symbol) else key)
@@ -183,6 +184,8 @@ class RuntimeArguments:
             ConfigurationError: A bound is infinite, and the filter needs finite ones.
         """
         m = len(self._inputs)
+        if type(given) is tuple and len(given) == 2 and _is_interval(*given):
+            return [float(given[0])] * m, [float(given[1])] * m
         pairs = real_array("bounds", given).astype(np.float64, copy=False)
         if pairs.shape == (2,):
             pairs = np.broadcast_to(pairs, (m, 2))
@@ -211,6 +214,12 @@ class RuntimeArguments:
                 require_ends(symbol, low, high, self._endless)
 
 
+def _is_interval(low: Any, high: Any) -> bool:
+    """Return whether two Python numbers are the ends of a finite interval, which is the rule."""
+    numbers = type(low) in (float, int) and type(high) in (float, int)
+    return numbers and -WIDEST <= low <= high <= WIDEST
+
+
 def _number(what: str, given: Any, batch: tuple[int, ...] | None) -> Any:
     """Return a finite number as a float, or several of a batch as an array (B,)."""
     found = real_array(what, given)
@@ -220,9 +229,3 @@ def _number(what: str, given: Any, batch: tuple[int, ...] | None) -> Any:
     if not np.isfinite(found).all():
         raise InvalidInputError(f"{what} = {shown(given)}; give finite numbers")
     return float(found) if found.ndim == 0 else found.astype(np.float64).reshape(-1)
-
-
-def _no_mapping(given: Any) -> ConfigurationError:
-    return ConfigurationError(
-        f"parameters = {shown(given)}; give a dict of values by name, such as {{'mass': 1.2}}"
-    )
