@@ -51,8 +51,8 @@ def formula(what: str, given: Any) -> sp.Expr:
         else type(given).__name__
     )
     raise SystemDefinitionError(
-        f"{what} is {kind}, {shown(given)}; give a sympy expression of the symbols of the system, like 1"
-        " - x**2"
+        f"{what} is {kind}, {shown(given)}; give a sympy expression of the symbols of the system,"
+        " like 1 - x**2"
     )
 
 

@@ -15,6 +15,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.conditions.spec_text import Conditions, conditions_for
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
@@ -80,7 +81,7 @@ class SafetyFilter(ComponentFilter):
         self,
         system: ControlAffineSDE,
         barriers: Any,
-        conditions: Conditions | None = None,
+        conditions: Conditions | Sequence[Condition | str] | None = None,
         bounds: Any = None,
         weights: Sequence[float] | None = None,
         *,

@@ -77,7 +77,7 @@ class CompiledQP:
     def compile(self) -> None:
         """Compile all functions that a decision may call; else each is at its first call."""
         _ = self._values, self._demands, self._changes, self.planes
-        zero = np.zeros(1) if self._flavour == "arrays" else 0.0
+        zero: Any = np.zeros(1) if self._flavour == "arrays" else 0.0
         for term in self._terms:
             # Learned terms compile themselves when they are first read, wherever that is.
             with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):

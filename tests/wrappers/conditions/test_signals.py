@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import sympy as sp
@@ -20,6 +21,7 @@ x, y, u, w, p, q, clock = sp.symbols("x y u w p q clock", real=True)
 mass = sp.Symbol("mass", positive=True)
 MEASURED = (x, y, p, q, TIME)
 FIRST = {"sampling_margin": "first-order"}
+ONE: Any = {TIME: clock, mass: sp.Symbol("mass", real=True)}
 
 
 def some(rng: random.Random, symbols: tuple[sp.Symbol, ...]) -> sp.Expr:
@@ -51,29 +53,27 @@ def random_system(seed: int, degree: int, *, noisy: bool) -> tuple[ControlAffine
 def as_states(system: ControlAffineSDE) -> ControlAffineSDE:
     """Return the system with its signals and the time as states with their rates."""
     extra, no_input = len(system.signals) + 1, [0] * system.m
-    one = {TIME: clock, mass: sp.Symbol("mass", real=True)}
     return ControlAffineSDE(
-        tuple(s.subs(one) for s in (*system.states, *system.signals, TIME)),
+        tuple(s.subs(ONE) for s in (*system.states, *system.signals, TIME)),
         system.inputs,
-        [sp.sympify(e).subs(one) for e in (*system.drift, *system.signals.values(), 1)],
-        [*system.input_matrix.subs(one).tolist(), *[no_input] * extra],
-        [*system.diffusion.subs(one).tolist(), *[[0] * system.diffusion.cols] * extra],
+        [sp.sympify(e).subs(ONE) for e in (*system.drift, *system.signals.values(), 1)],
+        [*system.input_matrix.subs(ONE).tolist(), *[no_input] * extra],
+        [*system.diffusion.subs(ONE).tolist(), *[[0] * system.diffusion.cols] * extra],
     )
 
 
 def assert_same(system: ControlAffineSDE, barrier: Barrier, condition: Condition) -> None:
-    one = {TIME: clock, mass: sp.Symbol("mass", real=True)}
     found = condition.constraint(system, barrier)
     expected = condition.constraint(
-        as_states(system), replace(barrier, expression=barrier.expression.subs(one))
+        as_states(system), replace(barrier, expression=barrier.expression.subs(ONE))
     )
     for name in ("coefficient", "chain"):
         pairs = zip(getattr(found, name), getattr(expected, name), strict=True)
-        assert all(is_zero(a.subs(one) - b) for a, b in pairs), name
+        assert all(is_zero(a.subs(ONE) - b) for a, b in pairs), name
     for name in ("offset", "demand", "change"):
         a, b = getattr(found, name), getattr(expected, name)
         assert (a is None) == (b is None), name
-        assert a is None or is_zero(a.subs(one) - b), name
+        assert a is None or is_zero(a.subs(ONE) - b), name
 
 
 @pytest.mark.parametrize("seed", range(4))

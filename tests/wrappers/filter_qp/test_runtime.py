@@ -39,7 +39,7 @@ BOUNDS = np.stack([LOW, LOW + np.random.default_rng(5).uniform(0.0, 4.0, (30, 2)
 EARLY = {"sampling_margin": "first-order"}
 
 
-def chased(**signals: object) -> ControlAffineSDE:
+def chased() -> ControlAffineSDE:
     """Two integrators in a wind, chased by something that moves along p at the speed q."""
     return ControlAffineSDE(
         (x, y),
@@ -48,14 +48,14 @@ def chased(**signals: object) -> ControlAffineSDE:
         [[gain, 0], [0, 1]],
         [[0.2], [0.1]],
         parameters={gain: 1.0, wind: 0.5},
-        signals=signals or {p: q, q: 0},
+        signals={p: q, q: 0},
     )
 
 
 def fixed(i: int) -> ControlAffineSDE:
     """The same at one instant: what moves has its values as numbers, and its rates in the drift."""
     return ControlAffineSDE(
-        (x, y, p, q, TIME.subs(TIME, sp.Symbol("clock", real=True))),
+        (x, y, p, q, sp.Symbol("clock", real=True)),
         (u, w),
         [0.5, 0, q, 0, 1],
         [[MOVING["gain"][i], 0], [0, 1], [0, 0], [0, 0], [0, 0]],
