@@ -31,7 +31,11 @@ class ComponentFilter:
         self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
         goal = int(qp.clf is not None)
         self._size = len(qp.constraints) + goal, qp.model.m + goal
-        self._single = len(qp.constraints) == 1 and qp.plain
+        single = len(qp.constraints) == 1 and qp.plain
+        self._solve_arrays = self._arrays.solve_single if single else self._arrays.solve
+        self._solve_floats = self._floats.solve_single if single else self._floats.solve
+        if qp.plain and not single and not any(c.uncertainty for c in qp.constraints):
+            self._solve_floats = self._floats.solve_plain
 
     def compile(self) -> None:
         """Import and compile all that any decision may need."""
@@ -56,8 +60,7 @@ class ComponentFilter:
             NumericalError: The constraint has no finite value.
         """
         try:
-            solve = self._floats.solve_single if self._single else self._floats.solve
-            found = solve(x, u, bounds)
+            found = self._solve_floats(x, u, bounds)
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, x) from error
         except NO_VALUE:
@@ -97,8 +100,7 @@ class ComponentFilter:
 
     def _decide(self, x: Components, u: Components, bounds: Bounds | None) -> FilterDecision:
         try:
-            solve = self._arrays.solve_single if self._single else self._arrays.solve
-            return solve(x, u, bounds)
+            return self._solve_arrays(x, u, bounds)
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, [float(c[error.index]) for c in x]) from error
 

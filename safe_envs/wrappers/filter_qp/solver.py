@@ -70,6 +70,26 @@ class FilterQPSolver(CompiledQP):
             u,
         )
 
+    def solve_plain(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Solve a plain QP without uncertainty for one state; see `solve`, which this shortens."""
+        low, high = bounds or self.bounds
+        values, m, width = self._values(*self._with_terms(x)), self._m, self._m + 1
+        self._require_finite(values)
+        a, b = [values[i : i + m] for i in range(0, len(values), width)], values[m::width]
+        action, margin, active, feasible = self._project(
+            a, b, u, low, high, self.weights, self._qp.priorities
+        )
+        self._require_finite((*action, *margin))
+        slack = [0.0] * len(b) if feasible else [max(-g, 0.0) for g in margin]
+        acting = active.count(True)
+        if acting == 1 and any(a[active.index(True)]):
+            cause = active.index(True)
+        else:
+            cause = self._cause(a, b, u, active, {}) if acting else -1
+        return FilterDecision(action, margin, active, feasible, slack, cause, u)
+
     def solve(
         self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
     ) -> FilterDecision:
