@@ -24,6 +24,9 @@ UNFILTERED = Source(
     "def decide(x, u, data, work):\n    return u, u, False, True, (0.0,), 0, True\n"
 )
 
+_GENERATED = ("_step", "_data", "_work")
+"""Attributes of a stepper that follow from the problem and the filter."""
+
 
 class BatchFilter(NamedTuple):
     """A filter that is to be part of the compiled function.
@@ -56,15 +59,10 @@ class BatchStepper:
 
     def __init__(self, batch: BatchState, batch_filter: BatchFilter | None) -> None:
         self._batch, self._filter = batch, batch_filter
-        problem, data = batch.problem, Data()
+        problem = batch.problem
         n, m = batch.shape
         self._rest = np.empty(0) if batch_filter is None else batch_filter.rest
-        generated = world_source(problem, data) + batch_source(problem, data)
-        generated += UNFILTERED if batch_filter is None else batch_filter.source(data)
-        title = f"{problem.name} in batches" + " with a filter" * (batch_filter is not None)
-        program = Program(title, [step_batch], generated)
-        self._step: Callable[..., int] = program.compiled()["step_batch"]
-        self._data, self._work = data.array(), np.empty(max(generated.work, 1))
+        self._generate()
         self._nowhere = np.zeros(n, dtype=bool)
         self._nothing = np.zeros(batch.shape)
         self._observation_shape = (n, len(problem.features))
@@ -73,6 +71,24 @@ class BatchStepper:
         self._width = m + len(self._rest)
         self.tallies = np.zeros((self._rows, 2), dtype=np.int64)
         self._told = self._at_rest()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what is compiled, which a copy makes itself."""
+        return {key: value for key, value in vars(self).items() if key not in _GENERATED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._generate()
+
+    def _generate(self) -> None:
+        """Make the compiled function, its numbers and its scratch array."""
+        problem, batch_filter, data = self._batch.problem, self._filter, Data()
+        generated = world_source(problem, data) + batch_source(problem, data)
+        generated += UNFILTERED if batch_filter is None else batch_filter.source(data)
+        title = f"{problem.name} in batches" + " with a filter" * (batch_filter is not None)
+        program = Program(title, [step_batch], generated)
+        self._step: Callable[..., int] = program.compiled()["step_batch"]
+        self._data, self._work = data.array(), np.empty(max(generated.work, 1))
 
     def begin(self, envs: np.ndarray) -> VectorStep:
         """Begin the next episode of some envs; the others keep what their filter told."""
