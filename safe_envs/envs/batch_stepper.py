@@ -16,6 +16,7 @@ from safe_envs.envs.batch_kernel import step_batch
 from safe_envs.envs.batch_source import batch_source
 from safe_envs.envs.batch_state import BatchState
 from safe_envs.envs.info import Info, VectorStep, filter_info, safety_info
+from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.simulation import require_sound, start_sampler
 from safe_envs.envs.world_source import world_source
 from safe_envs.errors import NumericalError
@@ -90,9 +91,17 @@ class BatchStepper:
         self._step: Callable[..., int] = program.compiled()["step_batch"]
         self._data, self._work = data.array(), np.empty(max(generated.work, 1))
 
-    def begin(self, envs: np.ndarray) -> VectorStep:
-        """Begin the next episode of some envs; the others keep what their filter told."""
-        return self._run(self._nothing, True, False, envs)
+    def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
+        """Begin the next episode of some envs; the others keep what their filter told.
+
+        Args:
+            envs: which, bool (num_envs,).
+            points: where; None for draws from the problem's distribution.
+
+        Returns:
+            What is read off the states.
+        """
+        return self._run(self._nothing, True, False, envs, points)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`."""
@@ -116,7 +125,12 @@ class BatchStepper:
         return self._run(given, scaled, True, due)
 
     def _run(
-        self, given: np.ndarray, scaled: bool, stepping: bool, restarts: np.ndarray | None
+        self,
+        given: np.ndarray,
+        scaled: bool,
+        stepping: bool,
+        restarts: np.ndarray | None,
+        points: StartingPoints | None = None,
     ) -> VectorStep:
         batch, filtered = self._batch, self._filter is not None
         # For an array that cannot be written to, Numba would compile once more.
@@ -130,11 +144,13 @@ class BatchStepper:
         told = self._new_told() if stepping else self._told.copied()
         observations, rewards = np.empty(self._observation_shape, np.float32), np.empty(n)
         readings = np.empty(self._reading_shape)
+        before = batch.before(restarts, points)
         status = self._step(
             given,
             scaled,
             stepping,
             filtered,
+            points is not None,
             self._nowhere if restarts is None else restarts,
             *batch.settings,
             batch.streams.words,
@@ -145,8 +161,7 @@ class BatchStepper:
             self._work,
             self._data,
             self._rest,
-            batch.states,
-            batch.counts,
+            *before,
             self.tallies,
             states,
             counts,

@@ -32,14 +32,15 @@ class NoiseStream:
         self._reader = StreamReader()
         self.begin((0, 0), 0)
 
-    def begin(self, key: Key, episode: int) -> None:
-        """Go to the first control period of an episode.
+    def begin(self, key: Key, episode: int, period: int = 0) -> None:
+        """Go to a control period of an episode.
 
         Args:
             key: of the seed.
             episode: its number since the seed.
+            period: of the episode, the first one by default.
         """
-        self._key, self._episode, self._drawn = key, episode, 0
+        self._key, self._episode, self._drawn = key, episode, period
         self._rows: list[list[float]] = []
         self._position = 0
 
