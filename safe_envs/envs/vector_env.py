@@ -102,7 +102,7 @@ class SafeVectorEnv(VectorInterface):
         before = self.state
         states = self._reset_options.states(given)
         moved = (states != before).any(axis=1)
-        self._batch.place(states, ())
+        self._batch.place(states, [])
         self.episodes.place(moved)
         if self.viewer is not None:
             self.viewer.restart(states, self._times, np.flatnonzero(moved).tolist())
