@@ -13,6 +13,7 @@ from safe_envs.envs.batch_state import BatchState
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import VectorStep
+from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.problem.problem import SafetyProblem
 
@@ -62,9 +63,9 @@ class CompiledBatch:
         rows = np.column_stack([states, episodes.h_min, episodes.episode_cost])
         state.commit(np.ascontiguousarray(rows, dtype=float), counts, None)
 
-    def begin(self, envs: np.ndarray) -> VectorStep:
+    def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
         """Begin the next episode of some envs; see `ArrayBatch.begin`."""
-        return self._unfiltered.begin(envs)
+        return self._unfiltered.begin(envs, points)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`.
