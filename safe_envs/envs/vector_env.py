@@ -16,12 +16,12 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.array_batch import ArrayBatch
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.compiled_batch import CompiledBatch
-from safe_envs.envs.episode import Episodes, last_of_episode
+from safe_envs.envs.episode import Episodes, autoreset_of, last_of_episode
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.seeding import EpisodeStreams, Seeds
 from safe_envs.envs.simulation import steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
-from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
+from safe_envs.errors import InvalidInputError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
@@ -69,7 +69,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         require_whole("num_envs", num_envs, 1)
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
-        self._autoreset = _mode(autoreset_mode)
+        self._autoreset = autoreset_of(autoreset_mode)
         self.problem, self.num_envs = problem, num_envs
         self.metadata = {
             "render_modes": [*RENDER_MODES[1:]],
@@ -98,8 +98,13 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._batch.components
 
     @property
+    def sent(self) -> Sequence[Any]:
+        """The components of the physical inputs that the last step was given."""
+        return self._batch.sent
+
+    @property
     def executed(self) -> Sequence[Any]:
-        """The components of the physical inputs of the last step."""
+        """The components of those that were executed in it; see `SafeEnv`."""
         return self._batch.executed
 
     @property
@@ -143,7 +148,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
-        return {"state": self.state, **self.episodes.snapshot()}
+        return {"state": self.state, **self.episodes.snapshot(), **self._batch.snapshot()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray], seed: Seeds = None) -> None:
         """Put each episode where a snapshot has it.
@@ -165,7 +170,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seeded = self._streams.seed(self._streams.for_each_env(seed))
         self.episodes.restore(snapshot)
         self._streams.begin_episodes(seeded)
-        self._batch.place(snapshot["state"], seeded)
+        self._batch.place(snapshot, seeded)
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, range(self.num_envs))
 
@@ -290,11 +295,3 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 def _without_state() -> gym.error.ResetNeeded:
     return gym.error.ResetNeeded("the envs have no state yet: call reset() first")
-
-
-def _mode(given: str | AutoresetMode) -> AutoresetMode:
-    try:
-        return AutoresetMode(given)
-    except ValueError as error:
-        allowed = ", ".join(mode.value for mode in AutoresetMode)
-        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error
