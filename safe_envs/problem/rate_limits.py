@@ -58,8 +58,9 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
     - Starts put the inputs at rest: within their bounds, nearest to 0.
     - The observation gets the inputs, by their names.
     - The nominal controller asks for the rate that brings its own input about in one period.
-    - Every barrier gets one more gain, the last one again. A default filter for relative degree 1
-      gives way to "szcbf" with noise, "hocbf" without.
+    - Every barrier gets one more gain, 1/dt: then the constraint on the rate asks, to first order,
+      that the input after this period meets the former constraint there. A default filter for
+      relative degree 1 gives way to "szcbf" with noise, "hocbf" without.
     - The reward, an expression of the executed input, takes the one that a period ends with.
     - The goal of the joint QP is left out: of its V, one derivative does not hold the rate.
 
@@ -95,7 +96,7 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
             name: Start((*start.state, *rest), start.uniforms, start.condition)
             for name, start in problem.starts.items()
         },
-        "gains": _extended(problem.gains),
+        "gains": _extended(problem.gains, 1.0 / problem.dt),
         "filter": problem.filter if problem.filter in _DEGREE_FREE else suitable,
         "clf": None,
         "sampling": _sampling(problem.sampling, ranges),
@@ -186,10 +187,10 @@ def _law(law: sp.Expr, v: Variable, ends: tuple[float, float], u: sp.Symbol, dt:
     return ends[0] + (wanted - least) * sp.Float(ends[1] - ends[0], 17) / (most - least)
 
 
-def _extended(gains: Any) -> Any:
+def _extended(gains: Any, last: float) -> Any:
     if isinstance(gains[0], tuple):
-        return tuple((*each, each[-1]) for each in gains)
-    return (*gains, gains[-1])
+        return tuple((*each, last) for each in gains)
+    return (*gains, last)
 
 
 def _sampling(sampling: SamplingDomain, ranges: Sequence[Variable]) -> SamplingDomain:

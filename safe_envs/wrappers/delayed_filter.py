@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from typing import Any
@@ -69,6 +70,8 @@ class Prediction:
         try:
             for u in inputs:
                 found = self._floats.step(found, u, [0.0] * self._floats.channels)
+            if not math.isfinite(sum(found)):
+                raise ArithmeticError(f"it ends at {found}")
         except NO_VALUE as error:
             raise NumericalError(
                 f"the model has no finite prediction from {tuple(x)} under the inputs that were"
