@@ -35,6 +35,7 @@ _STATED = (
     "start",
     "dt",
     "horizon",
+    "rates",
 )
 """Attributes of a problem that are made of the arguments."""
 

@@ -39,7 +39,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
     Raises:
         NotCompilableError: the engine of the env is "compiled", and the filter has no compiled
-            form: it has learned terms without one, or is the promise filter.
+            form: it has learned terms without one, predicts over a delay, or is the promise filter.
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
@@ -53,6 +53,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
         observe_promise: bool = False,
+        delay: int | None = None,
         **view: Any,
     ) -> None:
         if view:
@@ -60,7 +61,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             env = SafetyMonitorVector(env, spec)
         inner = readable(env)
         self.attach(
-            inner, condition, knowledge, objective, priorities, observe_promise, env.num_envs
+            inner, condition, knowledge, objective, priorities, observe_promise, delay, env.num_envs
         )
         gym.vector.VectorWrapper.__init__(self, env)
         if observe_promise:
