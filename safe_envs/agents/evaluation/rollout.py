@@ -12,7 +12,7 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponent
 from safe_envs.agents.evaluation.episode_batch import EpisodeBatch, PlayedBatch
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.targets import Env
-from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.trajectories import EpisodeRecorder
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.processes import compute_in_order
 from safe_envs.agents.policies.base import Policy
@@ -48,7 +48,7 @@ def play(
     episodes: range,
     seed: int,
     progress: Progress | None = None,
-    trajectories: Trajectories | None = None,
+    trajectories: EpisodeRecorder | None = None,
     bridge: BrownianBridge | None = None,
 ) -> Iterator[PlayedBatch]:
     """Simulate consecutive episodes in batches of the size of the vector env.
@@ -168,7 +168,7 @@ def _play(
     first: int,
     count: int,
     progress: Progress | None,
-    trajectories: Trajectories | None,
+    trajectories: EpisodeRecorder | None,
     watch: _MinimumWatch | None,
 ) -> EpisodeBatch:
     """Simulate a batch that was just reset and begins with the episode `first`."""
@@ -182,11 +182,13 @@ def _play(
     state, start = None, np.ones(len(h), dtype=bool)
     for k in range(1, steps + 1):
         actions, state = acted(policy, observation, state, start)
-        before = world.components
+        before, barriers = world.components, info["barrier"]
         observation, reward, terminated, truncated, info = env.step(actions)
-        h = smallest(info["barrier"])
+        h, executed = smallest(info["barrier"]), _executed(world, actions, info)
         lowest = h if watch is None else watch.minimum(world.components, info["barrier"])
-        batch.add(lowest, (before, world.components), _executed(world, actions, info), reward, info)
+        if trajectories and first == 0 and batch.alive[0]:
+            trajectories.note_decision(k - 1, before, barriers, executed, info)
+        batch.add(lowest, (before, world.components), executed, reward, info)
         if trajectories:
             trajectories.note(k, first, batch.alive, h, world.components)
         start = terminated | truncated

@@ -142,10 +142,7 @@ class RuntimeArguments:
             if seen & (1 << place):
                 raise ConfigurationError(f"parameters gives {self._named[place]} twice")
             seen |= 1 << place
-            if batch is None and type(value) is float and math.isfinite(value):
-                found[place] = value
-            else:
-                found[place] = _number(str(self._named[place]), value, batch)
+            found[place] = _number(self._named[place].name, value, batch)
 
     def _unknown(self, key: Any) -> ConfigurationError:
         name = key.name if isinstance(key, sp.Symbol) else key
@@ -222,6 +219,8 @@ def _is_interval(low: Any, high: Any) -> bool:
 
 def _number(what: str, given: Any, batch: tuple[int, ...] | None) -> Any:
     """Return a finite number as a float, or several of a batch as an array (B,)."""
+    if isinstance(given, float) and math.isfinite(given):
+        return float(given)
     found = real_array(what, given)
     if found.shape not in ((), batch):
         each = f", or an array {batch}, one for each state" if batch else ""

@@ -24,6 +24,7 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from tests.conftest import problem_of
 from tests.wrappers.filter_qp.decision_kernels import decided
+from tests.wrappers.filter_qp.test_filter_source import Corrected, Measured
 
 x, y, u, w, p, q = sp.symbols("x y u w p q", real=True)
 gain, wind = sp.Symbol("gain", positive=True), sp.Symbol("wind", real=True)
@@ -259,9 +260,16 @@ def test_the_time_is_not_looked_at_where_nothing_depends_on_it():
     assert timed.qp.symbols == (x, y, p, q, gain, TIME)
 
 
-@pytest.mark.parametrize("conditions", ["cbf", "cbf+cbf:sampling_margin=first-order"])
+LEARNED = Measured(ControlAffineSDE((x, y), (u,), [0, 0], [[1], [0]], [0, 0]), [1.5 + x**2, y])
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    ["cbf", ["cbf", CBF(1.0, sampling_margin="first-order")], Corrected(1.0, learned=LEARNED)],
+    ids=["one", "sampled", "learned terms of the state"],
+)
 def test_a_program_takes_what_is_given_after_the_state(conditions):
-    count = conditions.count("+") + 1
+    count = len(conditions) if isinstance(conditions, list) else 1
     moving = SafetyFilter(
         chased(), list(BARRIERS[:count]), conditions, (-2, 2), dt=0.1, adjustable=("gain",)
     )
@@ -277,4 +285,8 @@ def test_a_program_takes_what_is_given_after_the_state(conditions):
             state, proposal, data.array(), np.full(source.work, np.nan)
         )
         np.testing.assert_allclose(action, expected.action, atol=1e-12)
+        batch = moving.decide_arrays(
+            tuple(np.array([c]) for c in state), tuple(np.array([c]) for c in proposal)
+        )
+        np.testing.assert_allclose(np.ravel(batch.action), expected.action, atol=1e-12)
         assert (acts, feasible) == (any(expected.active), expected.feasible)
