@@ -19,7 +19,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE, WARM
 from safe_envs.scripts.reports.best_report import BestAnswer
 from safe_envs.scripts.reports.best_text import best_text
 from safe_envs.scripts.reports.evaluation_report import describe_system
@@ -26,7 +26,6 @@ LEVEL = 0.99
 
 _LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 _SHADES = ("#F1F5F9", "#DCE8F2", "#BDD6E8", "#93BEDB", "#5E9FCB", "#2F7FB8", "#0072B2")
-_MARK = "#D55E00"
 
 
 def draw(answer: BestAnswer, table: ValueTable, path: Path) -> None:
@@ -80,13 +79,13 @@ def _draw_curve(panel: Axes, edges: np.ndarray, lower: np.ndarray, upper: np.nda
     panel.stairs(lower, edges, baseline=None, color=COLORS[0], linewidth=1.4)
     panel.stairs(upper, edges, baseline=None, color=COLORS[0], linewidth=0.8, linestyle="--")
     for start, end in _runs(lower >= LEVEL):
-        panel.axvspan(edges[start], edges[end], color=_MARK, alpha=0.15, linewidth=0)
+        panel.axvspan(edges[start], edges[end], color=WARM, alpha=0.15, linewidth=0)
     panel.axhline(LEVEL, color=QUIET, linewidth=0.6, linestyle=":")
     panel.set_ylim(-0.02, 1.02)
     return [
         Line2D([], [], color=COLORS[0], linewidth=1.4, label="lower"),
         Line2D([], [], color=COLORS[0], linewidth=0.8, linestyle="--", label="upper"),
-        Patch(color=_MARK, alpha=0.15, label=f"{100 * LEVEL:g} % can be had (lower)"),
+        Patch(color=WARM, alpha=0.15, label=f"{100 * LEVEL:g} % can be had (lower)"),
     ]
 
 
@@ -117,14 +116,14 @@ def _draw_plane(
     for values, style, width in ((lower, "solid", 1.6), (upper, "dashed", 1.0)):
         if values.min() < LEVEL <= values.max() and min(values.shape) > 1:
             panel.contour(
-                *middles, values.T, levels=[LEVEL], colors=_MARK, linewidths=width, linestyles=style
+                *middles, values.T, levels=[LEVEL], colors=WARM, linewidths=width, linestyles=style
             )
     quiet = [level for level in _LEVELS[1:-1] if lower.min() < level < lower.max()]
     if quiet and min(lower.shape) > 1:
         panel.contour(*middles, lower.T, levels=quiet, colors=QUIET, linewidths=0.4)
     return [
-        Line2D([], [], color=_MARK, linewidth=1.6, label=f"{100 * LEVEL:g} % can be had (lower)"),
-        Line2D([], [], color=_MARK, linewidth=1.0, linestyle="--", label="at most there (upper)"),
+        Line2D([], [], color=WARM, linewidth=1.6, label=f"{100 * LEVEL:g} % can be had (lower)"),
+        Line2D([], [], color=WARM, linewidth=1.0, linestyle="--", label="at most there (upper)"),
         Patch(color=UNSAFE, label="0 %"),
     ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +18,11 @@ from safe_envs.agents.policies.base import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE, WARM, add_legend
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
-# Okabe and Ito's palette, which the colour-blind can tell apart; the unfiltered env always has the
-# same warm colour.
-_UNFILTERED_COLOR = "#D55E00"
-COLORS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-UNSAFE = "#B9B9B9"
-QUIET = "#444444"
 _SHOWN = 8
 _GRID = 300
-_MOST_COLUMNS = 4
-STYLE: Any = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 11,
-    "legend.frameon": False,
-    "figure.constrained_layout.use": True,
-    "svg.fonttype": "none",
-}
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:
@@ -68,30 +53,9 @@ def _policy_name(path: Path) -> str:
     return path.parent.name if path.name == POLICY_FILE else path.stem
 
 
-def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
-    """Add a legend below the panels, in as many columns as fit.
-
-    Args:
-        figure: with the panels.
-        handles: with labels; one too long for a column is written smaller.
-    """
-    size, share = mpl.rcParams["font.size"], 1.0
-    for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
-        legend = figure.legend(
-            handles=handles, loc="outside lower center", ncols=columns, fontsize=size
-        )
-        share = legend.get_window_extent().width / figure.bbox.width
-        if share <= 1.0:
-            return
-        legend.remove()
-    figure.legend(handles=handles, loc="outside lower center", fontsize=size / share)
-
-
 def _colors(evaluation: Evaluation) -> dict[str, str]:
     others = [row.filter for row in evaluation.rows if row.filter != UNFILTERED]
-    return {UNFILTERED: _UNFILTERED_COLOR} | {
-        name: COLORS[i % len(COLORS)] for i, name in enumerate(others)
-    }
+    return {UNFILTERED: WARM} | {name: COLORS[i % len(COLORS)] for i, name in enumerate(others)}
 
 
 def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, add_legend
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
 _NOMINAL_COLOR = "#D55E00"

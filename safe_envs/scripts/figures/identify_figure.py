@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, add_legend
 from safe_envs.scripts.reports.identify_answer import Function, IdentifyAnswer
 from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning.models.distributions import Diffusion, sigma_samples

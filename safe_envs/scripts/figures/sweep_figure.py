@@ -18,9 +18,8 @@ from matplotlib.ticker import MaxNLocator
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.evaluation_figure import COLORS, STYLE, add_legend
+from safe_envs.scripts.figures.style import COLORS, STYLE, WARM, add_legend
 
-_UNFILTERED_COLOR = "#D55E00"
 _SEED = "seed"
 _MOST_PANELS = 12
 _COLUMNS = 3
@@ -137,7 +136,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
         of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
         rates = {position[place]: _rate(_at(of_kind, layout.x, place)) for place in places}
         found = {at: rate for at, rate in rates.items() if rate is not None}
-        color = _UNFILTERED_COLOR if kind == UNFILTERED else colors[k % len(colors)]
+        color = WARM if kind == UNFILTERED else colors[k % len(colors)]
         label = None if layout.lines is None else _text(kind)
         if layout.lines not in (None, "filter"):
             label = f"{layout.lines} = {label}"

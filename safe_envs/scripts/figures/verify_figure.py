@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.evaluation_figure import COLORS, STYLE, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, STYLE, UNSAFE
 from safe_envs.scripts.figures.verify_panel import INFEASIBLE, draw_line
 from safe_envs.scripts.figures.verify_plane import draw_shares, draw_slice
 from safe_envs.scripts.reports.evaluation_report import describe_system

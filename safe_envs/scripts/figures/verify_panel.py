@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, UNSAFE
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.formulas import Formulas
 

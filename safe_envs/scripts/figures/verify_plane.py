@@ -8,7 +8,7 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE
 from safe_envs.scripts.figures.verify_panel import (
     INFEASIBLE,
     axis_label,

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3.disk_starts import (
     PRINTED_START,
     RATES,

@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines

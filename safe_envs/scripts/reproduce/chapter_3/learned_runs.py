@@ -12,7 +12,7 @@ import numpy as np
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import evaluate, make_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS
+from safe_envs.scripts.figures.style import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter

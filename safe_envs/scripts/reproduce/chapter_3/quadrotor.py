@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import QUIET, add_legend
+from safe_envs.scripts.figures.style import QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines

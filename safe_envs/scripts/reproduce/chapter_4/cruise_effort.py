@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents import NominalController
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_4 import cruise_setting as car
 from safe_envs.scripts.reproduce.chapter_4.effort_claims import (
     DISTANCES,

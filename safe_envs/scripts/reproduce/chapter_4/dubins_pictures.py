@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_4.dubins_runs import ALPHAS, FILTERS, RADIUS
 from safe_envs.scripts.reproduce.framework.artefact import Findings
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval

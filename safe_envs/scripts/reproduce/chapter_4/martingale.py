@@ -17,7 +17,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import rate_interval
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
-from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
+from safe_envs.scripts.figures.style import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_4 import reciprocal_inputs as scalar
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS
+from safe_envs.scripts.figures.style import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Claim
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.wrappers import SafetyFilter, parse_conditions

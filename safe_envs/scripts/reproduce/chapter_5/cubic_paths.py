@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_5.cubic import CBF, ENV, LEVELS, SETTINGS
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import repeated
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER, EPISODES, measured

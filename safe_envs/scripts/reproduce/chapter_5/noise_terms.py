@@ -15,7 +15,7 @@ from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient, ito_correction
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
+from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     REPETITIONS,
     VALIDATION,

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
+from safe_envs.scripts.figures.style import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_above

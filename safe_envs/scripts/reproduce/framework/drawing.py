@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from safe_envs.scripts.figures.evaluation_figure import UNSAFE
+from safe_envs.scripts.figures.style import UNSAFE
 
 SHADED: dict[str, Any] = {"color": UNSAFE, "alpha": 0.35, "linewidth": 0, "zorder": 0}
 """Style of unsafe areas."""

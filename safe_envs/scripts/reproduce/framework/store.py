@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from safe_envs.agents.jobs.fingerprint import file_checksum, package_versions, source_checksum
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.evaluation_figure import STYLE
+from safe_envs.scripts.figures.style import STYLE
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
 
 _SUFFIXES = (".png", ".svg")

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from safe_envs.scripts.figures.evaluation_figure import add_legend
+from safe_envs.scripts.figures.style import add_legend
 
 
 @pytest.mark.parametrize(
