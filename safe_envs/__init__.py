@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from safe_envs.problem.builder import state_problem
     from safe_envs.problem.clf import CLF
     from safe_envs.problem.problem import SafetyProblem
+    from safe_envs.scripts.figures.log_figure import plot_log
+    from safe_envs.wrappers.decision_log import DecisionLog
     from safe_envs.wrappers.safety_filter import SafetyFilter
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "Barrier",
     "ConfigurationError",
     "ControlAffineSDE",
+    "DecisionLog",
     "InvalidInputError",
     "NumericalError",
     "RelativeDegreeError",
@@ -46,6 +49,7 @@ __all__ = [
     "SafetyProblem",
     "SystemDefinitionError",
     "SystemDefinitionWarning",
+    "plot_log",
     "register",
     "state_problem",
 ]
@@ -56,10 +60,12 @@ _MODULES = {
     "Barrier": "problem.barrier",
     "CLF": "problem.clf",
     "ControlAffineSDE": "dynamics.sde",
+    "DecisionLog": "wrappers.decision_log",
     "SafeEnv": "envs.env",
     "SafeVectorEnv": "envs.vector_env",
     "SafetyFilter": "wrappers.safety_filter",
     "SafetyProblem": "problem.problem",
+    "plot_log": "scripts.figures.log_figure",
     "register": "envs.custom",
     "state_problem": "problem.builder",
 }

@@ -480,6 +480,10 @@ def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):
             b"hocbf: ",
             b"scbf: ",
             b"unsafe",
+            b"scbf, first episode",
+            b"omega (rad/s)",
+            b"nominal input",
+            b"intervention",
         ):
             assert text in content
     assert [p.name for p in Path().iterdir()] == [name]

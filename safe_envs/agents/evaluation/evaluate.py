@@ -180,10 +180,8 @@ class _Runner:
             for name, each in resolved.filters.items()
         }
         config = {**resolved.config(), "episodes": spec.episodes, "repeats": spec.repeats}
-        shape = (resolved.problem.steps, resolved.problem.plant.n, spec.episodes)
-        trajectories = (
-            {name: Trajectories(*shape) for name in resolved.names} if settings.record else {}
-        )
+        recorded = resolved.names if settings.record else ()
+        trajectories = {name: Trajectories(resolved.problem, spec.episodes) for name in recorded}
         rows, timings, safe, visited = [], [], {}, {}
         kept = KeptEpisodes() if self._keeps else None
         sinks: list[EpisodeSink] = [kept] if kept else []

@@ -182,11 +182,13 @@ def _play(
     state, start = None, np.ones(len(h), dtype=bool)
     for k in range(1, steps + 1):
         actions, state = acted(policy, observation, state, start)
-        before = world.components
+        before, barriers = world.components, info["barrier"]
         observation, reward, terminated, truncated, info = env.step(actions)
-        h = smallest(info["barrier"])
+        h, executed = smallest(info["barrier"]), _executed(world, actions, info)
         lowest = h if watch is None else watch.minimum(world.components, info["barrier"])
-        batch.add(lowest, (before, world.components), _executed(world, actions, info), reward, info)
+        if trajectories and first == 0 and batch.alive[0]:
+            trajectories.note_decision(k - 1, before, barriers, executed, info)
+        batch.add(lowest, (before, world.components), executed, reward, info)
         if trajectories:
             trajectories.note(k, first, batch.alive, h, world.components)
         start = terminated | truncated

@@ -1,4 +1,4 @@
-"""The picture of an evaluation: h and the safety rate over time, and trajectories."""
+"""The picture of an evaluation: h and safety rate over time, trajectories, first episodes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
@@ -18,10 +19,15 @@ from safe_envs.agents.policies.base import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.figures.log_panels import LogColors, LogPanels
 from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE, WARM, add_legend
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
 _SHOWN = 8
+_MOST_EPISODES = 4
+_EPISODE_HEIGHT = 1.2
+"""In inches, of a panel of the first episodes."""
+
 _GRID = 300
 
 
@@ -35,17 +41,56 @@ def draw(evaluation: Evaluation, path: Path) -> None:
     problem, config = evaluation.problem, evaluation.config
     colors = _colors(evaluation)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.5, 6.6) if problem.plane else (7.5, 6.6))
-        grid = figure.add_gridspec(2, 2 if problem.plane else 1, height_ratios=(3, 2))
+        episodes = _first_episodes(evaluation, colors)
+        count = max(each.count for each in episodes.values())
+        block = _EPISODE_HEIGHT * count + 0.6
+        figure = Figure(figsize=(11.5 if problem.plane else 7.5, 6.6 + block))
+        upper, lower = figure.add_gridspec(2, 1, height_ratios=(6.6, block))
+        grid = upper.subgridspec(2, 2 if problem.plane else 1, height_ratios=(3, 2))
         barrier = figure.add_subplot(grid[0, 0])
         _draw_barrier(barrier, evaluation, colors)
         _draw_curve(figure.add_subplot(grid[1, 0], sharex=barrier), evaluation, colors)
         if problem.plane:
             _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
-        add_legend(figure, barrier.get_legend_handles_labels()[0])
+        _draw_episodes(lower.subgridspec(count, len(episodes)), episodes)
+        handles = barrier.get_legend_handles_labels()[0]
+        add_legend(figure, [*handles, *_handles_of(evaluation, episodes)])
         title = f"{evaluation.title}, {_policy_name(Path(config['policy']['name']))} policy"
         figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+
+
+def _first_episodes(evaluation: Evaluation, colors: dict[str, str]) -> dict[str, LogPanels]:
+    """Return the panels of the first episode under each filter, as many as fit."""
+    return {
+        name: LogPanels(each.log, slice(None), LogColors(QUIET, colors[name], (colors[name],)))
+        for name, each in list(evaluation.trajectories.items())[:_MOST_EPISODES]
+    }
+
+
+def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> None:
+    """Draw the first episode under each filter in a column of its own, with common scales."""
+    shape, h_at = grid.get_geometry(), next(iter(episodes.values())).barrier_panel
+    panels = np.array([grid.figure.add_subplot(cell) for cell in grid]).reshape(shape)
+    for (name, drawn), column in zip(episodes.items(), panels.T, strict=True):
+        drawn.draw(list(column))
+        column[0].set_title(f"{name}, first episode")
+    for i, row in enumerate(panels):
+        low, high = np.transpose([panel.get_ylim() for panel in row])
+        # As above, h far below 0 is cut off.
+        bottom = max(low.min(), -high.max()) if i == h_at else low.min()
+        for panel in row:
+            panel.set_ylim(bottom, high.max())
+            panel.label_outer()
+
+
+def _handles_of(evaluation: Evaluation, episodes: dict[str, LogPanels]) -> list[Any]:
+    """Return the entries of the legend that the first episodes add to those of the filters."""
+    marks = max((each.handles() for each in episodes.values()), key=len)
+    barriers, grey = evaluation.problem.barriers, LogColors(barriers=(QUIET,))
+    several = range(len(barriers)) if len(barriers) > 1 else ()
+    lines = [Line2D([], [], **grey.barrier(i), label=f"{barriers[i].name}") for i in several]
+    return [*(mark for mark in marks if "executed" not in mark.get_label()), *lines]
 
 
 def _policy_name(path: Path) -> str:

@@ -28,15 +28,16 @@ STYLE: Any = {
 _MOST_COLUMNS = 4
 
 
-def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
+def add_legend(figure: Figure, handles: Sequence[Any], most: int = _MOST_COLUMNS) -> None:
     """Add a legend below the panels, in as many columns as fit.
 
     Args:
         figure: with the panels.
         handles: with labels; one too long for a column is written smaller.
+        most: columns.
     """
     size, share = mpl.rcParams["font.size"], 1.0
-    for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
+    for columns in range(min(len(handles), most), 0, -1):
         legend = figure.legend(
             handles=handles, loc="outside lower center", ncols=columns, fontsize=size
         )

@@ -160,6 +160,9 @@ Plot = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE",
-        help=f"Draw h and the safety rate over time, and trajectories: {text_options.FORMATS}",
+        help=(
+            "Draw h and the safety rate over time, trajectories, and the inputs of the first"
+            f" episode: {text_options.FORMATS}"
+        ),
     ),
 ]

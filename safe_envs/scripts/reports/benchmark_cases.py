@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.problem.barrier import Barrier
 from safe_envs.registry import make_problem
 from safe_envs.scripts.reports.hand_written_loop import LIMIT, step_by_hand
 from safe_envs.wrappers import (

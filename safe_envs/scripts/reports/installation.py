@@ -15,9 +15,9 @@ from importlib.util import find_spec
 import gymnasium as gym
 import numpy as np
 
-from safe_envs import ENV_IDS
 from safe_envs.rendering.viewer import require_pygame
 from safe_envs.scripts.reports.known_qps import KNOWN_QPS, KnownQP
+from safe_envs.systems import ENV_IDS
 
 _NEEDED = ""
 """In place of an extra: what is needed in any case."""

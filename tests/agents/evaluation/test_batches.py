@@ -31,6 +31,7 @@ def assert_same_to_the_bit(first, second):
     for name, recorder in first.trajectories.items():
         assert recorder.barrier.tobytes() == second.trajectories[name].barrier.tobytes()
         assert recorder.states.tobytes() == second.trajectories[name].states.tobytes()
+        assert recorder.log.table().tobytes() == second.trajectories[name].log.table().tobytes()
 
 
 def test_answer_is_the_same_for_every_num_envs(env_id):
@@ -162,7 +163,7 @@ def test_a_problem_gives_the_same_as_its_id_and_defaults_are_the_natural_filter(
 
 
 def test_trajectories_keep_a_bounded_number_of_episodes():
-    recorder = Trajectories(100, 12, 10**9)
+    recorder = Trajectories(make_problem("Quadrotor-v0", horizon=1.0, dt=0.01), 10**9)
     assert recorder.barrier.shape == (101, 256)
     assert recorder.states.shape == (101, 32, 12)
     answer = evaluate(

@@ -1,0 +1,88 @@
+"""The picture of a decision log: inputs, barriers and slacks over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from safe_envs.atomic_io import write_atomically
+from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.scripts.figures.log_panels import LogPanels, plain
+from safe_envs.scripts.figures.style import STYLE, add_legend
+from safe_envs.wrappers.decision_log import DecisionLog
+
+_WIDTH = 5.6
+"""In inches: text of 10 points can be read on the screen of a phone."""
+
+_HEIGHT = 1.35
+_LINE = 0.21
+"""In inches, of a panel and of a line of the legend."""
+
+
+def plot_log(
+    log: DecisionLog | Path | str,
+    out: Path | str | None = None,
+    *,
+    start: float | None = None,
+    end: float | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw the nominal and the executed inputs, h and slacks of a log over time.
+
+    Periods in which a constraint changed the input are shaded, infeasible ones hatched. The
+    smallest h is always within its panel; others may leave it at the top. Slacks have a panel where
+    there are some.
+
+    Args:
+        log: the log, or its file as `DecisionLog.read` takes it.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        start: first time to show, in s; by default that of the log.
+        end: last time to show, in s; by default that of the log.
+        title: of the picture; counts by default.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: The file cannot be read or written, or there is nothing to draw.
+    """
+    log = log if isinstance(log, DecisionLog) else DecisionLog.read(log)
+    drawn = LogPanels(log, _between(log, start, end))
+    with mpl.rc_context(STYLE):
+        left, right = drawn.handles(), drawn.barrier_handles()
+        height = 0.9 + _HEIGHT * drawn.count + _LINE * max(len(left), len(right))
+        figure = Figure(figsize=(_WIDTH, height))
+        panels = figure.subplots(drawn.count, 1, sharex=True, squeeze=False)[:, 0]
+        drawn.draw(list(panels))
+        figure.align_ylabels(panels)
+        nothing = [Line2D([], [], linewidth=0, label=" ")]
+        add_legend(figure, [*left, *nothing * (len(right) - len(left)), *right], 2)
+        said = str(log).replace("; ", "\n", 1) if title is None else title
+        figure.suptitle(plain(said, 200), fontsize=10)
+        if out is not None:
+            _write(figure, Path(out))
+    return figure
+
+
+def _between(log: DecisionLog, start: float | None, end: float | None) -> slice:
+    t = log.t
+    first = 0 if start is None else int(np.searchsorted(t, start, "left"))
+    last = len(t) if end is None else int(np.searchsorted(t, end, "right"))
+    if first >= last:
+        there = f"has {len(t)} periods{f' from {t[0]:g} to {t[-1]:g} s' if len(t) else ''}"
+        raise ConfigurationError(
+            f"nothing to draw between start = {start} and end = {end}: the log {there}"
+        )
+    return slice(first, last)
+
+
+def _write(figure: Figure, path: Path) -> None:
+    if path.suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
+        raise ConfigurationError(
+            f"{shortened(path)} names no format of a picture; give FILE.png, FILE.pdf or FILE.svg"
+        )
+    write_atomically(path, lambda part: figure.savefig(part, dpi=200))

@@ -1,0 +1,238 @@
+"""A log of decisions, to which a control loop adds one each period."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safe_envs.errors import InvalidInputError, shown
+from safe_envs.problem.signals import TIME
+from safe_envs.wrappers.decision_log.columns import LogColumns
+from safe_envs.wrappers.decision_log.files import read_log, write_csv, write_parquet
+from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.safety_filter import SafetyFilter
+
+
+class DecisionLog:
+    """States, inputs, barriers and slacks of a control loop over time.
+
+    Adding a decision takes a few microseconds and 8 bytes for each column. The log grows with every
+    period: a loop that runs for days writes it now and then, outside the loop, and goes on with
+    another one.
+
+    Args:
+        columns: what is logged; see `for_filter`.
+
+    Attributes:
+        columns: as given.
+    """
+
+    def __init__(self, columns: LogColumns) -> None:
+        self.columns = columns
+        self._width = len(columns.headings)
+        self._values = array("d")
+        self._bounds: tuple[Sequence[float], Sequence[float]] = ((), ())
+        self._defaults: dict[Any, float | None] = {}
+
+    @classmethod
+    def for_filter(
+        cls, safety_filter: SafetyFilter, units: Mapping[Any, str] | None = None
+    ) -> DecisionLog:
+        """Return an empty log with the names of a filter's states, inputs and barriers.
+
+        Args:
+            safety_filter: whose decisions will be added.
+            units: of states, inputs, run-time parameters and barriers, by symbol or name.
+
+        Raises:
+            ConfigurationError: A unit is of nothing that is logged.
+        """
+        qp, model = safety_filter.qp, safety_filter.model
+        runtime = [symbol for symbol in qp.runtime if symbol != TIME]
+        names = [barrier.name for barrier, _ in safety_filter.pairs]
+        log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
+        log._bounds = qp.low, qp.high
+        log._defaults = {symbol: model.parameters.get(symbol) for symbol in runtime}
+        return log
+
+    def add(
+        self,
+        t: float,
+        x: Any,
+        decision: FilterDecision,
+        *,
+        bounds: Any = None,
+        parameters: Mapping[Any, float] | None = None,
+    ) -> None:
+        """Add the decision of one period.
+
+        Args:
+            t: time in s.
+            x: state, shape (n,).
+            decision: what the filter returned for that one state.
+            bounds: as given to the filter; those of its construction by default.
+            parameters: as given to the filter.
+
+        Raises:
+            InvalidInputError: Something is missing or does not fit the log.
+        """
+        try:
+            action, proposed = decision.action.tolist(), decision.proposed.tolist()
+            intervened = decision.cause >= 0 and action != proposed
+            low, high = self._bounds if bounds is None else _pairs(bounds, len(action))
+            values = array(
+                "d",
+                [
+                    t,
+                    *x,
+                    *(self._given(parameters or {}) if self._defaults else ()),
+                    *proposed,
+                    *action,
+                    *low,
+                    *high,
+                    *decision.barrier.tolist(),
+                    *decision.slack.tolist(),
+                    intervened,
+                    decision.feasible,
+                    decision.cause if intervened else -1,
+                ],
+            )
+        except (AttributeError, TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"the log takes one state and its decision at a time ({error}); give t in s, x of"
+                f" shape ({len(self.columns.states)},) and what the filter returned for it"
+            ) from error
+        if len(values) != self._width or not math.isfinite(values[0]):
+            raise InvalidInputError(
+                f"t = {shown(t)} with {len(values)} numbers in all does not fit the log, which"
+                f" takes {self._width}: a finite t, {len(self.columns.states)} states, and the"
+                " decision of the filter that the log was made for"
+            )
+        self._values.extend(values)
+
+    def _given(self, parameters: Mapping[Any, float]) -> list[float]:
+        """Return what was given at run time, in order."""
+        found = []
+        for symbol, default in self._defaults.items():
+            value = parameters.get(symbol, parameters.get(symbol.name, default))
+            if value is None:
+                raise InvalidInputError(
+                    f"parameters lacks {symbol}; give what the filter was given"
+                )
+            found.append(value)
+        return found
+
+    def append(self, values: Sequence[float]) -> None:
+        """Add the numbers of one period in the order of `LogColumns.headings`.
+
+        Raises:
+            InvalidInputError: Their number does not fit.
+        """
+        if len(values) != self._width:
+            raise InvalidInputError(f"{len(values)} numbers for {self._width} columns of the log")
+        self._values.extend(array("d", values))
+
+    def __len__(self) -> int:
+        return len(self._values) // self._width
+
+    def table(self) -> np.ndarray:
+        """Return all that was added, shape (periods, columns); see `LogColumns.headings`."""
+        # A copy: the array cannot grow while somebody holds a view.
+        return np.array(self._values).reshape(-1, self._width)
+
+    def section(self, name: str) -> np.ndarray:
+        """Return the columns of a section of `LogColumns`, shape (periods, columns)."""
+        table = np.frombuffer(self._values).reshape(-1, self._width)
+        return table[:, self.columns.sections[name]].copy()
+
+    @property
+    def t(self) -> np.ndarray:
+        """Times in s, shape (periods,)."""
+        return self.section("t")[:, 0]
+
+    @property
+    def intervention(self) -> np.ndarray:
+        """Whether a constraint changed the input, bool (periods,)."""
+        return self.section("intervention")[:, 0] > 0.0
+
+    @property
+    def feasible(self) -> np.ndarray:
+        """Whether all constraints could be met, bool (periods,)."""
+        return self.section("feasible")[:, 0] > 0.0
+
+    @property
+    def interventions(self) -> int:
+        """Number of periods in which a constraint changed the input."""
+        return int(np.count_nonzero(self.intervention))
+
+    @property
+    def infeasible(self) -> int:
+        """Number of periods in which no input within its bounds met all constraints."""
+        return int(np.count_nonzero(~self.feasible))
+
+    @property
+    def h_min(self) -> float:
+        """Smallest value of any barrier; inf for an empty log."""
+        return float(self.section("h").min(initial=math.inf))
+
+    def __str__(self) -> str:
+        if not len(self):
+            return "an empty log"
+        h = self.section("h")
+        k, i = np.unravel_index(np.argmin(h), h.shape)
+        unit = self.columns.units.get(self.columns.barriers[i], "")
+        return (
+            f"{len(self)} decisions: {self.interventions} interventions, {self.infeasible}"
+            f" infeasible; smallest h {h[k, i]:.4g}{' ' * bool(unit)}{unit}"
+            f" ({self.columns.barriers[i]}, t = {self.t[k]:.6g} s)"
+        )
+
+    def to_csv(self, path: Path | str) -> None:
+        """Write a CSV file with one line of headings, whole or not at all.
+
+        Numbers are written so that they are read back to the last bit.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            ConfigurationError: The file cannot be written.
+        """
+        write_csv(Path(path), self.columns, self.table())
+
+    def to_parquet(self, path: Path | str) -> None:
+        """Write a Parquet file, whole or not at all; needs pyarrow.
+
+        Args:
+            path: of the file.
+
+        Raises:
+            ConfigurationError: pyarrow is not installed, or the file cannot be written.
+        """
+        write_parquet(Path(path), self.columns, self.table())
+
+    @classmethod
+    def read(cls, path: Path | str) -> DecisionLog:
+        """Read what `to_csv` or `to_parquet` wrote, by the suffix of the file.
+
+        Args:
+            path: of the file, FILE.csv or FILE.parquet.
+
+        Raises:
+            ConfigurationError: The file cannot be read, is too large, or holds no log.
+        """
+        columns, table = read_log(Path(path))
+        log = cls(columns)
+        log._values.frombytes(np.ascontiguousarray(table, dtype=np.float64).tobytes())
+        return log
+
+
+def _pairs(bounds: Any, m: int) -> tuple[Sequence[float], Sequence[float]]:
+    """Return lower and upper bounds, given as one pair or as one for each of m inputs."""
+    pairs = np.broadcast_to(np.asarray(bounds, dtype=float), (m, 2))
+    return pairs[:, 0].tolist(), pairs[:, 1].tolist()

@@ -1,0 +1,152 @@
+"""The log of decisions: what is added is what is read."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import (
+    Barrier,
+    ConfigurationError,
+    ControlAffineSDE,
+    DecisionLog,
+    InvalidInputError,
+)
+from safe_envs.wrappers import CBF, SafetyFilter
+from safe_envs.wrappers.decision_log import LogColumns
+
+x, y, u, w = sp.symbols("x y u w", real=True)
+
+
+@pytest.fixture(scope="module")
+def safety_filter():
+    """Two integrators below walls at x = 1 and y = 2, in a room where |x| stays below 3."""
+    plane = ControlAffineSDE((x, y), (u, w), [0, 0], [[1, 0], [0, 1]], [0, 0])
+    walls = [Barrier(1 - x, "wall"), Barrier(2 - y, "wall"), Barrier(9 - x**2, "room")]
+    return SafetyFilter(plane, [(wall, CBF(2.0)) for wall in walls], [(-3.0, 3.0)] * 2)
+
+
+@pytest.fixture
+def log(safety_filter):
+    """Free, held back by the first wall, and beyond it further than the bounds can mend."""
+    found = DecisionLog.for_filter(safety_filter, {x: "m", "u": "m/s", "room": "m^2"})
+    for k, (state, proposed) in enumerate(
+        [((0.0, 0.0), (1.0, -1.0)), ((0.5, 0.0), (2.0, 0.5)), ((3.5, 0.0), (0.0, 0.0))]
+    ):
+        decision = safety_filter.filter(np.array(state), np.array(proposed))
+        found.add(0.1 * k, np.array(state), decision)
+    return found
+
+
+def test_sections_hold_what_was_decided(log, safety_filter):
+    assert len(log) == 3
+    np.testing.assert_array_equal(log.t, [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(log.section("state"), [[0.0, 0.0], [0.5, 0.0], [3.5, 0.0]])
+    np.testing.assert_array_equal(log.section("nominal"), [[1.0, -1.0], [2.0, 0.5], [0.0, 0.0]])
+    np.testing.assert_allclose(log.section("action"), [[1.0, -1.0], [1.0, 0.5], [-3.0, 0.0]])
+    np.testing.assert_array_equal(log.section("low"), np.full((3, 2), -3.0))
+    np.testing.assert_allclose(log.section("h"), [[1, 2, 9], [0.5, 2, 8.75], [-2.5, 2, -3.25]])
+    np.testing.assert_allclose(log.section("slack")[:2], 0.0)
+    assert log.section("slack")[2, 0] == pytest.approx(2.0)
+    assert log.intervention.tolist() == [False, True, True]
+    assert log.feasible.tolist() == [True, True, False]
+    assert log.section("cause")[:2, 0].tolist() == [-1, 0]
+
+
+def test_counts_and_the_smallest_h(log):
+    assert (log.interventions, log.infeasible, log.h_min) == (2, 1, -3.25)
+    assert str(log) == (
+        "3 decisions: 2 interventions, 1 infeasible; smallest h -3.25 m^2 (room, t = 0.2 s)"
+    )
+    empty = DecisionLog(log.columns)
+    assert (len(empty), empty.h_min, str(empty)) == (0, np.inf, "an empty log")
+
+
+def test_headings_have_names_and_units(log):
+    assert log.columns.headings == [
+        *("t [s]", "state:x [m]", "state:y"),
+        *("nominal:u [m/s]", "nominal:w", "action:u [m/s]", "action:w"),
+        *("low:u [m/s]", "low:w", "high:u [m/s]", "high:w"),
+        *("h:wall 1", "h:wall 2", "h:room [m^2]"),
+        *("slack:wall 1", "slack:wall 2", "slack:room"),
+        *("intervention", "feasible", "cause"),
+    ]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_file_gives_the_log_back_to_the_last_bit(log, tmp_path, suffix):
+    path = tmp_path / f"log.{suffix}"
+    getattr(log, f"to_{suffix}")(path)
+    found = DecisionLog.read(path)
+    assert found.columns == log.columns
+    np.testing.assert_array_equal(found.table(), log.table())
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_an_empty_log_is_written_too(log, tmp_path, suffix):
+    path, empty = tmp_path / f"log.{suffix}", DecisionLog(log.columns)
+    getattr(empty, f"to_{suffix}")(path)
+    assert len(DecisionLog.read(path)) == 0
+
+
+def test_names_with_commas_and_quotes_are_kept(tmp_path):
+    columns = LogColumns.of(("a,b",), ('"u"',), ("h\n2",), units={"a,b": "%, $"})
+    log = DecisionLog(columns)
+    log.append([0.0, 1.5, 2.0, 1 / 3, -np.inf, np.inf, 0.1, 0.0, 1, 1, 0])
+    for path in (tmp_path / "a.csv", tmp_path / "a.parquet"):
+        (log.to_csv if path.suffix == ".csv" else log.to_parquet)(path)
+        found = DecisionLog.read(path)
+        assert found.columns == columns
+        np.testing.assert_array_equal(found.table(), log.table())
+
+
+def test_what_is_added_later_changes_nothing_before(log, safety_filter):
+    table, state = log.table(), np.array([0.2, 0.1])
+    decision = safety_filter.filter(state, np.zeros(2))
+    section = log.section("h")
+    log.add(0.3, state, decision)
+    state[:] = 7.0
+    np.testing.assert_array_equal(log.table()[:3], table)
+    np.testing.assert_array_equal(log.section("state")[3], [0.2, 0.1])
+    assert len(section) == 3
+
+
+def test_bounds_of_a_period(log, safety_filter):
+    decision = safety_filter.filter(np.zeros(2), np.zeros(2))
+    log.add(0.3, [0.0, 0.0], decision, bounds=[(-1.0, 1.0), (-2.0, 0.5)])
+    log.add(0.4, (0.0, 0.0), decision, bounds=(-1.0, 4.0))
+    np.testing.assert_array_equal(log.section("low")[3:], [[-1.0, -2.0], [-1.0, -1.0]])
+    np.testing.assert_array_equal(log.section("high")[3:], [[1.0, 0.5], [4.0, 4.0]])
+
+
+@pytest.mark.parametrize(
+    ("t", "state"), [(np.nan, [0.0, 0.0]), (0.1, [0.0]), (0.1, "ab"), (0.1, 1.0), (None, [0.0] * 2)]
+)
+def test_what_does_not_fit_is_refused_and_adds_nothing(log, safety_filter, t, state):
+    decision = safety_filter.filter(np.zeros(2), np.zeros(2))
+    with pytest.raises(InvalidInputError, match="the log"):
+        log.add(t, state, decision)
+    assert len(log) == 3
+
+
+def test_a_batch_is_refused(log, safety_filter):
+    with pytest.raises(InvalidInputError, match="one state"):
+        log.add(0.1, np.zeros((2, 2)), safety_filter.filter(np.zeros((2, 2)), np.zeros((2, 2))))
+
+
+def test_units_of_what_is_not_logged_are_refused(safety_filter):
+    with pytest.raises(ConfigurationError, match="'z'"):
+        DecisionLog.for_filter(safety_filter, {"z": "m"})
+    with pytest.raises(ConfigurationError, match="brackets"):
+        DecisionLog.for_filter(safety_filter, {"x": "[m]"})
+
+
+def test_a_log_can_be_copied_and_sent(log):
+    for found in (copy.deepcopy(log), pickle.loads(pickle.dumps(log))):
+        assert found.columns == log.columns
+        np.testing.assert_array_equal(found.table(), log.table())
