@@ -15,6 +15,7 @@ from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.decision_log.columns import LogColumns
 from safe_envs.wrappers.decision_log.files import read_log, write_csv, write_parquet
 from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
@@ -56,7 +57,7 @@ class DecisionLog:
         runtime = [symbol for symbol in qp.runtime if symbol != TIME]
         names = [barrier.name for barrier, _ in safety_filter.pairs]
         log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
-        log._bounds = qp.low, qp.high
+        log._bounds = _endless(qp.low), _endless(qp.high)
         log._defaults = {symbol: model.parameters.get(symbol) for symbol in runtime}
         return log
 
@@ -236,3 +237,8 @@ def _pairs(bounds: Any, m: int) -> tuple[Sequence[float], Sequence[float]]:
     """Return lower and upper bounds, given as one pair or as one for each of m inputs."""
     pairs = np.broadcast_to(np.asarray(bounds, dtype=float), (m, 2))
     return pairs[:, 0].tolist(), pairs[:, 1].tolist()
+
+
+def _endless(bounds: Sequence[float]) -> list[float]:
+    """Return bounds with infinities where a filter has `WIDEST`."""
+    return [math.copysign(math.inf, b) if abs(b) == WIDEST else b for b in bounds]

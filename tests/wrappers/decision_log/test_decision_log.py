@@ -16,6 +16,7 @@ from safe_envs import (
     DecisionLog,
     InvalidInputError,
 )
+from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, SafetyFilter
 from safe_envs.wrappers.decision_log import LogColumns
 
@@ -27,7 +28,7 @@ def safety_filter():
     """Two integrators below walls at x = 1 and y = 2, in a room where |x| stays below 3."""
     plane = ControlAffineSDE((x, y), (u, w), [0, 0], [[1, 0], [0, 1]], [0, 0])
     walls = [Barrier(1 - x, "wall"), Barrier(2 - y, "wall"), Barrier(9 - x**2, "room")]
-    return SafetyFilter(plane, [(wall, CBF(2.0)) for wall in walls], [(-3.0, 3.0)] * 2)
+    return SafetyFilter(plane, walls, CBF(2.0), bounds=(-3.0, 3.0))
 
 
 @pytest.fixture
@@ -137,6 +138,27 @@ def test_what_does_not_fit_is_refused_and_adds_nothing(log, safety_filter, t, st
 def test_a_batch_is_refused(log, safety_filter):
     with pytest.raises(InvalidInputError, match="one state"):
         log.add(0.1, np.zeros((2, 2)), safety_filter.filter(np.zeros((2, 2)), np.zeros((2, 2))))
+
+
+def test_what_comes_in_at_run_time():
+    p, m = sp.symbols("p m", real=True)
+    system = ControlAffineSDE((x,), (u,), [0], [m], [0], {m: 2.0}, {p: 0})
+    safety_filter = SafetyFilter(
+        system, [p - x + TIME], "cbf:alpha=1", bounds=(-np.inf, 3.0), adjustable=("m",)
+    )
+    log = DecisionLog.for_filter(safety_filter, {p: "m"})
+    for t, parameters in ((0.0, {"p": 1.0}), (0.5, {p: 0.5, "m": 4.0})):
+        decision = safety_filter.filter([0.0], [9.0], parameters=parameters, t=t)
+        log.add(t, [0.0], decision, parameters=parameters)
+    assert log.columns.headings[2:4] == ["parameter:p [m]", "parameter:m"]
+    np.testing.assert_array_equal(log.section("parameter"), [[1.0, 2.0], [0.5, 4.0]])
+    np.testing.assert_array_equal(log.section("low"), [[-np.inf], [-np.inf]])
+    np.testing.assert_allclose(log.section("h"), 1.0)
+    # The filter allows m u <= 1 + h.
+    np.testing.assert_allclose(log.section("action"), [[1.0], [0.5]])
+    with pytest.raises(InvalidInputError, match="parameters lacks p"):
+        log.add(1.0, [0.0], decision)
+    assert len(log) == 2
 
 
 def test_units_of_what_is_not_logged_are_refused(safety_filter):
