@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +28,7 @@ def benchmark(
 ) -> None:
     """Measure the speed of filters and envs."""
     from safe_envs import __version__
-    from safe_envs.scripts.reports import benchmark_figures
+    from safe_envs.scripts.reports import benchmark_figures, latency
     from safe_envs.scripts.reports.benchmark_cases import ENV_ID
 
     require_result(json)
@@ -38,6 +38,8 @@ def benchmark(
     cores = f"one of {os.cpu_count()} cores"
     say(console, f"{ENV_ID} with scbf, safe-envs {__version__}, on {cores}\n")
     console.print(_table(figures, earlier))
+    if tails := latency.rows_of(figures):
+        console.print(_latency(tails))
     sides = benchmark_figures.side_by_side(figures)
     if sides:
         console.print(_engines(sides))
@@ -65,6 +67,7 @@ def _read_figures(path: Path) -> dict[str, float]:
 def _table(figures: Mapping[str, float], earlier: Mapping[str, float]) -> Table:
     """Return the figures, and where there are earlier ones, those and the ratio to them."""
     from safe_envs.scripts.reports.benchmark_cases import NUM_ENVS
+    from safe_envs.scripts.reports.latency import is_latency
 
     first = (
         "microseconds for each state, seconds where they are named, or a ratio; vector envs of"
@@ -73,9 +76,22 @@ def _table(figures: Mapping[str, float], earlier: Mapping[str, float]) -> Table:
     titles = ("figure", *["earlier", "figure / earlier"] * bool(earlier))
     table = make_table("pr", first, *titles, tight=False)
     for name, value in figures.items():
+        # Tails have a table of their own; here they are compared only.
+        if is_latency(name) and name not in earlier:
+            continue
         before = earlier.get(name)
         ratio = ["-", "-"] if not before else [f"{before:.3g}", f"{value / before:.2f}"]
         table.add_row(name, f"{value:.3g}", *ratio * bool(earlier))
+    return table
+
+
+def _latency(tails: Mapping[str, Sequence[float]]) -> Table:
+    """Return the times of single decisions: the middle and the tail of their distribution."""
+    from safe_envs.scripts.reports.latency import COLUMNS
+
+    table = make_table("pr", "one decision, microseconds of processor time", *COLUMNS, tight=False)
+    for name, values in tails.items():
+        table.add_row(name, *(f"{value:.1f}" for value in values))
     return table
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import mmap
@@ -17,7 +18,7 @@ from safe_envs.agents.training import vec_env_speed as sb3_speed
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import benchmark
-from safe_envs.scripts.reports import benchmark_cases, benchmark_figures
+from safe_envs.scripts.reports import benchmark_cases, benchmark_figures, latency
 from safe_envs.scripts.reports.benchmark_cases import Case
 from safe_envs.scripts.reports.hand_written_loop import step_by_hand
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
@@ -43,12 +44,17 @@ def quick(monkeypatch):
     }
     monkeypatch.setattr(benchmark_figures, "_LEARNED", learned)
     monkeypatch.setattr(benchmark_figures, "_EPISODES", {"numpy": 20, "compiled": 2})
+    monkeypatch.setattr(latency, "_CALLS", 50)
+    monkeypatch.setattr(latency, "_DRAWN", 1024)
 
 
 @pytest.mark.slow
 def test_figures_are_finite_and_positive_and_ratios_fit(quick, monkeypatch):
     monkeypatch.setattr(benchmark_figures, "is_available", lambda: False)
     figures = benchmark_figures.measure()
+    tails = {name: figures.pop(name) for name in list(figures) if latency.is_latency(name)}
+    assert all(math.isfinite(value) for value in tails.values())
+    assert len(tails) == 6 * len(latency.COLUMNS)
     faults = [figures.pop(name) for name in list(figures) if name.startswith("page faults")]
     assert all(fault >= 0 for fault in faults)
     assert all(math.isfinite(value) and value > 0 for value in figures.values())
@@ -81,6 +87,7 @@ def test_engines_stand_side_by_side(quick, monkeypatch, capsys):
     for name in ("filter_calls", "several_constraints"):
         monkeypatch.setattr(benchmark_figures, name, dict)
     monkeypatch.setattr(benchmark_figures, "_LEARNED", {})
+    monkeypatch.setattr(latency, "cases", dict)
     monkeypatch.setattr(
         benchmark_figures, "scalar_steps", lambda: dict.fromkeys(STEPS, Case(lambda: None))
     )
@@ -175,6 +182,48 @@ def test_the_fused_loop_does_the_work_of_the_filter():
     np.testing.assert_allclose(turned, result.action[:, 0], rtol=1e-9, atol=1e-9)
     assert result.active.any()
     assert not result.active.all()
+
+
+def test_decisions_that_are_timed_are_what_their_names_say(monkeypatch):
+    monkeypatch.setattr(latency, "_DRAWN", 2048)
+    for name, calls in latency.cases().items():
+        found = calls.decisions()
+        assert len(calls.states) > 20
+        assert (found.active.any(axis=1) == ("free" not in name)).all()
+        assert (found.feasible == ("infeasible" not in name)).all()
+        constraints, inputs = found.slack.shape[1], found.action.shape[1]
+        expected = (3, 4) if "Quadrotor" in name else (1 if "one" in name else 3, 2)
+        assert (constraints, inputs) == expected
+
+
+def test_times_of_decisions_grow_from_the_middle_to_the_end(monkeypatch, capsys):
+    monkeypatch.setattr(latency, "_CALLS", 200)
+    monkeypatch.setattr(latency, "_DRAWN", 512)
+    cases = {name: c for name, c in latency.cases().items() if "one constraint" in name}
+    monkeypatch.setattr(latency, "cases", lambda: cases)
+    figures = latency.measure()
+    for values in latency.rows_of(figures).values():
+        assert len(values) == len(latency.COLUMNS)
+        median, p99, p999, most, p999_off, most_off, collections = values
+        assert median <= p99 <= p999 <= most
+        assert p999_off <= most_off
+        assert collections >= 0
+    monkeypatch.setattr(benchmark_figures, "measure", lambda: figures)
+    benchmark.benchmark()
+    out = capsys.readouterr().out
+    assert all(name in out for name in (*cases, "p99.9", "gc off: max"))
+    assert "latency, " not in out
+
+
+def test_collections_are_counted_and_switched_off():
+    with latency._counted_collections() as counted:
+        gc.collect()
+        with latency._without_collections():
+            assert not gc.isenabled()
+        assert gc.isenabled()
+    found = counted[0]
+    gc.collect()
+    assert 2 <= found == counted[0]
 
 
 def test_page_faults_are_those_of_fresh_memory():

@@ -12,6 +12,7 @@ import sympy as sp
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.registry import make_problem
 from safe_envs.scripts.reports.hand_written_loop import LIMIT, step_by_hand
@@ -21,12 +22,10 @@ from safe_envs.wrappers import (
     SafetyFilter,
     SafetyFilterVectorWrapper,
     SafetyFilterWrapper,
-    parse_conditions,
 )
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 NUM_ENVS = 1024
-_LIMITS = "safe_envs/QuadrotorLimits-v0"
 _BATCHES = (1, 32, 1024, 10_000)
 
 
@@ -60,8 +59,16 @@ def filter_calls() -> dict[str, Case]:
     return cases
 
 
-def several_constraints() -> dict[str, Case]:
-    """Return filter calls with three constraints: of a point mass in the plane, and a quadrotor."""
+def obstacle_course(constraints: int, states: int) -> tuple[SafetyFilter, np.ndarray, np.ndarray]:
+    """Return the filter of a point mass in the plane, with states and proposed inputs.
+
+    Args:
+        constraints: how many, from 1 to 3: an obstacle, a wall, a limit of its speed.
+        states: how many, all outside the obstacle.
+
+    Returns:
+        The filter, the states (B, 4), and the inputs (B, 2).
+    """
     x, y, v, w, a, b = sp.symbols("x y v w a b", real=True)
     point = ControlAffineSDE(
         (x, y, v, w), (a, b), [v, w, 0, 0], [[0, 0], [0, 0], [1, 0], [0, 1]], [0, 0, 0, 0]
@@ -71,22 +78,42 @@ def several_constraints() -> dict[str, Case]:
         (Barrier(3 - x), HOCBF((1, 1))),
         (Barrier(1 - v**2 - w**2), CBF(1.0)),
     ]
-    in_plane = SafetyFilter(point, barriers, bounds=[(-2.0, 2.0)] * 2)
+    safety_filter = SafetyFilter(point, barriers[:constraints], bounds=(-2.0, 2.0))
     rng = np.random.default_rng(0)
-    angle, radius = rng.uniform(0, 2 * np.pi, NUM_ENVS), rng.uniform(1.1, 2.0, NUM_ENVS)
-    states = np.stack(
-        [radius * np.cos(angle), radius * np.sin(angle), *rng.uniform(-0.6, 0.6, (2, NUM_ENVS))],
+    angle, radius = rng.uniform(0, 2 * np.pi, states), rng.uniform(1.1, 2.0, states)
+    drawn = np.stack(
+        [radius * np.cos(angle), radius * np.sin(angle), *rng.uniform(-0.6, 0.6, (2, states))],
         axis=1,
     )
-    inputs = rng.uniform(-3.0, 3.0, (NUM_ENVS, 2))
-    acting = np.flatnonzero(in_plane.filter(states, inputs).active.any(axis=1))[0]
-    problem = gym.make(_LIMITS).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
-    limits = SafetyFilter.for_problem(problem, parse_conditions("hocbf", problem))
-    envs = gym.make_vec(_LIMITS, num_envs=NUM_ENVS)
-    envs.reset(seed=0)
-    flying = envs.unwrapped.state + rng.normal(0.0, 0.7, (NUM_ENVS, 12))  # pyright: ignore[reportAttributeAccessIssue]
+    return safety_filter, drawn, rng.uniform(-3.0, 3.0, (states, 2))
+
+
+def flights_within_limits(
+    deviation: float, states: int
+) -> tuple[SafetyFilter, np.ndarray, np.ndarray]:
+    """Return the filter of QuadrotorLimits, with states around its starts and proposed inputs.
+
+    Args:
+        deviation: standard deviation of each state from a start.
+        states: how many.
+
+    Returns:
+        The filter, the states (B, 12), and inputs (B, 4) anywhere within the bounds.
+    """
+    problem, rng = make_problem("safe_envs/QuadrotorLimits-v0"), np.random.default_rng(0)
     low, high = np.transpose(problem.box)
-    rotors = rng.uniform(low, high, (NUM_ENVS, 4))
+    envs = SafeVectorEnv(problem, states)
+    envs.reset(seed=0)
+    drawn = envs.state + rng.normal(0.0, deviation, envs.state.shape)
+    inputs = rng.uniform(low, high, (states, len(low)))
+    return SafetyFilter.for_problem(problem, "hocbf"), drawn, inputs
+
+
+def several_constraints() -> dict[str, Case]:
+    """Return filter calls with three constraints: of a point mass in the plane, and a quadrotor."""
+    in_plane, states, inputs = obstacle_course(3, NUM_ENVS)
+    acting = np.flatnonzero(in_plane.filter(states, inputs).active.any(axis=1))[0]
+    limits, flying, rotors = flights_within_limits(0.7, NUM_ENVS)
     return {
         "three constraints, two inputs, 1 state": Case(
             lambda: in_plane.filter(states[acting], inputs[acting])

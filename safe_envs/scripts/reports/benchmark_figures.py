@@ -12,6 +12,7 @@ import numpy as np
 
 from safe_envs.compiled.program import is_available
 from safe_envs.registry import make_problem
+from safe_envs.scripts.reports import latency
 from safe_envs.scripts.reports.benchmark_cases import (
     ENV_ID,
     NUM_ENVS,
@@ -28,7 +29,7 @@ from safe_envs.wrappers.learning import LearnedModel, learner_of
 from safe_envs.wrappers.learning.data.collection import draw_states
 
 Figures = dict[str, float]
-"""Numbers by name; times of cases are in microseconds for each state."""
+"""Numbers by name; times of cases are in microseconds for each state, or for each call."""
 
 FUSED = "hand-fused loop"
 BY_HAND = "hand-written compiled loop"
@@ -73,6 +74,7 @@ def measure() -> Figures:
         ),
         **_ratios_of_vector_envs(times),
         **_page_faults(cases["vector env, filtered"]),
+        **latency.measure(),
         **seconds,
         **_of_engine("numpy"),
         **({COMPILED + name: v for name, v in _of_engine("compiled").items()} if compiled else {}),
