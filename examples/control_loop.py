@@ -17,6 +17,7 @@ from safe_envs.problem.signals import TIME
 PERIOD = 0.01
 AHEAD, BODY, PERSON = 0.2, 0.25, 0.3  # of the look-ahead point, and radii, in m
 TRACK, GYRATION = 0.4, 0.17  # distance of the wheels and radius of gyration in m
+CLEARANCE = AHEAD + BODY  # of the look-ahead point, so that all of the body is clear
 GOAL = np.array([7.0, 0.2])
 
 x, y, theta, v, omega, mass = sp.symbols("x y theta v omega mass", real=True)
@@ -37,19 +38,20 @@ robot = ControlAffineSDE.from_rate(
     # What is measured at each call, with its rate: a person goes on at the same speed.
     signals={s: rate for a, b, c, d in people for s, rate in ((a, c), (b, d), (c, 0), (d, 0))},
 )
-# A point ahead of the axle can be pushed in any direction at once, the axle itself cannot. What it
-# keeps clear of, the body keeps clear of too.
+# A point ahead of the axle can be pushed in any direction at once; the axle itself cannot.
 ahead_x, ahead_y = x + AHEAD * sp.cos(theta), y + AHEAD * sp.sin(theta)
-gate = 1.6 - 0.5 * (1 + sp.tanh(TIME - 5))  # comes down from 1.6 m to 0.6 m around t = 5 s
+gate = 1.8 - 0.5 * (1 + sp.tanh(TIME - 5))  # comes down from 1.8 m to 0.8 m around t = 5 s
 barriers = [
     *(
-        Barrier(
-            (ahead_x - a) ** 2 + (ahead_y - b) ** 2 - (AHEAD + BODY + PERSON) ** 2, f"person {i}"
-        )
+        Barrier((ahead_x - a) ** 2 + (ahead_y - b) ** 2 - (CLEARANCE + PERSON) ** 2, f"person {i}")
         for i, (a, b, _, _) in enumerate(people, 1)
     ),
-    Barrier(gate - BODY - ahead_y, "gate"),
+    Barrier(gate - CLEARANCE - ahead_y, "gate"),
 ]
+rate = sp.lambdify(
+    (robot.states, robot.inputs, mass),
+    list(robot.drift + robot.input_matrix * sp.Matrix(robot.inputs)),
+)
 UNITS = {x: "m", y: "m", theta: "rad", v: "m/s", omega: "rad/s", left: "N", right: "N"}
 
 
@@ -77,23 +79,14 @@ def propose(state: np.ndarray) -> np.ndarray:
 def move(state: np.ndarray, force: np.ndarray, weight: float) -> np.ndarray:
     """Simulate one period, with the forces held."""
     for _ in range(10):
-        _, _, heading, speed, turning = state
-        spin = (force[1] - force[0]) * TRACK / (2 * weight * GYRATION**2)
-        rate = [
-            speed * np.cos(heading),
-            speed * np.sin(heading),
-            turning,
-            force.sum() / weight,
-            spin,
-        ]
-        state = state + 0.1 * PERIOD * np.array(rate)
+        state = state + 0.1 * PERIOD * np.array(rate(state, force, weight))
     return state
 
 
-def run(seconds: float = 11.0) -> tuple[DecisionLog, np.ndarray]:
+def run(gains: str = "3,3", seconds: float = 11.0) -> tuple[DecisionLog, np.ndarray]:
     """Run the loop; return its log, and how long each decision took in s."""
     safety_filter = SafetyFilter(
-        robot, barriers, "hocbf:p=3,3", bounds=(-20.0, 20.0), adjustable=("mass",)
+        robot, barriers, f"hocbf:p={gains}", bounds=(-20.0, 20.0), adjustable=("mass",)
     )
     log = DecisionLog.for_filter(safety_filter, UNITS)
     state, latency = np.zeros(5), []

@@ -1,4 +1,4 @@
-"""The pictures of the page of concepts, computed when the site is built."""
+"""The pictures of concepts and of a control loop, computed when the site is built."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from runs import ROOT
 
 import safe_envs  # noqa: F401  (registers the ids)
-from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, plot_log
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.object_import import load_object
 from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
@@ -36,6 +38,7 @@ def pictures() -> dict[str, bytes]:
             "assets/chain.png": _written(_chain()),
             "assets/qp.png": _written(_qp()),
             "assets/bounds.png": _written(_bounds()),
+            "assets/control-loop.png": _written(_control_loop()),
         }
 
 
@@ -163,6 +166,12 @@ def _draw_qp(axes: Axes, constraint: np.ndarray, nominal: np.ndarray, result: An
         color=QUIET,
     )
     axes.set(aspect="equal", xlabel="$a_x$ (m/s²)", ylabel="$a_y$ (m/s²)")
+
+
+def _control_loop() -> Figure:
+    """Draw the log of the example of a control loop."""
+    log, _ = load_object(f"{ROOT / 'examples' / 'control_loop.py'}:run")()
+    return plot_log(log)
 
 
 def _bounds() -> Figure:
