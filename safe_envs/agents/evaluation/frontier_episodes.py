@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.rollout import play
 from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.trajectories import EpisodeRecorder
 from safe_envs.agents.policies.base import Policy
 from safe_envs.dynamics.codegen import Components, compile_function, filled
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -24,14 +24,14 @@ from safe_envs.wrappers.value.priced_values import PricedValues
 _BATCH = 1024
 
 
-class _LastStates(Trajectories):
+class _LastStates(EpisodeRecorder):
     """Keeps the state in which each episode of a batch ended."""
 
     def __init__(self) -> None:
         self.last: list[np.ndarray] = []
 
     def note(self, k: int, first: int, present: np.ndarray, h: np.ndarray, x: Components) -> None:
-        """Keep the states of the episodes that are under way; see `Trajectories.note`."""
+        """Keep the states of the episodes that are under way; see `EpisodeRecorder.note`."""
         if k == 0:
             self.last = [np.array(c, dtype=np.float64) for c in x]
         for kept, component in zip(self.last, x, strict=True):

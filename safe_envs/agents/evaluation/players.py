@@ -13,7 +13,7 @@ from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation
 from safe_envs.agents.evaluation.rollout import play, play_in_processes
 from safe_envs.agents.evaluation.spec import Progress, RunSettings
 from safe_envs.agents.evaluation.targets import Env
-from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.trajectories import EpisodeRecorder
 from safe_envs.agents.jobs.threads import available_threads
 from safe_envs.compiled.engine import compiled_or_none
 from safe_envs.errors import NotCompilableError
@@ -50,7 +50,7 @@ class NumpyPlayer:
         self._env: Env = resolved.env(conditions, self._size)
 
     def play(
-        self, progress: Progress | None = None, trajectories: Trajectories | None = None
+        self, progress: Progress | None = None, trajectories: EpisodeRecorder | None = None
     ) -> Iterator[PlayedBatch]:
         """Simulate all episodes.
 
@@ -79,7 +79,7 @@ class NumpyPlayer:
         self,
         episodes: range,
         progress: Progress | None = None,
-        trajectories: Trajectories | None = None,
+        trajectories: EpisodeRecorder | None = None,
     ) -> Iterator[PlayedBatch]:
         """Simulate some of the episodes in this process; see `play`."""
         return play(
@@ -146,7 +146,7 @@ class CompiledPlayer:
         return self._reference()
 
     def play(
-        self, progress: Progress | None = None, trajectories: Trajectories | None = None
+        self, progress: Progress | None = None, trajectories: EpisodeRecorder | None = None
     ) -> Iterator[PlayedBatch]:
         """Simulate all episodes; see `NumpyPlayer.play`."""
         done = 0

@@ -12,7 +12,7 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponent
 from safe_envs.agents.evaluation.episode_batch import EpisodeBatch, PlayedBatch
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.targets import Env
-from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.trajectories import EpisodeRecorder
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.processes import compute_in_order
 from safe_envs.agents.policies.base import Policy
@@ -48,7 +48,7 @@ def play(
     episodes: range,
     seed: int,
     progress: Progress | None = None,
-    trajectories: Trajectories | None = None,
+    trajectories: EpisodeRecorder | None = None,
     bridge: BrownianBridge | None = None,
 ) -> Iterator[PlayedBatch]:
     """Simulate consecutive episodes in batches of the size of the vector env.
@@ -168,7 +168,7 @@ def _play(
     first: int,
     count: int,
     progress: Progress | None,
-    trajectories: Trajectories | None,
+    trajectories: EpisodeRecorder | None,
     watch: _MinimumWatch | None,
 ) -> EpisodeBatch:
     """Simulate a batch that was just reset and begins with the episode `first`."""

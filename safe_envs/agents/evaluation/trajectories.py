@@ -16,7 +16,35 @@ _DECIDED = ("intervention", "feasible", "active_barrier")
 _MOST_RECORDED = 1_000_000
 
 
-class Trajectories:
+class EpisodeRecorder:
+    """Receives what happens in the episodes of a rollout; this one forgets it."""
+
+    def note(self, k: int, first: int, present: np.ndarray, h: np.ndarray, x: Components) -> None:
+        """Keep instant k of a batch that begins with the episode `first`.
+
+        Args:
+            k: the instant.
+            first: number of the first episode.
+            present: which episodes are under way, shape (B,).
+            h: smallest barrier values, shape (B,).
+            x: components of the states, each of shape (B,).
+        """
+
+    def note_decision(
+        self, k: int, x: Components, barriers: np.ndarray, executed: Components, info: Info
+    ) -> None:
+        """Keep the decision at instant k of the first episode, which is the first of its batch.
+
+        Args:
+            k: the instant.
+            x: components of the states at which was decided, each of shape (B,).
+            barriers: their values there, shape (B, number of barriers).
+            executed: components of the inputs, each of shape (B,).
+            info: of the step, with the keys of a filter if there is one.
+        """
+
+
+class Trajectories(EpisodeRecorder):
     """Trajectories of the first episodes, NaN after their ends.
 
     Attributes:
@@ -48,15 +76,7 @@ class Trajectories:
         self._dt, self._bounds = problem.dt, np.transpose(problem.box)
 
     def note(self, k: int, first: int, present: np.ndarray, h: np.ndarray, x: Components) -> None:
-        """Keep instant k of a batch that begins with the episode `first`.
-
-        Args:
-            k: the instant.
-            first: number of the first episode.
-            present: which episodes are under way, shape (B,).
-            h: smallest barrier values, shape (B,).
-            x: components of the states, each of shape (B,).
-        """
+        """See `EpisodeRecorder`."""
         self._put(self.barrier[k], first, present, h)
         for j, component in enumerate(x):
             self._put(self.states[k, :, j], first, present, component)
@@ -64,15 +84,7 @@ class Trajectories:
     def note_decision(
         self, k: int, x: Components, barriers: np.ndarray, executed: Components, info: Info
     ) -> None:
-        """Keep the decision at instant k of the first episode, which is the first of its batch.
-
-        Args:
-            k: the instant.
-            x: components of the states at which was decided, each of shape (B,).
-            barriers: their values there, shape (B, number of barriers).
-            executed: components of the inputs, each of shape (B,).
-            info: of the step, with the keys of a filter if there is one.
-        """
+        """See `EpisodeRecorder`."""
         action = [float(component[0]) for component in executed]
         filtered = "safe_action" in info
         self.log.append(
