@@ -151,6 +151,19 @@ class DecisionLog:
         table = np.frombuffer(self._values).reshape(-1, self._width)
         return table[:, self.columns.sections[name]].copy()
 
+    def between(self, start: float | None = None, end: float | None = None) -> DecisionLog:
+        """Return a log of the periods between two times, both included.
+
+        Args:
+            start: in s; by default that of the log.
+            end: in s; by default that of the log.
+        """
+        t, found = self.t, DecisionLog(self.columns)
+        first = 0 if start is None else int(np.searchsorted(t, start, "left"))
+        last = len(t) if end is None else int(np.searchsorted(t, end, "right"))
+        found._values = self._values[first * self._width : max(first, last) * self._width]
+        return found
+
     @property
     def t(self) -> np.ndarray:
         """Times in s, shape (periods,)."""
