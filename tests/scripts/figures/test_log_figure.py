@@ -108,6 +108,8 @@ def test_what_cannot_be_drawn_is_refused(tmp_path):
     ):
         with pytest.raises(ConfigurationError, match=reason):
             plot_log(log, **arguments)
+    with pytest.raises(ConfigurationError, match="no path"):
+        plot_log(5)
     with pytest.raises(ConfigurationError, match="0 periods"):
         plot_log(DecisionLog(COLUMNS))
     assert not list(tmp_path.iterdir())

@@ -112,6 +112,8 @@ def test_a_part_between_two_times(log):
     part = log.between(0.1, 0.1)
     np.testing.assert_array_equal(part.table(), log.table()[1:2])
     assert (part.interventions, part.infeasible, len(log)) == (1, 0, 3)
+    with pytest.raises(ConfigurationError, match="start"):
+        log.between("now")
     assert len(log.between(3.0)) == len(log.between(0.2, 0.1)) == 0
 
 
@@ -175,6 +177,10 @@ def test_units_of_what_is_not_logged_are_refused(safety_filter):
         DecisionLog.for_filter(safety_filter, {"z": "m"})
     with pytest.raises(ConfigurationError, match="brackets"):
         DecisionLog.for_filter(safety_filter, {"x": "[m]"})
+    with pytest.raises(ConfigurationError, match="units = 'm'"):
+        DecisionLog.for_filter(safety_filter, "m")
+    with pytest.raises(ConfigurationError, match="no SafetyFilter"):
+        DecisionLog.for_filter(safety_filter.qp)
 
 
 def test_a_log_can_be_copied_and_sent(log):
