@@ -63,7 +63,7 @@ def draw(evaluation: Evaluation, path: Path) -> None:
 def _first_episodes(evaluation: Evaluation, colors: dict[str, str]) -> dict[str, LogPanels]:
     """Return the panels of the first episode under each filter, as many as fit."""
     return {
-        name: LogPanels(each.log, slice(None), LogColors(QUIET, colors[name], (colors[name],)))
+        name: LogPanels(each.log, LogColors(QUIET, colors[name], (colors[name],)))
         for name, each in list(evaluation.trajectories.items())[:_MOST_EPISODES]
     }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -50,8 +49,14 @@ def plot_log(
     Raises:
         ConfigurationError: The file cannot be read or written, or there is nothing to draw.
     """
-    log = log if isinstance(log, DecisionLog) else DecisionLog.read(log)
-    drawn = LogPanels(log, _between(log, start, end))
+    whole = log if isinstance(log, DecisionLog) else DecisionLog.read(log)
+    log = whole if start is None and end is None else whole.between(start, end)
+    if not len(log):
+        raise ConfigurationError(
+            f"nothing to draw between start = {start} and end = {end}: the log has {len(whole)}"
+            f" periods{f' from {whole.t[0]:g} to {whole.t[-1]:g} s' if len(whole) else ''}"
+        )
+    drawn = LogPanels(log)
     with mpl.rc_context(STYLE):
         left, right = drawn.handles(), drawn.barrier_handles()
         height = 0.9 + _HEIGHT * drawn.count + _LINE * max(len(left), len(right))
@@ -66,18 +71,6 @@ def plot_log(
         if out is not None:
             _write(figure, Path(out))
     return figure
-
-
-def _between(log: DecisionLog, start: float | None, end: float | None) -> slice:
-    t = log.t
-    first = 0 if start is None else int(np.searchsorted(t, start, "left"))
-    last = len(t) if end is None else int(np.searchsorted(t, end, "right"))
-    if first >= last:
-        there = f"has {len(t)} periods{f' from {t[0]:g} to {t[-1]:g} s' if len(t) else ''}"
-        raise ConfigurationError(
-            f"nothing to draw between start = {start} and end = {end}: the log {there}"
-        )
-    return slice(first, last)
 
 
 def _write(figure: Figure, path: Path) -> None:

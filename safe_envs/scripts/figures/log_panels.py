@@ -53,11 +53,10 @@ class LogColors:
 
 
 class LogPanels:
-    """Draws the rows of a log between two times.
+    """Draws a log that is not empty.
 
     Args:
         log: to draw.
-        shown: its rows, at least one.
         colors: of the lines.
 
     Attributes:
@@ -66,18 +65,15 @@ class LogPanels:
         count: number of panels.
     """
 
-    def __init__(self, log: DecisionLog, shown: slice, colors: LogColors | None = None) -> None:
-        self._log, self._shown, self._colors = log, shown, colors or LogColors()
-        t = self._t = log.t[shown]
+    def __init__(self, log: DecisionLog, colors: LogColors | None = None) -> None:
+        self._log, self._colors = log, colors or LogColors()
+        t = self._t = log.t
         # The last period is taken to be as long as usual.
         last = t[-1] + (np.median(np.diff(t)) if len(t) > 1 else 1.0)
         self._ends = np.append(t[1:], last)
-        self.slack = bool(self._section("slack").any())
+        self.slack = bool(log.section("slack").any())
         self.barrier_panel = len(log.columns.inputs)
         self.count = self.barrier_panel + 1 + self.slack
-
-    def _section(self, name: str) -> np.ndarray:
-        return self._log.section(name)[self._shown]
 
     def draw(self, panels: Sequence[Axes]) -> None:
         """Draw inputs, h, and slacks where there is a panel for them.
@@ -103,13 +99,13 @@ class LogPanels:
             Line2D([], [], **_BOUNDS, label="input bounds"),
             Patch(**_INTERVENTION, label="intervention"),
         ]
-        if not self._log.feasible[self._shown].all():
+        if not self._log.feasible.all():
             found.append(Patch(**_INFEASIBLE, label="infeasible"))
         return found
 
     def barrier_handles(self) -> list[Any]:
         """Return entries of a legend for the barriers, with the smallest value of each."""
-        h, names = self._section("h"), self._log.columns.barriers
+        h, names = self._log.section("h"), self._log.columns.barriers
         return [
             Line2D(
                 [],
@@ -123,7 +119,7 @@ class LogPanels:
 
     def _draw_input(self, panel: Axes, j: int) -> None:
         nominal, action, low, high = (
-            self._section(name)[:, j] for name in ("nominal", "action", "low", "high")
+            self._log.section(name)[:, j] for name in ("nominal", "action", "low", "high")
         )
         steps: Any = {"drawstyle": "steps-post"}
         panel.plot(self._t, nominal, color=self._colors.nominal, **_PROPOSED, **steps)
@@ -140,12 +136,12 @@ class LogPanels:
         panel.set(ylim=(bottom - room, top + room), ylabel=self._label(j))
 
     def _draw_barriers(self, panel: Axes) -> None:
-        h = self._section("h")
+        h = self._log.section("h")
         for i in range(h.shape[1]):
             panel.plot(self._t, h[:, i], **self._colors.barrier(i), linewidth=1.6)
         smallest = min(h.min(), 0.0)
-        # The nearest barrier is always seen, and each one where it is nearest.
-        top = min(h.max(), max(h.min(axis=1).max(), 2.0 * h.min(axis=0).max()))
+        # The smallest h is always seen; others, of another scale perhaps, leave the panel.
+        top = max(h.min(axis=1).max(), 0.0)
         room = 0.06 * max(top - smallest, 1e-12)
         bottom = smallest - 2.0 * room
         # Whoever compares panels may move their lower end.
@@ -158,15 +154,15 @@ class LogPanels:
         panel.set(ylim=(bottom, top + room), ylabel=f"h{unit}")
 
     def _draw_slacks(self, panel: Axes) -> None:
-        slack = self._section("slack")
+        slack = self._log.section("slack")
         for i in range(slack.shape[1]):
             panel.plot(self._t, slack[:, i], **self._colors.barrier(i), drawstyle="steps-post")
         panel.set(ylim=(0.0, 1.08 * slack.max() or 1.0), ylabel="slack")
 
     def _mark(self, panel: Axes) -> None:
         """Shade the periods with interventions, and hatch the infeasible ones."""
-        infeasible = ~self._log.feasible[self._shown]
-        intervened = self._log.intervention[self._shown] & ~infeasible
+        infeasible = ~self._log.feasible
+        intervened = self._log.intervention & ~infeasible
         for flags, style in ((intervened, _INTERVENTION), (infeasible, _INFEASIBLE)):
             spans = [(self._t[i], self._ends[k - 1]) for i, k in _runs(flags)]
             corners = [[(a, 0.0), (b, 0.0), (b, 1.0), (a, 1.0)] for a, b in spans]

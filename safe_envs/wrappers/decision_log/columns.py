@@ -58,15 +58,20 @@ class LogColumns:
             units: by symbol or name.
 
         Raises:
-            ConfigurationError: A unit is of nothing that is logged, or holds a bracket.
+            ConfigurationError: The units are no mapping, or one is of nothing that is logged or
+                holds a bracket.
         """
+        if not isinstance(units, Mapping | None):
+            raise ConfigurationError(
+                f"units = {shown(units)}; give a dict of texts, such as {{'x': 'm'}}"
+            )
         count, number = Counter(barriers), Counter()
         names = []
         for name in barriers:
             number[name] += 1
             names.append(f"{name} {number[name]}" if count[name] > 1 else name)
         parts = [tuple(map(str, part)) for part in (states, inputs, names, parameters)]
-        given = {str(name): str(unit) for name, unit in (units or {}).items()}
+        given = {str(name): str(unit) for name, unit in (units or {}).items() if unit}
         known = list(itertools.chain(*parts))
         for name, unit in given.items():
             if name not in known:
@@ -76,17 +81,17 @@ class LogColumns:
         return cls(*parts, units=given)
 
     @cached_property
+    def _names(self) -> dict[str, tuple[str, ...]]:
+        """Names of what each section holds."""
+        each = (self.states, self.parameters, *[self.inputs] * 4, *[self.barriers] * 2)
+        return dict(zip(_SECTIONS, each, strict=True))
+
+    @cached_property
     def sections(self) -> dict[str, slice]:
         """Where the columns of each section are."""
-        widths = {
-            "t": 1,
-            "state": len(self.states),
-            "parameter": len(self.parameters),
-            **dict.fromkeys(("nominal", "action", "low", "high"), len(self.inputs)),
-            **dict.fromkeys(("h", "slack"), len(self.barriers)),
-            **dict.fromkeys(_FLAGS, 1),
-        }
-        ends = list(itertools.accumulate(widths.values()))
+        widths = {"t": 1, **{name: len(of) for name, of in self._names.items()}}
+        widths |= dict.fromkeys(_FLAGS, 1)
+        ends = itertools.accumulate(widths.values())
         return {
             name: slice(end - width, end)
             for (name, width), end in zip(widths.items(), ends, strict=True)
@@ -95,30 +100,15 @@ class LogColumns:
     @cached_property
     def headings(self) -> list[str]:
         """Return the names of all columns."""
-        of = dict(
-            zip(
-                _SECTIONS,
-                (
-                    self.states,
-                    self.parameters,
-                    *[self.inputs] * 4,
-                    *[self.barriers] * 2,
-                ),
-                strict=True,
-            )
-        )
-        return [
-            "t [s]",
-            *(
-                f"{section}:{name}{self._bracketed(name) if section != 'slack' else ''}"
-                for section, names in of.items()
-                for name in names
-            ),
-            *_FLAGS,
+        named = [
+            f"{section}:{name}{self._bracketed(name) if section != 'slack' else ''}"
+            for section, names in self._names.items()
+            for name in names
         ]
+        return ["t [s]", *named, *_FLAGS]
 
     def _bracketed(self, name: str) -> str:
-        return f" [{self.units[name]}]" if self.units.get(name) else ""
+        return f" [{self.units[name]}]" if name in self.units else ""
 
     @classmethod
     def read(cls, headings: Sequence[str]) -> LogColumns:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import InvalidInputError, shown
+from safe_envs.errors import ConfigurationError, InvalidInputError, shown
+from safe_envs.number_text import finite_number
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.decision_log.columns import LogColumns
 from safe_envs.wrappers.decision_log.files import read_log, write_csv, write_parquet
@@ -51,8 +52,12 @@ class DecisionLog:
             units: of states, inputs, run-time parameters and barriers, by symbol or name.
 
         Raises:
-            ConfigurationError: A unit is of nothing that is logged.
+            ConfigurationError: What is given is no filter, or a unit is of nothing that is logged.
         """
+        if not isinstance(safety_filter, SafetyFilter):
+            raise ConfigurationError(
+                f"{shown(safety_filter)} is no SafetyFilter; give the one that decides"
+            )
         qp, model = safety_filter.qp, safety_filter.model
         runtime = [symbol for symbol in qp.runtime if symbol != TIME]
         names = [barrier.name for barrier, _ in safety_filter.pairs]
@@ -151,6 +156,25 @@ class DecisionLog:
         table = np.frombuffer(self._values).reshape(-1, self._width)
         return table[:, self.columns.sections[name]].copy()
 
+    def between(self, start: float | None = None, end: float | None = None) -> DecisionLog:
+        """Return a log of the periods between two times, both included.
+
+        Args:
+            start: in s; by default that of the log.
+            end: in s; by default that of the log.
+
+        Raises:
+            ConfigurationError: A time is no finite number.
+        """
+        t, found = self.t, DecisionLog(self.columns)
+        first, last = 0, len(t)
+        if start is not None:
+            first = int(np.searchsorted(t, finite_number("start", start), "left"))
+        if end is not None:
+            last = int(np.searchsorted(t, finite_number("end", end), "right"))
+        found._values = self._values[first * self._width : max(first, last) * self._width]
+        return found
+
     @property
     def t(self) -> np.ndarray:
         """Times in s, shape (periods,)."""
@@ -227,6 +251,8 @@ class DecisionLog:
         Raises:
             ConfigurationError: The file cannot be read, is too large, or holds no log.
         """
+        if not isinstance(path, str | Path):
+            raise ConfigurationError(f"{shown(path)} is no path; give FILE.csv or FILE.parquet")
         columns, table = read_log(Path(path))
         log = cls(columns)
         log._values.frombytes(np.ascontiguousarray(table, dtype=np.float64).tobytes())

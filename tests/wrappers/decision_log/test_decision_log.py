@@ -106,6 +106,17 @@ def test_names_with_commas_and_quotes_are_kept(tmp_path):
         np.testing.assert_array_equal(found.table(), log.table())
 
 
+def test_a_part_between_two_times(log):
+    assert log.between(0.05).t.tolist() == [0.1, 0.2]
+    assert log.between(end=0.1).t.tolist() == [0.0, 0.1]
+    part = log.between(0.1, 0.1)
+    np.testing.assert_array_equal(part.table(), log.table()[1:2])
+    assert (part.interventions, part.infeasible, len(log)) == (1, 0, 3)
+    with pytest.raises(ConfigurationError, match="start"):
+        log.between("now")
+    assert len(log.between(3.0)) == len(log.between(0.2, 0.1)) == 0
+
+
 def test_what_is_added_later_changes_nothing_before(log, safety_filter):
     table, state = log.table(), np.array([0.2, 0.1])
     decision = safety_filter.filter(state, np.zeros(2))
@@ -166,6 +177,10 @@ def test_units_of_what_is_not_logged_are_refused(safety_filter):
         DecisionLog.for_filter(safety_filter, {"z": "m"})
     with pytest.raises(ConfigurationError, match="brackets"):
         DecisionLog.for_filter(safety_filter, {"x": "[m]"})
+    with pytest.raises(ConfigurationError, match="units = 'm'"):
+        DecisionLog.for_filter(safety_filter, "m")
+    with pytest.raises(ConfigurationError, match="no SafetyFilter"):
+        DecisionLog.for_filter(safety_filter.qp)
 
 
 def test_a_log_can_be_copied_and_sent(log):
