@@ -24,7 +24,7 @@ from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions, noise_levels
-from safe_envs.problem.rate_limits import require_apart, with_rates
+from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
 from safe_envs.problem.regions import sound_regions
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
@@ -267,8 +267,9 @@ class SafetyProblem:
             changes["slew_limit"] = rate_limits("slew_limit", given.slew_limit, len(self.inputs))
         if given.rate_limit is not None:
             limits = rate_limits("rate_limit", given.rate_limit, len(self.inputs))
-            limited = replace(self, **changes)
-            return replace(limited, **with_rates(limited, limits)).configured(start=given.start)
+            free = replace(self, **changes)
+            start = with_resting_inputs(given.start, free)
+            return replace(free, **with_rates(free, limits)).configured(start=start)
         start = given.start
         if isinstance(start, str):
             if start not in self.starts:

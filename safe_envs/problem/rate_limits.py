@@ -24,8 +24,10 @@ than the bounds by a millionth, so that rounding ends no episode.
 
 What differs from an actuator that slews towards a command u_c, u[k+1] = clip(u_c, u[k] + dt r-,
 u[k] + dt r+), which the option `slew_limit` simulates: the inputs at control instants can be the
-same, but the rate is decided in place of the command, and during a period the input is a ramp here
-and constant there.
+same, but what is decided is the rate in place of the command, and it is the input at the end of a
+period that it decides. There the input of the period itself is decided, and constant in it. Here
+the input is a ramp; in a step of Euler it is that of the start of the period, so that a decision
+acts one period later.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
+from safe_envs.validators import numbers_in
 
 _ROUNDING = 1e-6
 """Part of the width of an input's bounds by which its range as a state is wider."""
@@ -103,6 +106,18 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
         "frame": _framed(problem.frame, problem.inputs),
         "rates": limits,
     }
+
+
+def with_resting_inputs(start: Any, problem: Any) -> Any:
+    """Return a start with the inputs at rest, where it has a number for each other state only.
+
+    Args:
+        start: a name, numbers, or None.
+        problem: a `SafetyProblem` without limits.
+    """
+    if start is None or isinstance(start, str) or numbers_in(start).shape != (len(problem.states),):
+        return start
+    return [*numbers_in(start).tolist(), *resting_input(problem.box)]
 
 
 def require_apart(given: ProblemOptions, dt: float) -> None:

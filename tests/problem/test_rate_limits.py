@@ -137,6 +137,8 @@ def test_what_else_follows():
     assert limited.configured(noise=0.1, dt=problem.dt).rates == ((-5.0, 5.0),)
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0, 1.0])
     assert SafeEnv(given).reset(seed=0)[0][-1] == 1.0
+    given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0])
+    assert SafeEnv(given).reset(seed=0)[0][-1] == 0.0
     several = problem_of("safe_envs/QuadrotorLimits-v0").configured(rate_limit=(-1e5, 1e5))
     assert [len(gains) for gains in several.gains] == [3, 3, 3]
     acc = problem_of("safe_envs/ACC-v0").configured(rate_limit=(-1e4, 1e4))
