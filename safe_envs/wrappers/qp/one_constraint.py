@@ -20,14 +20,13 @@ from typing import Any
 import numpy as np
 
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
+from safe_envs.wrappers.qp.kernels.two_inputs import project_two_inputs
 from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, tolerance, tolerances
 
 _EXCESS = 1e3
 """A constraint that holds with so many times its rounding to spare is not on the nearest action:
 the rounding of the way there was larger. Then, and where that makes it miss, a state of a batch is
 solved by itself."""
-_TINY, _HUGE = 1e-200, 1e200
-"""Sizes of a constraint, squared, that neither vanish nor overflow on the way."""
 _CORRECTIONS = 3
 """How often the rounding of a long way is taken back: each time it shrinks by a factor of 1e16."""
 
@@ -53,9 +52,12 @@ def project_floats(
         found, margin, active, feasible = project_scalar(a[0], b, u[0], low[0], high[0])
         return [found], margin, active, feasible
     if len(u) == 2:
-        near = _project_two(a, b, u, low, high, w)
-        if near:
-            return near
+        (a1, a2), (v1, v2), (l1, l2), (h1, h2), (w1, w2) = a, u, low, high, w
+        solved, u1, u2, margin, active = project_two_inputs(
+            a1, a2, b, v1, v2, l1, l2, h1, h2, w1, w2
+        )
+        if solved:
+            return [u1, u2], margin, active, True
     v = u
     u = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
@@ -81,46 +83,6 @@ def project_floats(
             tolerance(a, b, u),
         )
     return u, margin, True, margin >= -allowed
-
-
-def _project_two(
-    a: Floats, b: float, v: Floats, low: Floats, high: Floats, w: Floats
-) -> tuple[list[float], float, bool, bool] | None:
-    """Return what `project_floats` does for two inputs.
-
-    It is None where the proposal lies outside the input bounds, the constraint cannot be met, or
-    sizes ask for care.
-    """
-    (a1, a2), (v1, v2), (l1, l2), (h1, h2), (w1, w2) = a, v, low, high, w
-    if not (l1 <= v1 <= h1 and l2 <= v2 <= h2):
-        return None
-    margin = a1 * v1 + a2 * v2 + b
-    if margin >= 0.0:
-        return [v1, v2], margin, False, True
-    d1, d2 = a1 / w1, a2 / w2
-    slope = a1 * d1 + a2 * d2
-    if not _TINY < slope < _HUGE:
-        return None
-    step = margin / slope
-    u1, u2 = v1 - step * d1, v2 - step * d2
-    if not (l1 <= u1 <= h1 and l2 <= u2 <= h2):
-        # One stops at its bound, and the other goes on alone.
-        end1, end2 = h1 if d1 > 0.0 else l1, h2 if d2 > 0.0 else l2
-        if d2 == 0.0 or (d1 != 0.0 and (end1 - v1) / d1 < (end2 - v2) / d2):
-            if d2 == 0.0:
-                return None
-            u1, u2 = end1, -(b + a1 * end1) / a2
-        else:
-            if d1 == 0.0:
-                return None
-            u1, u2 = -(b + a2 * end2) / a1, end2
-        if not (l1 <= u1 <= h1 and l2 <= u2 <= h2):
-            return None
-    first, second = a1 * u1, a2 * u2
-    margin = first + second + b
-    if abs(margin) <= ROUNDING * abs(b) + ROUNDING * abs(first) + ROUNDING * abs(second):
-        return [u1, u2], margin, True, True
-    return None
 
 
 def _follow_multiplier(
