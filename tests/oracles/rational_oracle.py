@@ -3,6 +3,7 @@ for any number of inputs."""
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -45,11 +46,12 @@ def nearest_of_least_violating(a, b, v, low, high, w, priority, near):
 
     `near` is an approximate answer, from which the sets of missed and binding rows and of held
     inputs are guessed. The guess is changed until every condition of optimality holds exactly, so
-    that it has no part in what is returned.
+    that it has no part in what is returned. Input bounds may be infinite.
     """
     a = [[Fraction(x) for x in row] for row in a]
     b, v, low, high, w, priority = [
-        [Fraction(float(x)) for x in part] for part in (b, v, low, high, w, priority)
+        [Fraction(x) if math.isfinite(x) else x for x in map(float, part)]
+        for part in (b, v, low, high, w, priority)
     ]
     m, k = len(v), len(b)
     margin = np.array([float(dot(a[i], map(Fraction, map(float, near))) + b[i]) for i in range(k)])

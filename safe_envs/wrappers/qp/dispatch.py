@@ -12,8 +12,10 @@ of `safe_envs.wrappers.qp.rounding`.
 
 from __future__ import annotations
 
+import functools
 import importlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +24,6 @@ from safe_envs.wrappers.qp import (
     one_constraint,
     plane,
     plane_batch,
-    single_active_constraint,
 )
 from safe_envs.wrappers.qp.rounding import ArrayAnswer, Arrays, Entries, FloatAnswer, Floats, stack
 
@@ -35,7 +36,13 @@ def prepare(k: int, m: int) -> None:
         m: number of inputs.
     """
     if k > 1 and m > 2:
-        importlib.import_module("safe_envs.wrappers.qp.proxqp")
+        _general("general_batch")
+
+
+@functools.cache
+def _general(name: str) -> Any:
+    """Import a module of the general method, which few filters need."""
+    return importlib.import_module(f"safe_envs.wrappers.qp.{name}")
 
 
 def project_floats(
@@ -70,6 +77,8 @@ def project_floats(
         found = plane.project_floats(a, b, v, low, high, w)
     elif len(v) == 1:
         found = interval.project_floats([ai for (ai,) in a], b, v[0], low[0], high[0])
+    else:
+        found = _general("general").project_floats(a, b, v, low, high, w, priority)
     if found:
         return found
     *parts, feasible = project_arrays(a, b, [np.array([c]) for c in v], low, high, w, priority)
@@ -112,52 +121,7 @@ def project_arrays(
     if len(v) == 2:
         u, margin, active, feasible = plane_batch.project_arrays(a, b, v, low, high, w, priority)
         return list(u), list(margin), list(active), feasible
-    return _solver(a, b, v, low, high, w, priority)
-
-
-def _solver(
-    a: Sequence[Entries],
-    b: Entries,
-    v: Arrays,
-    low: Entries,
-    high: Entries,
-    w: Entries,
-    priority: Floats,
-) -> ArrayAnswer:
     size = len(v[0])
-    rows = [stack(ai, size) for ai in a]
-    offsets, proposed, lower, upper = [stack(part, size) for part in (b, v, low, high)]
-    # A constraint that says nothing of the input is met or not, exactly, whatever the solver's
-    # precision.
-    flat = np.array([(row == 0.0).all(axis=0) for row in rows])
-    unmet = flat & (offsets < 0.0)
-    solvable = np.where(unmet, 0.0, offsets)
-    (u, margin, active, feasible), left = single_active_constraint.project_arrays(
-        rows, solvable, proposed, lower, upper, w
-    )
-    if left.size:
-        # Imported here, since few filters need a solver.
-        from safe_envs.wrappers.qp import proxqp
-
-        def of_left(part: np.ndarray) -> np.ndarray:
-            return part[:, left].T
-
-        table = np.stack([of_left(row) for row in rows], axis=1)
-        found = proxqp.project(
-            table,
-            of_left(solvable),
-            of_left(proposed),
-            of_left(lower),
-            of_left(upper),
-            of_left(stack(w, size)),
-            np.array(priority),
-        )
-        for whole, part in zip((u, margin, active), found[:3], strict=True):
-            whole[:, left] = part.T
-        feasible[left] = found.feasible
-    return (
-        list(u),
-        list(np.where(unmet, offsets, margin)),
-        list(np.where(flat, unmet, active)),
-        feasible & ~unmet.any(axis=0),
-    )
+    table = np.array([stack(ai, size) for ai in a])
+    stacked = [stack(part, size) for part in (b, v, low, high, w)]
+    return _general("general_batch").project_arrays(table, *stacked, np.array(priority))

@@ -22,6 +22,9 @@ from safe_envs.wrappers.qp import bounded_least_squares, interval
 from safe_envs.wrappers.qp.rounding import ROUNDING, total
 
 _STEPS = 20
+_SURELY = 100.0
+"""A constraint that is missed by so many times its rounding surely has a slack: one that binds may
+be missed by a few."""
 _FAR = 1e150
 """A line further off than this meets no box. How far does not matter, and its square would
 overflow."""
@@ -109,7 +112,8 @@ def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
         u: the minimisers.
     """
     first, second = a[0] * u[0], a[1] * u[1]
-    violated = first + second + b < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))
+    rounding = ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))
+    violated = first + second + b < -_SURELY * rounding
     _, _, along = _frame(np.where(violated, a[0], 0.0), np.where(violated, a[1], 0.0))
     return np.any(along != 0.0, axis=0)
 

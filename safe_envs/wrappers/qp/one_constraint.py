@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
+from safe_envs.wrappers.qp.kernels.two_inputs import project_two_inputs
 from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, tolerance, tolerances
 
 _EXCESS = 1e3
@@ -50,6 +51,13 @@ def project_floats(
     if len(u) == 1:
         found, margin, active, feasible = project_scalar(a[0], b, u[0], low[0], high[0])
         return [found], margin, active, feasible
+    if len(u) == 2:
+        (a1, a2), (v1, v2), (l1, l2), (h1, h2), (w1, w2) = a, u, low, high, w
+        solved, u1, u2, margin, active = project_two_inputs(
+            a1, a2, b, v1, v2, l1, l2, h1, h2, w1, w2
+        )
+        if solved:
+            return [u1, u2], margin, active, True
     v = u
     u = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])

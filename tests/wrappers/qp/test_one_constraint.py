@@ -203,3 +203,25 @@ def test_weights_and_bounds_of_each_state():
         np.testing.assert_allclose([c[i] for c in found[0]], u, rtol=1e-12, atol=1e-12)
         assert found[1][i] == pytest.approx(margin, rel=1e-12, abs=1e-12 * (1 + np.abs(a[i]).max()))
         assert (found[2][i], found[3][i]) == (active, feasible)
+
+
+def test_two_inputs_inside_their_bounds_follow_the_same_way_as_more():
+    # A third input without a say takes the general way.
+    rng = np.random.default_rng(21)
+    ends = set()
+    for _ in range(2000):
+        a, b, _, low, high, w = random_problem(rng, 2)
+        v = low + rng.choice([0.0, 0.3, 0.8, 1.0], 2) * (high - low)
+        u, _, active, feasible = project_floats(
+            a.tolist(), b, v.tolist(), low.tolist(), high.tolist(), w.tolist()
+        )
+        general = [
+            np.append(part, end).tolist()
+            for part, end in zip((v, low, high), (0, -1, 1), strict=True)
+        ]
+        expected = project_floats([*a.tolist(), 0.0], b, *general, [*w.tolist(), 1.0])
+        np.testing.assert_allclose(u, expected[0][:2], rtol=1e-12, atol=1e-12)
+        assert (active, feasible) == expected[2:]
+        assert np.all((low <= u) & (u <= high))
+        ends.add((active, feasible, int(np.isin(u, (low, high)).sum())))
+    assert ends >= {(True, True, 0), (True, True, 1), (True, False, 2), (False, True, 0)}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from safe_envs.wrappers.qp.kernels.two_inputs import project_two_inputs
+
 ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
 WAY_CORRECTIONS = 3
@@ -82,7 +84,13 @@ def project_one_constraint(  # noqa: PLR0913
     if len(v) == 1:
         u[0], margin[0], acts, feasible = project_scalar(a[0, 0], b[0], v[0], low[0], high[0])
     else:
-        margin[0], acts, feasible = project_onto_row(a, 0, b[0], v, low, high, w, u, work)
+        solved, feasible, acts = False, True, False
+        if len(v) == 2:
+            solved, u[0], u[1], margin[0], acts = project_two_inputs(
+                a[0, 0], a[0, 1], b[0], v[0], v[1], low[0], low[1], high[0], high[1], w[0], w[1]
+            )
+        if not solved:
+            margin[0], acts, feasible = project_onto_row(a, 0, b[0], v, low, high, w, u, work)
     active[0] = 1.0 if acts else 0.0
     return feasible
 

@@ -28,6 +28,8 @@ from safe_envs.wrappers.qp.kernels.plane_fallback import bounded_least_squares_i
 ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
 NEWTON_STEPS = 20
+SURELY_MISSED = 100.0
+"""That many times its rounding: one that binds may be missed by a few, and has no slack."""
 FARTHEST_LINE = 1e150
 """A line further off than this meets no box. How far does not matter, and its square would
 overflow."""
@@ -98,7 +100,8 @@ def crossing_is_missed(a: np.ndarray, b: np.ndarray, u: np.ndarray, work: np.nda
     k = len(b)
     for i in range(k):
         first, second = a[i, 0] * u[0], a[i, 1] * u[1]
-        violated = first + second + b[i] < -ROUNDING * (abs(first) + abs(second) + abs(b[i]))
+        rounding = ROUNDING * (abs(first) + abs(second) + abs(b[i]))
+        violated = first + second + b[i] < -SURELY_MISSED * rounding
         work[8 * k + i] = a[i, 0] if violated else 0.0
         work[9 * k + i] = a[i, 1] if violated else 0.0
     frame_of_plane(k, work)

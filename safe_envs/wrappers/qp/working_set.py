@@ -1,0 +1,240 @@
+"""The point that a working set holds, and the proof that it is the answer, for one state.
+
+A working set says which constraints count (those that are missed or bind) and which inputs are at a
+bound. Its point is the limit, for vanishing e, of the minimiser of
+
+    1/2 sum_j w_j (u_j - v_j)^2 + 1/(2 e) sum_i priority_i (a_i . u + b_i)^2,   i in the working set
+
+over the inputs that are free: the nearest of the points with the least sum of squares. It is the
+nearest of the least-violating actions if it is optimal on both levels: the forces of the slacks
+vanish along free inputs and press held ones outwards, and where they leave an input alone, the way
+from the proposal does. Where the constraints can be met, there are no slacks, and it is the
+minimiser.
+
+What contradicts that says how the working set has to change; one after the other is a block
+pivoting method for the limit of the problem with soft constraints (Judice and Pires, Computers and
+Operations Research 21, 1994).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from operator import mul
+from typing import NamedTuple
+
+from safe_envs.wrappers.qp.rounding import ROUNDING, Floats
+from safe_envs.wrappers.qp.row_span import RowSpan
+
+_NOTHING = 1e-12
+"""Part of the forces on an input that is rounding."""
+_CORRECTIONS = 3
+"""How often a point is found: from the second time on, this takes back the rounding of a long
+way."""
+
+
+class WorkingSet(NamedTuple):
+    """Constraints that count, and -1 for inputs at the lower, 1 at the upper bound, else 0 (m)."""
+
+    rows: list[int]
+    at: list[int]
+
+
+class Point(NamedTuple):
+    """Inputs (m) with the margins there and their rounding (k), and the working set that follows.
+
+    The latter is None where the point is proved to be the answer.
+    """
+
+    u: list[float]
+    margin: list[float]
+    allowed: list[float]
+    change: WorkingSet | None
+
+
+class FloatQP:
+    """A QP whose constraints all depend on the input.
+
+    Attributes:
+        roots: of the weights.
+        start: the clipped proposal.
+        margin: of the constraints there.
+        normals: of unit length, in inputs times the roots.
+        lengths: of the constraints, likewise.
+        sizes: these, times the roots of the priorities.
+    """
+
+    def __init__(
+        self,
+        a: Sequence[Floats],
+        b: Floats,
+        v: Floats,
+        low: Floats,
+        high: Floats,
+        w: Floats,
+        priority: Floats,
+    ) -> None:
+        """Take a QP; see `dispatch.project_floats`."""
+        self.a, self.b, self.v, self.low, self.high = a, b, v, low, high
+        self.w, self.priority = w, priority
+        self.roots = [math.sqrt(wj) for wj in w]
+        self.start = [
+            lo if vj < lo else hi if vj > hi else vj
+            for vj, lo, hi in zip(v, low, high, strict=True)
+        ]
+        self.margin = [
+            sum(map(mul, row, self.start)) + offset for row, offset in zip(a, b, strict=True)
+        ]
+        self.normals: list[list[float]] = []
+        self.lengths: list[float] = []
+        for row in a:
+            scaled = [aj / root for aj, root in zip(row, self.roots, strict=True)]
+            length = math.hypot(*scaled)
+            self.normals.append([s / length for s in scaled])
+            self.lengths.append(length)
+        self.sizes = [
+            math.sqrt(q) * length for q, length in zip(priority, self.lengths, strict=True)
+        ]
+
+    def first(self) -> WorkingSet:
+        """Return the working set of the clipped proposal."""
+        at = [
+            -1 if vj < lo else 1 if vj > hi else 0
+            for vj, lo, hi in zip(self.v, self.low, self.high, strict=True)
+        ]
+        return WorkingSet([i for i, value in enumerate(self.margin) if value < 0.0], at)
+
+    def point(self, working: WorkingSet) -> Point:
+        """Return the point of a working set, and what contradicts that it is the answer.
+
+        Args:
+            working: constraints and bounds.
+        """
+        rows, at = working
+        u, margin, allowed, span, outside = self._settle(working)
+        missed = [i for i, value in enumerate(margin) if not value >= -allowed[i]]
+        slacks = [i for i in missed if i in rows]
+        way = self._way(u)
+        nothing = ROUNDING * max(max(way), -min(way))
+        kept, presses = rows, None
+        if len(slacks) < len(rows):
+            presses = self._presses(working, span, way)
+            kept = [
+                i
+                for i, (pressure, _) in zip(rows, presses, strict=True)
+                if i in slacks or (pressure >= -nothing and margin[i] <= allowed[i])
+            ]
+        pulls = [(self.priority[i] * -margin[i], self.a[i]) for i in slacks]
+        changed, settled = dict(outside), True
+        for j, side in enumerate(at):
+            force, doubt = 0.0, 0.0
+            for pull, row in pulls:
+                part = pull * row[j]
+                force += part
+                doubt += abs(part)
+            doubt *= _NOTHING
+            if not side:
+                settled = settled and -doubt <= force <= doubt
+            elif not force * side > doubt:
+                # The slacks do not press it against its bound; the way from the proposal may.
+                if presses is None:
+                    presses = self._presses(working, span, way)
+                rest = way[j]
+                for pressure, normal in presses:
+                    rest -= pressure * normal[j]
+                if force * side < -doubt or not rest * side <= nothing:
+                    changed[j] = 0
+        if settled and not changed and len(kept) == len(rows) and len(slacks) == len(missed):
+            return Point(u, margin, allowed, None)
+        more = [i for i in missed if i not in rows]
+        return Point(
+            u,
+            margin,
+            allowed,
+            WorkingSet([*kept, *more], [changed.get(j, side) for j, side in enumerate(at)]),
+        )
+
+    def margins(self, u: Floats) -> tuple[list[float], list[float]]:
+        """Return the margins (k) at inputs, and their rounding.
+
+        Args:
+            u: m inputs.
+        """
+        margin, allowed = [], []
+        for row, offset in zip(self.a, self.b, strict=True):
+            terms = [*map(mul, row, u), offset]
+            margin.append(sum(terms))
+            allowed.append(ROUNDING * sum(map(abs, terms)))
+        return margin, allowed
+
+    def _presses(
+        self, working: WorkingSet, span: RowSpan | None, way: list[float]
+    ) -> list[tuple[float, list[float]]]:
+        """Return the pressures of the constraints that add up to a way, and their normals."""
+        rows, at = working
+        pressures = [0.0] * len(rows)
+        if span:
+            pressures = span.pressures([c for c, side in zip(way, at, strict=True) if not side])
+        return [(pressure, self.normals[i]) for pressure, i in zip(pressures, rows, strict=True)]
+
+    def _settle(
+        self, working: WorkingSet
+    ) -> tuple[list[float], list[float], list[float], RowSpan | None, dict[int, int]]:
+        """Return the inputs, margins, their rounding, and on which side inputs leave the bounds."""
+        rows, at = working
+        lengths, roots = self.lengths, self.roots
+        u = [
+            vj if not side else lo if side < 0 else hi
+            for side, vj, lo, hi in zip(at, self.v, self.low, self.high, strict=True)
+        ]
+        free = [j for j, side in enumerate(at) if not side]
+        span = None
+        if rows and free:
+            normals = [self.normals[i] for i in rows]
+            if len(free) < len(u):
+                normals = [[n[j] for j in free] for n in normals]
+            span = RowSpan(normals, [self.sizes[i] for i in rows])
+        margin, allowed = self.margins(u)
+        if span:
+            for _ in range(_CORRECTIONS):
+                gaps = [margin[i] / lengths[i] for i in rows]
+                steps = span.step(gaps)
+                far = False
+                for j, step in zip(free, steps, strict=True):
+                    step /= roots[j]
+                    new = u[j] - step
+                    far = far or abs(step) > ROUNDING * abs(new)
+                    u[j] = new
+                if not far:
+                    break
+                margin, allowed = self.margins(u)
+                met = [abs(margin[i]) <= allowed[i] for i in rows]
+                if not span.dependent and all(met):
+                    break
+        outside, moved = self._clip(u, free)
+        if moved:
+            margin, allowed = self.margins(u)
+        return u, margin, allowed, span, outside
+
+    def _way(self, u: Floats) -> list[float]:
+        return [(uj - vj) * root for uj, vj, root in zip(u, self.v, self.roots, strict=True)]
+
+    def _clip(self, u: list[float], free: list[int]) -> tuple[dict[int, int], bool]:
+        """Clip inputs; return on which side those were that left their bounds, and if any moved."""
+        outside, moved = {}, False
+        if not free:
+            return outside, moved
+        way = self._way(u)
+        nothing = ROUNDING * max(max(way), -min(way))
+        for j in free:
+            uj, lo, hi = u[j], self.low[j], self.high[j]
+            doubt = nothing / self.roots[j]
+            if -doubt <= uj <= doubt and uj != 0.0:
+                u[j] = uj = 0.0  # nothing but rounding of the way
+                moved = True
+            if not lo <= uj <= hi:
+                u[j] = end = lo if uj < lo else hi
+                moved = True
+                if not abs(uj - end) <= max(doubt, ROUNDING * abs(end)):
+                    outside[j] = -1 if uj < lo else 1
+        return outside, moved
