@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
+from safe_envs.envs.delay_line import Actuators
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import VectorStep
 from safe_envs.envs.noise import NoiseStreams
@@ -23,7 +24,9 @@ class ArrayBatch:
 
     Attributes:
         components: of the states, () before the first episode.
-        executed: components of the physical inputs of the last step.
+        sent: components of the physical inputs that the last step was given.
+        executed: components of those that were executed in it; see `SafeEnv`.
+        actuators: between the two; None where they are the same.
         noise: that drives the states.
 
     Args:
@@ -37,7 +40,9 @@ class ArrayBatch:
         self, problem: SafetyProblem, streams: EpisodeStreams, episodes: Episodes, limit: int
     ) -> None:
         self.components: Components = ()
+        self.sent: Sequence[Any] = ()
         self.executed: Sequence[Any] = ()
+        self.actuators = None if problem.direct else Actuators(problem, streams.num_envs)
         self._problem, self._streams, self._episodes, self._limit = (
             problem,
             streams,
@@ -52,14 +57,20 @@ class ArrayBatch:
         observed = {f.expression for f in problem.features}
         self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
 
-    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return what a batch remembers besides states and counters, in arrays."""
+        return {} if self.actuators is None else self.actuators.snapshot()
+
+    def place(self, snapshot: Mapping[str, np.ndarray], seeded: Sequence[int]) -> None:
         """Put the envs into states, where their episodes are.
 
         Args:
-            states: shape (num_envs, n).
+            snapshot: with the states, shape (num_envs, n), and what `snapshot` returned.
             seeded: indices of the envs whose noise goes to the step of their episode.
         """
-        self.components = tuple(np.array(states, dtype=float).T.copy())
+        self.components = tuple(np.array(snapshot["state"], dtype=float).T.copy())
+        if self.actuators is not None:
+            self.actuators.restore(snapshot)
         self.noise.seek(seeded, self._episodes.steps[seeded])
 
     def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
@@ -103,6 +114,9 @@ class ArrayBatch:
         Raises:
             NumericalError: A state is not finite any more.
         """
+        self.sent = u
+        if self.actuators is not None:
+            u = self.actuators.execute(u)
         self.executed = u
         draws = self.noise.next(None if due is None else ~due)
         # A state that overflows is found by `_read`, which says so better than a warning.
@@ -132,6 +146,8 @@ class ArrayBatch:
             for x, fresh in zip(self.components, start, strict=True):
                 x[envs] = fresh
         self._episodes.restart(envs, steps)
+        if self.actuators is not None:
+            self.actuators.restart(envs)
 
     def _read(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
@@ -145,6 +161,8 @@ class ArrayBatch:
         barrier = stacked(barriers, *self._shape)
         h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
         info = self._episodes.count(barrier, h, counted)
+        if self.actuators is not None:
+            info |= self.actuators.report()
         terminated = filled(outside > 0.0, self._shape)
         sound = finite(h) and finite(rows)
         for i in self._unobserved:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,15 +44,24 @@ class CompiledBatch:
         return self._state.components
 
     @property
+    def sent(self) -> Components:
+        """The same as `executed`: problems with a delay are left to `ArrayBatch`."""
+        return self.executed
+
+    @property
     def executed(self) -> Components:
         """Components of the physical inputs of the last step; where it restarted, as given."""
         return tuple(self._state.inputs.T[: self._state.shape[1]])
 
-    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return nothing; see `ArrayBatch.snapshot`."""
+        return {}
+
+    def place(self, snapshot: Mapping[str, np.ndarray], seeded: Sequence[int]) -> None:
         """Put the envs into states; see `ArrayBatch.place`.
 
         Args:
-            states: see there.
+            snapshot: see there.
             seeded: see there.
         """
         state, episodes = self._state, self._state.episodes
@@ -60,7 +69,7 @@ class CompiledBatch:
         counts[:, STEPS] = episodes.steps
         counts[seeded, PERIOD] = episodes.steps[seeded]
         state.chunks[seeded] = -1
-        rows = np.column_stack([states, episodes.h_min, episodes.episode_cost])
+        rows = np.column_stack([snapshot["state"], episodes.h_min, episodes.episode_cost])
         state.commit(np.ascontiguousarray(rows, dtype=float), counts, None)
 
     def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from safe_envs.dynamics.philox import Key, StreamReader, key_of
+from safe_envs.envs.delay_line import Actuators
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream
@@ -38,7 +39,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     truncated after `horizon`. A violation does not end it.
 
     Attributes:
-        executed: the physical input of the last step.
+        sent: the physical input that the last step was given.
+        executed: the physical input that the plant executed in it; the same, but for a problem with
+            a delay or a slew limit.
         viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
@@ -79,7 +82,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._reader = StreamReader()
         self._key: Key | None = None
         self._number = 0
+        self.sent: Sequence[float] = ()
         self.executed: Sequence[float] = ()
+        self._actuators = None if problem.direct else Actuators(problem)
         self._x: tuple[float, ...] | None = None
         self._episode = Episode()
         self._reset_options = ResetOptions(problem, self._limit)
@@ -182,6 +187,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         requested = None if options is None else self._reset_options.read(options)
         super().reset(seed=seed)
         self._begin_episode(seed is not None, requested)
+        if self._actuators is not None:
+            self._actuators.restart()
         observation, _, _, info = self._observe([c for c, _ in self._scales])
         self._show_start()
         return observation, info
@@ -197,6 +204,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Step with a physical input inside its bounds, as a filter returns it."""
+        self.sent = u
+        if self._actuators is not None:
+            u = self._actuators.execute(u)
         self.executed = u
         try:
             self._x = self._simulation.integrator.step(self.components, u, self._noise.next())
@@ -276,4 +286,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if left:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
-        return observation, reward, left or goal >= 0.0, episode.count(barriers, h)
+        info = episode.count(barriers, h)
+        if self._actuators is not None:
+            info |= self._actuators.report()
+        return observation, reward, left or goal >= 0.0, info

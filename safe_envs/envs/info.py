@@ -32,6 +32,15 @@ and with the promise filter
 |---|---|---|
 | `promise` | float | p_k at the state reached: the probability that is still kept, p_0 at reset |
 
+and from an env with the option `delay` or `slew_limit`
+
+| key | type | meaning |
+|---|---|---|
+| `sent_action` | float64 (m,) | sent to the actuators: the safe action, with a filter |
+| `executed_action` | float64 (m,) | executed by the plant; both in physical units |
+
+There a filter's `safe_action` is what it sends, which is executed later.
+
 and with a specification, of the trace of the episode so far
 
 | key | type | meaning |
@@ -43,8 +52,8 @@ and with a specification, of the trace of the episode so far
 
 A robustness is -inf or inf where the trace is too short for anything to count.
 
-At reset, before anything is executed, both actions are the point within the input bounds nearest
-to 0.
+At reset, before anything is executed, all actions are the point within the input bounds nearest to
+0.
 """
 
 from __future__ import annotations

@@ -85,8 +85,13 @@ class SafeVectorEnv(VectorInterface):
         return self._batch.components
 
     @property
+    def sent(self) -> Sequence[Any]:
+        """The components of the physical inputs that the last step was given."""
+        return self._batch.sent
+
+    @property
     def executed(self) -> Sequence[Any]:
-        """The components of the physical inputs of the last step."""
+        """The components of those that were executed in it; see `SafeEnv`."""
         return self._batch.executed
 
     @property
@@ -102,7 +107,7 @@ class SafeVectorEnv(VectorInterface):
         before = self.state
         states = self._reset_options.states(given)
         moved = (states != before).any(axis=1)
-        self._batch.place(states, [])
+        self._batch.place({"state": states, **self._batch.snapshot()}, [])
         self.episodes.place(moved)
         if self.viewer is not None:
             self.viewer.restart(states, self._times, np.flatnonzero(moved).tolist())
@@ -128,7 +133,7 @@ class SafeVectorEnv(VectorInterface):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
-        return {"state": self.state, **self.episodes.snapshot()}
+        return {"state": self.state, **self.episodes.snapshot(), **self._batch.snapshot()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray], seed: Seeds = None) -> None:
         """Put each episode where a snapshot has it.
@@ -150,7 +155,7 @@ class SafeVectorEnv(VectorInterface):
         seeded = self._streams.seed(self._streams.for_each_env(seed))
         self.episodes.restore(snapshot)
         self._streams.begin_episodes(seeded)
-        self._batch.place(snapshot["state"], seeded)
+        self._batch.place(snapshot, seeded)
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, range(self.num_envs))
 

@@ -8,6 +8,7 @@ from safe_envs.dynamics.integrators import euler_maruyama_step, rate
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.simulation import readings
 from safe_envs.envs.spaces import center_and_half_width
+from safe_envs.errors import NotCompilableError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
 
@@ -21,7 +22,15 @@ def world_source(problem: SafetyProblem, data: Data) -> Source:
     Args:
         problem: what to simulate.
         data: receives its numbers.
+
+    Raises:
+        NotCompilableError: It has a delay or a slew limit, or filters believe one.
     """
+    if not problem.direct:
+        raise NotCompilableError(
+            f"{problem.name} has {problem.actuators}: inputs under way are kept by the engine"
+            " 'numpy' alone"
+        )
     return (
         _rest(problem, data)
         + _starts(problem, data)

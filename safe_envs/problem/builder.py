@@ -34,6 +34,7 @@ _STATED = (
     "start",
     "dt",
     "horizon",
+    "rates",
 )
 """Attributes of a problem that are made of the arguments."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -13,6 +14,9 @@ from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.philox import START, Key, StreamReader
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
+from safe_envs.number_text import finite_number
+from safe_envs.problem.signals import Variable
+from safe_envs.validators import numbers_in
 
 _TRIES_AT_ONCE = 4
 
@@ -32,6 +36,34 @@ class Start:
     def at(cls, values: Sequence[float]) -> Start:
         """Return the distribution of a fixed initial state."""
         return cls(tuple(sp.Float(v, 17) for v in values))
+
+    @classmethod
+    def given(cls, states: Sequence[Variable], start: Any) -> Start:
+        """Return the distribution of an initial state that somebody asks for.
+
+        Args:
+            states: with their ranges.
+            start: a number for each.
+
+        Raises:
+            ConfigurationError: It has another number of them, or one is not in its range.
+        """
+        names = ", ".join(s.symbol.name for s in states)
+        found = numbers_in(start)
+        if found.shape != (len(states),):
+            raise ConfigurationError(
+                f"start has {found.size} numbers; the state has {len(states)}: {names}"
+            )
+        values = [
+            finite_number(f"start of {s.symbol}", v)
+            for s, v in zip(states, found.tolist(), strict=True)
+        ]
+        for s, v in zip(states, values, strict=True):
+            if not s.low <= v <= s.high:
+                raise ConfigurationError(
+                    f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]"
+                )
+        return cls.at(values)
 
     def proposals(self, count: int) -> np.ndarray:
         """Return some states, always the same, whether or not they meet the condition.

@@ -10,8 +10,11 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, named_values, numbers
+from safe_envs.validators import numbers_in
 
 Reader = Callable[[str, Any], Any]
 """From the name of an option and its text (texts, where it is repeatable) to its value."""
@@ -67,6 +70,14 @@ class ProblemOptions:
         horizon: length of an episode in s.
         box: physical bounds (low, high) of every input, or one such pair for each.
         start: name of an initial distribution, or a fixed initial state.
+        delay: whole control periods after which the plant executes an input that is sent.
+        model_delay: the delay that filters believe, by default that of the plant; 0 for filters
+            that are unaware of it.
+        slew_limit: bounds (low, high) of the rate at which the plant's actuators follow the input
+            that is sent, in its unit per s, for all inputs or one such pair for each. Filters are
+            unaware of them.
+        rate_limit: the same as part of the system, whose inputs become states, and their rates
+            the inputs: see `safe_envs.problem.rate_limits`.
 
     Raises:
         ConfigurationError: A value is of the wrong kind.
@@ -88,6 +99,14 @@ class ProblemOptions:
     )
     start: str | Sequence[float] | None = _option(
         "Initial state, or the name of a distribution.", _read_start, "A,B,.."
+    )
+    delay: int | None = _option("Delay of the plant's inputs, in control periods.")
+    model_delay: int | None = _option("Delay that filters believe; that of the plant by default.")
+    slew_limit: Sequence[Any] | None = _option(
+        "Bounds of the actuators' rates, which filters do not know.", _read_box, "LO,HI", True
+    )
+    rate_limit: Sequence[Any] | None = _option(
+        "Bounds of the inputs' rates, which become the inputs.", _read_box, "LO,HI", True
     )
 
     def __post_init__(self) -> None:
@@ -149,3 +168,36 @@ def _require_known(complaint: str, given: Mapping[str, Any], allowed: Collection
     for name in given:
         if name not in allowed:
             raise ConfigurationError(f"{complaint} {shown(name)}; {nearest(name, allowed)}")
+
+
+def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[str, float]:
+    """Return the values of a problem's diffusion parameters, by name.
+
+    Args:
+        problem: a `SafetyProblem`.
+        noise: one number for all of them, or one for each; None to change none.
+
+    Raises:
+        ConfigurationError: The problem has none, or a number is missing or negative.
+    """
+    if noise is None:
+        return {}
+    names = problem.noise
+    if not names:
+        advice = (
+            ": its diffusion holds numbers only; write it as a parameter, so that it can be changed"
+            if problem.plant.noisy
+            else ""
+        )
+        raise ConfigurationError(f"{problem.name} has no noise channels{advice}")
+    given = numbers_in(noise)
+    if (
+        given.shape not in ((1,), (len(names),))
+        or not np.isfinite(given).all()
+        or (given < 0).any()
+    ):
+        raise ConfigurationError(
+            f"noise = {shown(noise)}; give one number >= 0, or {len(names)} of them"
+            f" ({', '.join(names)})"
+        )
+    return dict(zip(names, np.broadcast_to(given, len(names)).tolist(), strict=True))

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
@@ -19,16 +18,16 @@ from safe_envs.errors import (
     require_whole,
     shown,
 )
-from safe_envs.number_text import finite_number
+from safe_envs.problem.actuators import Limits, rate_limits, require_delay
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.options import ProblemOptions
+from safe_envs.problem.options import ProblemOptions, noise_levels
+from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
 from safe_envs.problem.regions import sound_regions
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
-from safe_envs.validators import numbers_in
 
 _WIDEST = 1e100
 """Largest bound of a box: its square, an effort, is still a number."""
@@ -68,6 +67,12 @@ class SafetyProblem:
         sampling: where and how the system is excited to learn from it, as far as the defaults do
             not suit; see `sampling_domain`.
         frame: coordinates in which the problem closes, if it has a symmetry; see `Frame`.
+        delay: control periods after which the plant executes an input that is sent. Before the
+            first arrives, it executes the one within the input bounds nearest to 0.
+        model_delay: the delay that filters believe; that of the plant by default.
+        slew_limit: bounds of the rates of the plant's actuators, see `ProblemOptions`; () without.
+        rates: bounds of the rates of inputs that have become states, see
+            `safe_envs.problem.rate_limits`; () without.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -97,6 +102,10 @@ class SafetyProblem:
     clf: CLF | None = None
     sampling: SamplingDomain = field(default_factory=SamplingDomain)
     frame: Frame | None = None
+    delay: int = 0
+    model_delay: int | None = None
+    slew_limit: Limits = ()
+    rates: Limits = ()
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -185,6 +194,9 @@ class SafetyProblem:
                 f" {self.dt} s"
             )
         require_whole("substeps", self.substeps, 1)
+        require_delay("delay", self.delay)
+        if self.model_delay is not None:
+            require_delay("model_delay", self.model_delay)
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
         """Return the rates p_1..p_r of a barrier, given by its index."""
@@ -202,6 +214,22 @@ class SafetyProblem:
         return self.steps * self.dt
 
     @property
+    def believed_delay(self) -> int:
+        """The delay of the inputs that filters believe, in control periods."""
+        return self.delay if self.model_delay is None else self.model_delay
+
+    @property
+    def direct(self) -> bool:
+        """Whether inputs are executed, and believed to be, as and when they are sent."""
+        return not (self.delay or self.believed_delay or self.slew_limit)
+
+    @property
+    def actuators(self) -> str:
+        """What lies between the sent and the executed input, in words of the options."""
+        slew = "".join(f", slew_limit {low:g},{high:g}" for low, high in self.slew_limit)
+        return f"delay {self.delay}, model_delay {self.believed_delay}{slew}"
+
+    @property
     def outside(self) -> sp.Expr:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
         return excess(self.states)
@@ -217,12 +245,14 @@ class SafetyProblem:
             ConfigurationError: A name is unknown or a value is not allowed.
         """
         given = ProblemOptions.of(self.name, options, ())
-        levels = self._noise_levels(given.noise)
+        levels = noise_levels(self, given.noise)
+        if self.rates:
+            require_apart(given, self.dt)
         changes: dict[str, Any] = {
             "plant": self.plant.with_parameters(**{**levels, **(given.plant or {})}),
             "model": self.model.with_parameters(**{**levels, **(given.model or {})}),
         }
-        for name in ("dt", "substeps", "horizon"):
+        for name in ("dt", "substeps", "horizon", "delay", "model_delay"):
             if getattr(given, name) is not None:
                 changes[name] = getattr(given, name)
         if given.box is not None:
@@ -231,6 +261,13 @@ class SafetyProblem:
                 replace(i, low=low, high=high)
                 for i, (low, high) in zip(self.inputs, pairs, strict=True)
             )
+        if given.slew_limit is not None:
+            changes["slew_limit"] = rate_limits("slew_limit", given.slew_limit, len(self.inputs))
+        if given.rate_limit is not None:
+            limits = rate_limits("rate_limit", given.rate_limit, len(self.inputs))
+            free = replace(self, **changes)
+            start = with_resting_inputs(given.start, free)
+            return replace(free, **with_rates(free, limits)).configured(start=start)
         start = given.start
         if isinstance(start, str):
             if start not in self.starts:
@@ -240,47 +277,6 @@ class SafetyProblem:
                 )
             changes["start"] = start
         elif start is not None:
-            changes["starts"] = {**self.starts, "given": self._fixed(start)}
+            changes["starts"] = {**self.starts, "given": Start.given(self.states, start)}
             changes["start"] = "given"
         return replace(self, **changes)
-
-    def _noise_levels(self, noise: float | Sequence[float] | None) -> dict[str, float]:
-        if noise is None:
-            return {}
-        if not self.noise:
-            advice = (
-                ": its diffusion holds numbers only; write it as a parameter, so that it can be"
-                " changed"
-                if self.plant.noisy
-                else ""
-            )
-            raise ConfigurationError(f"{self.name} has no noise channels{advice}")
-        given = numbers_in(noise)
-        if (
-            given.shape not in ((1,), (len(self.noise),))
-            or not np.isfinite(given).all()
-            or (given < 0).any()
-        ):
-            raise ConfigurationError(
-                f"noise = {shown(noise)}; give one number >= 0, or {len(self.noise)} of them"
-                f" ({', '.join(self.noise)})"
-            )
-        return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
-
-    def _fixed(self, start: Sequence[float]) -> Start:
-        names = ", ".join(s.symbol.name for s in self.states)
-        given = numbers_in(start)
-        if given.shape != (len(self.states),):
-            raise ConfigurationError(
-                f"start has {given.size} numbers; the state has {len(self.states)}: {names}"
-            )
-        values = [
-            finite_number(f"start of {s.symbol}", v)
-            for s, v in zip(self.states, given.tolist(), strict=True)
-        ]
-        for s, v in zip(self.states, values, strict=True):
-            if not s.low <= v <= s.high:
-                raise ConfigurationError(
-                    f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]"
-                )
-        return Start.at(values)

@@ -2,6 +2,7 @@
 
 from safe_envs.wrappers import conditions
 from safe_envs.wrappers.conditions import *  # noqa: F403
+from safe_envs.wrappers.delayed_filter import DelayedFilter
 from safe_envs.wrappers.env_wrappers.external_env import ActionMap, FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
@@ -14,6 +15,7 @@ from safe_envs.wrappers.safety_filter import SafetyFilter
 
 __all__ = [
     "ActionMap",
+    "DelayedFilter",
     "FilterDecision",
     "FilterSpec",
     "SafetyFilter",

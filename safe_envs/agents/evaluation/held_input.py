@@ -21,6 +21,7 @@ from safe_envs.agents.evaluation.promise_bound import promise_bound
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.running_sum import RunningMean
 from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.problem.actuators import why_not_direct
 
 
 class HeldInputBound(Protocol):
@@ -75,6 +76,9 @@ def held_bound_of(
         of: the policy and the filter.
         makers: of bounds; by default all.
     """
+    why_not = why_not_direct(of.problem, "bounds of a filter")
+    if why_not:
+        return why_not
     made = (make(of) for make in (MAKERS if makers is None else makers))
     found = [bound for bound in made if bound is not None]
     if not found:

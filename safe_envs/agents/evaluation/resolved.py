@@ -288,6 +288,8 @@ def _describe(problem: SafetyProblem) -> dict[str, Any]:
         "dt": problem.dt,
         "substeps": problem.substeps,
         "horizon": problem.horizon,
+        **({} if problem.direct else {"actuators": problem.actuators}),
+        **({"rate_limit": [list(ends) for ends in problem.rates]} if problem.rates else {}),
     }
 
 

@@ -232,4 +232,6 @@ def _executed(
     world: SafeVectorEnv | SafetyMonitorVector, actions: np.ndarray, info: Info
 ) -> Components:
     """Return the components of the executed input in physical units."""
+    if "executed_action" in info:
+        return tuple(info["executed_action"].T)
     return tuple(info["safe_action"].T) if "safe_action" in info else world.physical_action(actions)

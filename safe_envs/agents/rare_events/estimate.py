@@ -19,6 +19,7 @@ from safe_envs.agents.rare_events.rows import BETTER, PlainEpisodes, RareEstimat
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import NumericalError, require_whole
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.problem import SafetyProblem
 
 PARTICLES = 250
@@ -121,6 +122,7 @@ def estimate_rare(
         **fields,
     )
     resolved = ResolvedEvaluation(spec)
+    require_direct(resolved.problem, "estimates of rare events")
     work = WorkParts(progress, resolved.parts + 2 * len(resolved.names))
     resolved.learn(work.part)
     config = {**resolved.config(), "particles": particles, "repetitions": repetitions}

@@ -27,6 +27,10 @@ def _annotation(option: Field[Any]) -> Any:
     ]
 
 
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 _OPTIONS: dict[str, Any] = {
     "env_id": Annotated[
         str | None,
@@ -87,7 +91,7 @@ class EnvOptions:
         """
         system = {} if self.system is None else {"system": self.system}
         return system | {
-            option.name: value if reader is None else reader(f"--{option.name}", value)
+            option.name: value if reader is None else reader(_flag(option.name), value)
             for option in fields(ProblemOptions)
             for value in (self.changes.get(option.name),)
             for reader in (option.metadata["reader"],)
@@ -102,7 +106,7 @@ class EnvOptions:
         """
         env = [self.full_id] if self.system is None else ["--system", self.system]
         changes = [
-            f"--{name}={text}"
+            f"{_flag(name)}={text}"
             for name, value in self.changes.items()
             for text in (value if isinstance(value, list) else [value])
         ]

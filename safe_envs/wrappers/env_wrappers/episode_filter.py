@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,10 +13,12 @@ from safe_envs.compiled.program import Source
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.errors import ConfigurationError
+from safe_envs.problem.actuators import require_delay, require_direct
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import spec_of
 from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.conditions.text_parts import names_promise
+from safe_envs.wrappers.env_wrappers.delay_memory import DelayMemory
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from safe_envs.wrappers.safety_filter import SafetyFilter
@@ -163,7 +166,8 @@ def episode_filter(
     objective: str,
     priorities: Sequence[float] | None,
     num_envs: int,
-) -> Memoryless | PromiseMemory:
+    delay: int | None = None,
+) -> Memoryless | DelayMemory | PromiseMemory:
     """Return a filter for the episodes of envs.
 
     Args:
@@ -173,6 +177,8 @@ def episode_filter(
         objective: see there.
         priorities: see there.
         num_envs: size of the batch.
+        delay: of the inputs as the filter believes it, in control periods; None for that of the
+            problem's plant or model, as `knowledge` says.
 
     Raises:
         ConfigurationError: What is given is unknown or does not fit the problem.
@@ -180,7 +186,11 @@ def episode_filter(
     """
     if isinstance(given, str) and names_promise(given):
         given = PromiseSettings.of_text(given)
+    if delay is None:
+        delay = problem.delay if knowledge == "plant" else problem.believed_delay
+    require_delay("delay", delay)
     if isinstance(given, PromiseSettings | PromiseFilter):
+        require_direct(replace(problem, model_delay=delay), "promise filters")
         if priorities is not None:
             raise ConfigurationError(
                 "priorities are of conditions; the promise filter keeps all barriers together:"
@@ -192,4 +202,5 @@ def episode_filter(
         given.settings.require_fit(problem, objective)
         given.require_problem(problem)
         return PromiseMemory(given, num_envs)
-    return Memoryless(SafetyFilter.for_problem(problem, given, knowledge, objective, priorities))
+    found = SafetyFilter.for_problem(problem, given, knowledge, objective, priorities)
+    return DelayMemory(found, problem, delay, num_envs) if delay else Memoryless(found)

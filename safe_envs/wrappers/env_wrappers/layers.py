@@ -13,6 +13,7 @@ from safe_envs.envs.episode import Episode, Episodes
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.envs.reset_options import refuse_time
 from safe_envs.errors import ConfigurationError
+from safe_envs.problem.actuators import resting_input
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice, episode_filter
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
@@ -30,6 +31,7 @@ class FilterLayer:
         objective: str,
         priorities: Sequence[float] | None,
         observe_promise: bool,
+        delay: int | None,
         num_envs: int = 1,
     ) -> str:
         """Build the filter over the layer of an env that shows its state.
@@ -41,6 +43,7 @@ class FilterLayer:
             objective: "nearest" or "clf".
             priorities: weights of the squared slacks.
             observe_promise: whether observations hold p_k of the promise filter.
+            delay: that the filter believes, in control periods; None for the problem's.
             num_envs: size of the batch.
 
         Returns:
@@ -51,7 +54,7 @@ class FilterLayer:
         """
         problem: SafetyProblem = inner.problem
         self._filter = episode_filter(
-            problem, condition, knowledge, objective, priorities, num_envs
+            problem, condition, knowledge, objective, priorities, num_envs, delay
         )
         self.safety_filter = self._filter.safety_filter
         if observe_promise and not isinstance(self._filter, PromiseMemory):
@@ -134,11 +137,13 @@ class FilterLayer:
         if directly:
             return self._inner.step_physical(decided)
         found = env.step(self._inner.normalized_action(decided))
-        for u, v, t in zip(decided, self._inner.executed, self._tolerance, strict=True):
+        direct = self._inner.problem.direct
+        arrived = self._inner.executed if direct else self._inner.sent
+        for u, v, t in zip(decided, arrived, self._tolerance, strict=True):
             if np.count_nonzero(abs(u - v) > t):
                 raise ConfigurationError(
                     f"a wrapper below the filter changed the safe action {decided} into"
-                    f" {self._inner.executed}: {self}. Put wrappers that change actions around the"
+                    f" {arrived}: {self}. Put wrappers that change actions around the"
                     " filter; several conditions go into one SafetyFilter"
                 )
         return found
@@ -211,7 +216,7 @@ def _unreadable(env: Any, vector: bool) -> ConfigurationError:
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:
     """Return the input within its bounds nearest to 0, reported before any action."""
-    return np.array([min(max(0.0, low), high) for low, high in problem.box])
+    return np.array(resting_input(problem.box))
 
 
 def rest_info(problem: SafetyProblem) -> Info:

@@ -45,6 +45,8 @@ class SafetyFilterWrapper(
             asks for.
         priorities: of the barriers where not all can be kept: weights of their squared slacks, ones
             by default.
+        delay: of the inputs as the filter believes it, in control periods; by default that of the
+            env's `delay` and `model_delay`. It predicts so far ahead, see `DelayedFilter`.
         observe_promise: append p_k of the promise filter, in [0, 1], to the observation, on which
             what it will allow depends.
         **view: for a third-party env `model`, `barriers`, `state_fn`, and what else of
@@ -65,12 +67,15 @@ class SafetyFilterWrapper(
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
         observe_promise: bool = False,
+        delay: int | None = None,
         **view: Any,
     ) -> None:
         if view:
             env = SafetyMonitor(env, third_party_spec(env.unwrapped, SafeEnv, view, knowledge))
         inner = state_layer(env, (SafeEnv, SafetyMonitor), vector=False)
-        text = self.attach(inner, condition, knowledge, objective, priorities, observe_promise)
+        text = self.attach(
+            inner, condition, knowledge, objective, priorities, observe_promise, delay
+        )
         self.watch_states(inner.episode)
         # The monitor records the view: an env that is made again from its spec has one already.
         gym.utils.RecordConstructorArgs.__init__(
@@ -80,6 +85,7 @@ class SafetyFilterWrapper(
             objective=objective,
             priorities=priorities,
             observe_promise=observe_promise,
+            delay=delay,
         )
         gym.Wrapper.__init__(self, env)
         if observe_promise:

@@ -38,7 +38,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
     Raises:
         NotCompilableError: the engine of the env is "compiled", and the filter has no compiled
-            form: it has learned terms without one, or is the promise filter.
+            form: it has learned terms without one, predicts over a delay, or is the promise filter.
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
@@ -52,6 +52,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
         observe_promise: bool = False,
+        delay: int | None = None,
         **view: Any,
     ) -> None:
         if view:
@@ -59,7 +60,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             env = SafetyMonitorVector(env, spec)
         inner = readable(env)
         self.attach(
-            inner, condition, knowledge, objective, priorities, observe_promise, env.num_envs
+            inner, condition, knowledge, objective, priorities, observe_promise, delay, env.num_envs
         )
         self.watch_states(inner.episodes)
         gym.vector.VectorWrapper.__init__(self, env)

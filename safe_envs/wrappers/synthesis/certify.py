@@ -10,6 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
@@ -107,6 +108,7 @@ def certify(
         ConfigurationError: The nominal controller depends on the time, or see `Synthesis`.
     """
     begin, problem = time.monotonic(), named.problem
+    require_direct(problem, "certificates")
     laws = nominal_laws(problem)
     if policy and not laws:
         raise ConfigurationError(

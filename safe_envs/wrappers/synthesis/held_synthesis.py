@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 
 from safe_envs.dynamics.polynomial import Polynomial
+from safe_envs.problem.actuators import require_direct
 from safe_envs.wrappers.certificates.certificate import HeldCertificate
 from safe_envs.wrappers.certificates.held_step import held_period
 from safe_envs.wrappers.certificates.statements import plant_of
@@ -100,6 +101,7 @@ def certify_held(
             there is not one input, or see `Domain` and `degrees_of`.
     """
     begin, problem = time.monotonic(), named.problem
+    require_direct(problem, "certificates")
     period, plant = held_period(problem), plant_of(problem)
     step = SampledStep(plant, float(period))
     closed = tuple(not np.isfinite([v.low, v.high]).all() for v in problem.states)

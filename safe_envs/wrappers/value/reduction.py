@@ -20,6 +20,7 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, compile_function
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.automaton import Automaton
 from safe_envs.wrappers.value.automaton_building import problem_automaton
@@ -173,6 +174,7 @@ def reduced(
             bounds nor a period; or an argument is not allowed; or the text is no specification
             over the problem's sets.
     """
+    require_direct(problem, "tables of values and promises")
     worlds = {"plant": problem.plant, "model": problem.model}
     if knowledge not in worlds:
         raise ConfigurationError(f"knowledge = {shown(knowledge)}; {nearest(knowledge, worlds)}")

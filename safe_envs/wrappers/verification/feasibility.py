@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from safe_envs.errors import require_whole
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Certified, Condition, spec_of
 from safe_envs.wrappers.verification.certificate_guarantee import (
@@ -163,6 +164,7 @@ def verify(
     """
     require_whole("samples", samples, 1)
     require_whole("seed", seed, 0)
+    require_direct(problem, "proofs of a filter")
     formulas = Formulas(problem, conditions, knowledge)
     analysis = SafeSetAnalysis(formulas, samples, seed)
     points = analysis.invariant_set

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Certified, Condition
 from safe_envs.wrappers.verification.certificate_guarantee import (
@@ -44,6 +45,7 @@ def guarantee_of(
             contradict what the posterior takes for granted, or no state of C was found.
         RelativeDegreeError: a condition does not suit a barrier.
     """
+    require_direct(problem, "bounds of a filter")
     if any(isinstance(c, Certified) for c in conditions):
         return certificate_guarantee(problem, conditions)
     if any(c.credible_set is not None for c in conditions):

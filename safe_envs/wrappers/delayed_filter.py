@@ -1,0 +1,231 @@
+"""A safety filter for a plant that executes an input some control periods after it is sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components, Flavour
+from safe_envs.dynamics.integrators import Integrator
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.delay_line import DelayLine
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
+from safe_envs.number_text import finite_number
+from safe_envs.problem.actuators import require_delay, resting_input
+from safe_envs.validators import real_array
+from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
+from safe_envs.wrappers.safety_filter import SafetyFilter
+
+
+class Prediction:
+    """Where a model will be once the inputs that are under way have been executed.
+
+    A period is one of the simulator with every random number 0: classical Runge-Kutta for a model
+    without noise, and Euler for one with noise, which is the mean of a simulated sub-step. So the
+    prediction is that of the simulator to the last bit where the plant is the model and has no
+    noise; and the mean of the simulated state where f and g u are affine in x. Elsewhere the error
+    of the prediction is what the model does not know: it grows with the delay, and no condition
+    accounts for it.
+
+    Args:
+        model: that is believed.
+        dt: control period in s.
+        substeps: integration steps in it.
+    """
+
+    def __init__(self, model: ControlAffineSDE, dt: float, substeps: int = 1) -> None:
+        self._settings = (model, dt, substeps)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the settings: what is compiled from them is compiled again."""
+        return {"_settings": self._settings}
+
+    @cached_property
+    def _floats(self) -> Integrator:
+        return self._integrator("floats")
+
+    @cached_property
+    def _arrays(self) -> Integrator:
+        return self._integrator("arrays")
+
+    def _integrator(self, flavour: Flavour) -> Integrator:
+        return Integrator(*self._settings, flavour)
+
+    def of_one(self, x: Sequence[float], inputs: Iterable[Sequence[float]]) -> Sequence[float]:
+        """Return the components of the state after some inputs, each for one control period.
+
+        Args:
+            x: n components of the state.
+            inputs: m components each, the first one first.
+
+        Raises:
+            NumericalError: The prediction leaves the finite numbers.
+        """
+        found: Components = tuple(x)
+        try:
+            for u in inputs:
+                found = self._floats.step(found, u, [0.0] * self._floats.channels)
+            if not math.isfinite(sum(found)):
+                raise ArithmeticError(f"it ends at {found}")
+        except NO_VALUE as error:
+            raise NumericalError(
+                f"the model has no finite prediction from {tuple(x)} under the inputs that were"
+                f" sent: {error}"
+            ) from error
+        return found
+
+    def of_batch(self, x: Components, inputs: Iterable[Components]) -> Components:
+        """Return the same for a batch; what is not finite stays so.
+
+        Args:
+            x: n components (B,) of the states.
+            inputs: m components (B,) each.
+
+        Returns:
+            n components (B,).
+        """
+        found = x
+        with np.errstate(all="ignore"):
+            for u in inputs:
+                found = self._arrays.step(found, u, [np.float64(0.0)] * self._arrays.channels)
+        return tuple([np.broadcast_to(c, np.shape(x[0])) for c in found])
+
+
+class DelayedFilter:
+    """A `SafetyFilter` whose inputs are executed a number of control periods after they are sent.
+
+    It remembers the inputs under way, predicts the state at which the next one will be executed,
+    and filters there: `decision.barrier`, `margin` and the rest are of the predicted state. Where
+    the prediction is exact, so is the filter: the plant is filtered as one without delay is, from
+    the period on in which the first decided input arrives. Until then it executes the resting
+    input, which no filter can change.
+
+    Args:
+        safety_filter: decides at the predicted state.
+        delay: whole control periods between sending and executing; 0 filters as `safety_filter`.
+        dt: control period in s.
+        substeps: integration steps of the prediction in a control period.
+        rest: the input that is executed before any arrives, shape (m,); by default that within
+            the bounds of the filter nearest to 0.
+
+    Raises:
+        ConfigurationError: An argument is out of range.
+    """
+
+    def __init__(
+        self,
+        safety_filter: SafetyFilter,
+        delay: int,
+        dt: float,
+        substeps: int = 1,
+        rest: Sequence[float] | None = None,
+    ) -> None:
+        require_delay("delay", delay)
+        require_whole("substeps", substeps, 1)
+        period = finite_number("dt", dt)
+        if not period > 0.0:
+            raise ConfigurationError(f"dt = {period} s; a control period is positive")
+        qp = safety_filter.qp
+        self.safety_filter, self.delay = safety_filter, delay
+        self._prediction = Prediction(safety_filter.model, period, substeps)
+        box = list(zip(np.ravel(qp.low).tolist(), np.ravel(qp.high).tolist(), strict=True))
+        self._rest = resting_input(box) if rest is None else self._input("rest", rest)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: the plant executes the resting input until another arrives."""
+        self._batch: tuple[int, ...] | None = None
+        self._line = DelayLine(0, self._rest)
+
+    @property
+    def sent(self) -> np.ndarray:
+        """The inputs under way, the oldest first, shape (..., delay, m); empty after a reset."""
+        found = self._line.snapshot()
+        return found.reshape(*(self._batch or ()), *found.shape[-2:])
+
+    def filter(self, x: Any, u_nominal: Any) -> FilterDecision:
+        """Decide what to send now, and remember it.
+
+        Args:
+            x: states as measured now, shape (n,) or (..., n); of the same plants at every call
+                until `reset`.
+            u_nominal: proposed inputs in physical units, shape (m,) or (..., m): for the period in
+                which they are executed.
+
+        Returns:
+            The decision at the predicted state; `action` is to be sent.
+
+        Raises:
+            InvalidInputError: A shape does not fit, or an entry is no finite real number.
+            NumericalError: The prediction or the constraint has no finite value.
+        """
+        state = real_array("state", x).astype(np.float64)
+        self._begin(state)
+        decision = self.safety_filter.filter(self._predicted(state), u_nominal)
+        self._line.exchange(self._components(decision.action))
+        return decision
+
+    def override(self, u: Any) -> None:
+        """Say what was sent in place of the last decision, shape (m,) or (..., m).
+
+        Raises:
+            InvalidInputError: The shape does not fit, or an entry is no finite real number.
+            ConfigurationError: Nothing has been decided since the reset.
+        """
+        given = real_array("input", u).astype(np.float64)
+        if self._batch is None:
+            raise ConfigurationError("nothing was sent since the reset: call filter() first")
+        if given.shape != (*self._batch, len(self._rest)) or not np.isfinite(given).all():
+            raise InvalidInputError(
+                f"the input {u!r} does not fit; give finite numbers of shape"
+                f" {(*self._batch, len(self._rest))}"
+            )
+        if self.delay:
+            self._line.under_way[-1] = tuple(self._components(given))
+
+    def _begin(self, x: np.ndarray) -> None:
+        n, batch = self.safety_filter.model.n, x.shape[:-1]
+        if x.shape[-1:] != (n,) or not np.isfinite(x).all():
+            raise InvalidInputError(
+                f"the state has shape {x.shape}; a filter needs finite numbers of shape (..., {n})"
+            )
+        if self._batch is None:
+            count = int(np.prod(batch)) if batch else None
+            self._batch, self._line = batch, DelayLine(self.delay, self._rest, count)
+        if batch != self._batch:
+            raise InvalidInputError(
+                f"the state has the leading axes {batch}, and the inputs under way are of"
+                f" {self._batch}: call reset() before other plants are filtered"
+            )
+
+    def _predicted(self, x: np.ndarray) -> np.ndarray:
+        under_way = self._line.under_way
+        if not under_way:
+            return x
+        if x.ndim == 1:
+            return np.array(self._prediction.of_one(x.tolist(), under_way))
+        found = self._prediction.of_batch(tuple(self._components(x)), under_way)
+        predicted = np.stack(found, axis=-1).reshape(x.shape)
+        if not np.isfinite(predicted).all():
+            i = np.argwhere(~np.isfinite(predicted))[0].tolist()
+            raise NumericalError(f"the model has no finite prediction from the state at {i[:-1]}")
+        return predicted
+
+    def _components(self, values: np.ndarray) -> Sequence[Any]:
+        """Return components of arrays (..., k): floats of one, arrays (B,) of a batch."""
+        if values.ndim == 1:
+            return values.tolist()
+        return list(np.ascontiguousarray(values.reshape(-1, values.shape[-1]).T))
+
+    def _input(self, what: str, given: Any) -> list[float]:
+        values = real_array(what, given)
+        if values.shape != (self.safety_filter.model.m,) or not np.isfinite(values).all():
+            raise InvalidInputError(
+                f"{what} = {given!r}; give {self.safety_filter.model.m} finite numbers"
+            )
+        return values.tolist()

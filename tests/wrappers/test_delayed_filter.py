@@ -1,0 +1,164 @@
+"""A filter over a delay is, for a plant that the model predicts, the filter without one."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import ControlAffineSDE
+from safe_envs.dynamics.integrators import Integrator
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.problem.barrier import Barrier
+from safe_envs.wrappers import DelayedFilter, SafetyFilter
+from safe_envs.wrappers.conditions import HOCBF
+from safe_envs.wrappers.delayed_filter import Prediction
+
+x, y, u, w = sp.symbols("x y u w", real=True)
+DT = 0.1
+LINEAR = ControlAffineSDE(
+    (x, y), (u, w), [y, -x], [[0, 0], [1, sp.Rational(1, 2)]], sp.zeros(2, 1), {}
+)
+NOISY = ControlAffineSDE((x, y), (u, w), [y, -x], [[0, 0], [1, 0.5]], [sp.Rational(1, 5), 0], {})
+BOX = [(-2.0, 1.0), (0.5, 3.0)]
+REST = (0.0, 0.5)
+
+
+def plain_filter(model=LINEAR):
+    return SafetyFilter(model, [(Barrier(1 - x**2), HOCBF((2.0, 4.0)))], BOX)
+
+
+def proposals(steps=60):
+    return np.random.default_rng(0).uniform([-2.0, 0.5], [1.0, 3.0], (steps, 2))
+
+
+def loop(safety_filter, delay, start, proposed, system=LINEAR):
+    """States and decisions of a plant that executes each input `delay` periods after it is sent."""
+    plant, state = Integrator(system, DT, 1, "floats"), tuple(start)
+    line, states, decisions = [REST] * delay, [state], []
+    for each in proposed:
+        decision = safety_filter.filter(np.array(state), each)
+        line.append(tuple(decision.action.tolist()))
+        state = plant.step(state, line.pop(0), [0.0] * plant.channels)
+        states.append(state)
+        decisions.append(decision)
+    return states, decisions
+
+
+@pytest.mark.parametrize("delay", [1, 4])
+def test_a_deterministic_plant_is_filtered_as_without_delay_to_the_last_bit(delay):
+    start, proposed = (0.2, 0.1), proposals()
+    late, made = loop(DelayedFilter(plain_filter(), delay, DT), delay, start, proposed)
+    # The first inputs are at rest for both; then the plant without delay is filtered.
+    resting = Integrator(LINEAR, DT, 1, "floats")
+    state = start
+    for k in range(delay):
+        assert late[k] == state
+        state = resting.step(state, REST, ())
+    prompt, wanted = loop(plain_filter(), 0, state, proposed)
+    assert late[delay:] == prompt[: len(late) - delay]
+    for mine, other in zip(made, wanted, strict=True):
+        for name, a, b in zip(mine._fields, mine, other, strict=True):
+            np.testing.assert_array_equal(a, b, err_msg=name)
+    assert any(d.active.any() for d in made)
+    # A filter that knows nothing of the delay decides otherwise.
+    assert loop(plain_filter(), delay, start, proposed)[0] != late
+
+
+def test_no_delay_is_the_filter_itself():
+    start, proposed = (0.2, 0.1), proposals(10)
+    assert (
+        loop(DelayedFilter(plain_filter(), 0, DT), 0, start, proposed)[0]
+        == (loop(plain_filter(), 0, start, proposed)[0])
+    )
+
+
+def test_a_batch_is_filtered_as_its_states_one_by_one():
+    rng = np.random.default_rng(2)
+    many, ones = DelayedFilter(plain_filter(), 2, DT), []
+    ones = [DelayedFilter(plain_filter(), 2, DT) for _ in range(6)]
+    for _ in range(5):
+        states, proposed = rng.uniform(-0.8, 0.8, (2, 3, 2)), rng.uniform(-2.0, 3.0, (2, 3, 2))
+        together = many.filter(states, proposed)
+        assert together.action.shape == (2, 3, 2)
+        rows = zip(ones, states.reshape(6, 2), proposed.reshape(6, 2), strict=True)
+        apart = [one.filter(state, each).action for one, state, each in rows]
+        np.testing.assert_allclose(together.action.reshape(6, 2), apart, rtol=1e-12, atol=1e-12)
+    assert many.sent.shape == (2, 3, 2, 2)
+    np.testing.assert_allclose(many.sent.reshape(6, 2, 2), [one.sent for one in ones], atol=1e-12)
+
+
+def test_the_prediction_is_the_mean_of_what_is_simulated():
+    inputs = [(0.5, 1.0), (-1.0, 2.0), (1.0, 0.5)]
+    expected = Prediction(NOISY, DT, 2).of_one((0.3, -0.2), inputs)
+    simulated = Integrator(NOISY, DT, 2, "arrays")
+    count, rng = 200_000, np.random.default_rng(0)
+    state = tuple(np.full(count, c) for c in (0.3, -0.2))
+    for each in inputs:
+        draws = rng.standard_normal((simulated.channels // 2, count))
+        # Opposite draws, whose mean is exact in a linear system.
+        draws = np.concatenate([draws, rng.standard_normal(draws.shape)])
+        state = simulated.step(state, each, draws)
+    errors = [np.std(c) / np.sqrt(count) for c in state]
+    for mean, wanted, error in zip(map(np.mean, state), expected, errors, strict=True):
+        assert abs(mean - wanted) < 5.0 * error + 1e-12
+
+
+def test_what_was_sent_in_place_of_the_decision_counts():
+    first, second = (DelayedFilter(plain_filter(), 2, DT) for _ in range(2))
+    state, proposed = np.array([0.4, 0.3]), np.array([0.5, 1.0])
+    for each in (first, second):
+        each.filter(state, proposed)
+    np.testing.assert_array_equal(first.sent[0], REST)
+    first.override([-2.0, 3.0])
+    np.testing.assert_array_equal(first.sent[-1], [-2.0, 3.0])
+    decisions = [each.filter(state, proposed) for each in (first, second)]
+    assert decisions[0].barrier != decisions[1].barrier
+    first.reset()
+    assert first.sent.shape == (0, 2)
+    with pytest.raises(ConfigurationError, match="call filter"):
+        first.override([0.0, 1.0])
+
+
+@pytest.mark.parametrize("remake", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
+def test_a_prediction_outlives_its_compiled_functions(remake):
+    prediction = Prediction(NOISY, DT, 3)
+    inputs = [(0.5, 1.0), (-1.0, 2.0)]
+    wanted = prediction.of_one((0.1, 0.2), inputs)
+    assert remake(prediction).of_one((0.1, 0.2), inputs) == wanted
+
+
+def test_errors():
+    safety_filter = plain_filter()
+    for arguments, message in (
+        ((-1, DT), "delay = -1"),
+        ((1, 0.0), "dt = 0.0 s"),
+        ((1, "fast"), "dt"),
+        ((1, DT, 0), "substeps = 0"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            DelayedFilter(safety_filter, *arguments)
+    with pytest.raises(InvalidInputError, match="rest = "):
+        DelayedFilter(safety_filter, 1, DT, rest=[0.0])
+    late = DelayedFilter(safety_filter, 1, DT)
+    with pytest.raises(InvalidInputError, match="finite numbers of shape"):
+        late.filter([0.0, np.nan], REST)
+    with pytest.raises(InvalidInputError, match=r"\(\.\.\., 2\)"):
+        late.filter([0.0], REST)
+    late.filter([0.0, 0.0], REST)
+    with pytest.raises(InvalidInputError, match="call reset"):
+        late.filter(np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(InvalidInputError, match="does not fit"):
+        late.override([1.0])
+    fast = ControlAffineSDE((x,), (u,), [x**3], [1], [0], {})
+    blown = DelayedFilter(
+        SafetyFilter(fast, [(Barrier(1 - x**2), HOCBF((1.0,)))], [(-1.0, 1.0)]), 3, 1.0
+    )
+    with pytest.raises(NumericalError, match="no finite prediction"):
+        blown.filter([1e60], [0.0])
+    blown.reset()
+    with pytest.raises(NumericalError, match=r"no finite prediction from the state at \[1\]"):
+        blown.filter([[0.0], [1e60]], [[0.0], [0.0]])
