@@ -180,21 +180,19 @@ def _piece_by_piece(
 
     A subexpression that other pieces share may have no value.
     """
-    careful = lru_cache(maxsize=1)(
-        lambda: sp.lambdify(
-            (_OWNER, *names),
-            tuple(formulas),
-            modules=[math],
-            printer=FloatPrinter(),
-            docstring_limit=0,
-        )
+    careful = sp.lambdify(
+        (_OWNER, *names),
+        tuple(formulas),
+        modules=[math],
+        printer=FloatPrinter(),
+        docstring_limit=0,
     )
 
     def function(*arguments: Any) -> Components:
         try:
             return quick(*arguments)
         except (ArithmeticError, ValueError):
-            return careful()(*arguments)
+            return careful(*arguments)
 
     return function
 
