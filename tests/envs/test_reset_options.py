@@ -277,3 +277,18 @@ def test_a_picture_begins_at_the_state_that_was_set():
     env.unwrapped.state = UNSAFE
     assert len(history.snapshot.times) == 1
     np.testing.assert_array_equal(history.snapshot.states[-1], UNSAFE)
+
+
+def test_inputs_under_way_arrive_where_a_state_was_set():
+    env, envs = gym.make(DUBINS, delay=2), batch(delay=2)
+    env.reset(seed=0)
+    envs.reset(seed=0)
+    for each, shape in ((env, (1,)), (envs, (3, 1))):
+        for sent in (0.25, 0.5):
+            each.step(np.full(shape, sent))
+        each.unwrapped.state = UNSAFE
+        *_, info = each.step(np.full(shape, 1.0))
+        assert info["executed_action"] == pytest.approx(0.25 * info["sent_action"])
+        each.reset(options={"state": UNSAFE, "t": 1.0})
+        *_, info = each.step(np.full(shape, 1.0))
+        assert not info["executed_action"].any()

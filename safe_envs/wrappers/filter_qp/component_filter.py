@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -36,6 +37,11 @@ class ComponentFilter:
         self._solve_floats = self._floats.solve_single if single else self._floats.solve
         if qp.plain and not single and not any(c.uncertainty for c in qp.constraints):
             self._solve_floats = self._floats.solve_plain
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        # Another process has not imported yet what decisions may need.
+        self.compile()
 
     def compile(self) -> None:
         """Import and compile all that any decision may need."""

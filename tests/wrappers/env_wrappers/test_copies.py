@@ -68,6 +68,14 @@ def test_what_a_promise_filter_remembers(copied):
 
 
 @copied
+def test_inputs_that_are_under_way(copied):
+    options = {"delay": 3, "model_delay": 2, **SHORT}
+    assert_goes_on_alone(SafetyFilterWrapper(gym.make(DUBINS, **options), "scbf"), copied)
+    envs = gym.make_vec(DUBINS, 3, autoreset_mode="SameStep", **options)
+    assert_goes_on_alone(SafetyFilterVectorWrapper(envs, "scbf"), copied)
+
+
+@copied
 def test_the_goal_of_a_filter(copied):
     env = gym.make("safe_envs/ACC-v0", **SHORT)
     assert_goes_on_alone(SafetyFilterWrapper(env, "hocbf", objective="clf"), copied)

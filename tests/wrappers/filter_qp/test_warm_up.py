@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 
@@ -64,6 +65,28 @@ def test_nothing_is_imported_or_compiled_after_construction(inputs: int) -> None
         [sys.executable, "-c", _SCRIPT.format(m=inputs)], capture_output=True, text=True
     )
     assert not done.returncode, done.stderr
+
+
+_READER = """
+import pickle, sys
+made, states, inputs = pickle.load(sys.stdin.buffer)
+known = set(sys.modules)
+found = [made.filter(x, u) for x, u in zip(states, inputs)]
+made.filter(states, inputs)
+assert not all(one.feasible for one in found)
+late = sorted(set(sys.modules) - known)
+assert not late, late
+"""
+
+
+def test_nor_after_it_is_unpickled() -> None:
+    x = sp.symbols("x:4", real=True)
+    system = ControlAffineSDE(x, sp.symbols("u:4", real=True), [0] * 4, np.eye(4), [0] * 4)
+    made = SafetyFilter(system, [1 - x[0], x[0] + x[3] + 2, 3 - x[1] ** 2], "cbf", (-1, 1))
+    rng = np.random.default_rng(0)
+    given = pickle.dumps((made, 2 * rng.normal(size=(30, 4)), 3 * rng.normal(size=(30, 4))))
+    done = subprocess.run([sys.executable, "-c", _READER], input=given, capture_output=True)
+    assert not done.returncode, done.stderr.decode()
 
 
 def test_formulas_by_pieces_goals_and_reciprocal_conditions_are_compiled_at_once(

@@ -332,10 +332,14 @@ def test_from_states_that_are_set_is_kept_what_can_be_after_the_trace(text):
 
 
 def test_a_goal_that_a_state_is_set_into_is_not_yet_an_end():
-    chosen = filter_of(REACH, 0.9)
-    memory, _ = memory_of(chosen, np.array([0.0, 0.0]))
-    memory.advance((np.array([0.0, 0.0]),), np.zeros(2, dtype=bool))
-    memory.resume((np.array([0.75, 0.0]),), np.array([True, False]), np.ones(2, dtype=int))
+    text = "always safe & eventually left"
+    problem = walk(moves=False, goal=True)
+    table = solve(problem, ValueSettings(specification=text, cells=(160,), inputs=17))
+    settings = PromiseSettings(0.9, specification=text)
+    memory, _ = memory_of(PromiseFilter(LookAhead(table, problem), settings, problem), np.zeros(2))
+    # Both have been on the left: if their episodes ended now, they had met the specification.
+    memory.advance((np.full(2, -0.4),), np.zeros(2, dtype=bool))
+    memory.resume((np.array([0.75, 0.5]),), np.ones(2, dtype=bool), 1)
     assert memory.levels[0] == 0.0
     assert memory.levels[1] > 0.0
 
