@@ -12,6 +12,7 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import Bounds, CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
+from safe_envs.wrappers.filter_qp.furthest import dot, furthest_active
 from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 
@@ -83,7 +84,7 @@ class FilterQPSolver(CompiledQP):
         )
         self._require_finite((*action, *margin))
         slack = [0.0] * len(b) if feasible else [max(-g, 0.0) for g in margin]
-        cause = _furthest(a, b, u, active, self.weights) if True in active else -1
+        cause = furthest_active(a, b, u, active, self.weights) if True in active else -1
         return FilterDecision(action, margin, active, feasible, slack, cause, u)
 
     def solve(
@@ -130,7 +131,7 @@ class FilterQPSolver(CompiledQP):
                 asked[i] = asked[i] - self._qp.dt * self._loss(i, x, action, inside.get(i))
             action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
         for i, defined in inside.items():
-            margin[i] = self._choose(defined, margin[i], _dot(a[i], action) + b[i])
+            margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
             feasible = feasible & defined
         # A demand or a loss without a value shows here, and so does what overflows on the way to
@@ -269,36 +270,10 @@ class FilterQPSolver(CompiledQP):
             square = sum(
                 [p * p / wj for p, wj in zip([aj / unit for aj in ai], self.weights, strict=True)]
             )
-            distance = -(_dot(ai, u) + bi) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
+            distance = -(dot(ai, u) + bi) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
             if i in inside:
                 distance = self._choose(inside[i], distance, math.inf)
             distance = self._choose(acts & (size > 0.0), distance, -math.inf)
             cause = self._choose(distance > furthest, i, cause)
             furthest = self._larger(furthest, distance)
         return cause
-
-
-def _furthest(
-    a: Sequence[Sequence[float]],
-    b: Sequence[float],
-    u: Sequence[float],
-    active: Sequence[bool],
-    weights: Sequence[float],
-) -> int:
-    """Return what `FilterQPSolver._cause` does, in floats, where every condition has a meaning."""
-    acting = [i for i, acts in enumerate(active) if acts and any(a[i])]
-    if len(acting) < 2:
-        return acting[0] if acting else -1
-    cause, furthest = -1, -math.inf
-    for i in acting:
-        unit = max(map(abs, a[i]))  # so that squares neither overflow nor vanish
-        parts = [aj / unit for aj in a[i]]
-        square = sum([p * p / wj for p, wj in zip(parts, weights, strict=True)])
-        distance = -(_dot(a[i], u) + b[i]) / unit / square**0.5
-        if distance > furthest:
-            cause, furthest = i, distance
-    return cause
-
-
-def _dot(a: Sequence[Any], u: Sequence[Any]) -> Any:
-    return sum([aj * uj for aj, uj in zip(a, u, strict=True)])

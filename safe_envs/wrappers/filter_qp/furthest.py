@@ -1,0 +1,47 @@
+"""Which constraint of one state changes the proposed input most."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+
+def furthest_active(
+    a: Sequence[Sequence[float]],
+    b: Sequence[float],
+    u: Sequence[float],
+    active: Sequence[bool],
+    weights: Sequence[float],
+) -> int:
+    """Return the active constraint whose half-space is furthest from the proposed input, else -1.
+
+    Args:
+        a: coefficients of k constraints on m inputs.
+        b: their offsets.
+        u: the proposed input.
+        active: which constraints are active.
+        weights: of the inputs.
+    """
+    acting = [i for i, acts in enumerate(active) if acts and any(a[i])]
+    if len(acting) < 2:
+        return acting[0] if acting else -1
+    cause, furthest = -1, -math.inf
+    for i in acting:
+        unit = max(map(abs, a[i]))  # so that squares neither overflow nor vanish
+        parts = [aj / unit for aj in a[i]]
+        square = sum([p * p / wj for p, wj in zip(parts, weights, strict=True)])
+        distance = -(dot(a[i], u) + b[i]) / unit / square**0.5
+        if distance > furthest:
+            cause, furthest = i, distance
+    return cause
+
+
+def dot(a: Sequence[Any], u: Sequence[Any]) -> Any:
+    """Return a . u.
+
+    Args:
+        a: m entries, floats or arrays (B,).
+        u: m entries, likewise.
+    """
+    return sum([aj * uj for aj, uj in zip(a, u, strict=True)])
