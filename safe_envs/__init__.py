@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from safe_envs.problem.builder import state_problem
     from safe_envs.problem.clf import CLF
     from safe_envs.problem.problem import SafetyProblem
+    from safe_envs.wrappers.safety_filter import SafetyFilter
 
 __all__ = [
     "CLF",
@@ -41,6 +42,7 @@ __all__ = [
     "SafeEnv",
     "SafeEnvsError",
     "SafeVectorEnv",
+    "SafetyFilter",
     "SafetyProblem",
     "SystemDefinitionError",
     "SystemDefinitionWarning",
@@ -56,6 +58,7 @@ _MODULES = {
     "ControlAffineSDE": "dynamics.sde",
     "SafeEnv": "envs.env",
     "SafeVectorEnv": "envs.vector_env",
+    "SafetyFilter": "wrappers.safety_filter",
     "SafetyProblem": "problem.problem",
     "register": "envs.custom",
     "state_problem": "problem.builder",

@@ -45,7 +45,8 @@ def numbers_in(given: Any) -> np.ndarray:
     """Return numbers as an array of at least one axis; empty if there are none."""
     try:
         found = np.asarray(given)
-        # NumPy would read numbers out of texts.
-        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
+        # NumPy would read numbers out of texts, times and what is masked, and drop imaginary parts.
+        no_numbers = found.dtype.kind in "USMmc" or np.ma.is_masked(given)
+        return np.empty(0) if no_numbers else np.atleast_1d(found.astype(float))
     except (TypeError, ValueError, OverflowError):
         return np.empty(0)

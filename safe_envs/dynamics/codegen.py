@@ -171,17 +171,15 @@ def _piece_by_piece(
 
     A subexpression that other pieces share may have no value.
     """
-    careful = lru_cache(maxsize=1)(
-        lambda: sp.lambdify(
-            names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0
-        )
+    careful = sp.lambdify(
+        names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0
     )
 
     def function(*arguments: float) -> Components:
         try:
             return quick(*arguments)
         except (ArithmeticError, ValueError):
-            return careful()(*arguments)
+            return careful(*arguments)
 
     return function
 

@@ -1,16 +1,59 @@
-"""What symbols are declared to be, and matrices of expressions."""
+"""What symbols are declared to be, and expressions as users give them."""
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Iterable
 from typing import Any
 
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError, SystemDefinitionError
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, shown
 from safe_envs.number_text import finite_number
 
+TIME = sp.Symbol("t", nonnegative=True)
+"""Time since the start of the episode or of the control loop, in s. No state or input, which may
+have any sign, is the same symbol, even if its name is t."""
+
 _REAL = sp.Symbol("real", real=True).assumptions0
+
+_SIGNS = {
+    word: sp.Symbol("sign", **{"real": True, word: True}).assumptions0
+    for word in ("real", "positive", "nonnegative", "negative", "nonpositive", "nonzero")
+}
+"""What is known of a real symbol whose sign is declared, by the word that declares it."""
+
+
+def formula(what: str, given: Any) -> sp.Expr:
+    """Return a SymPy expression, or a number as one.
+
+    Args:
+        what: name of the argument, for errors.
+        given: of SymPy, or a number.
+
+    Raises:
+        SystemDefinitionError: it is a text, a function, an inequality or something else.
+    """
+    if isinstance(given, sp.Expr):
+        return given
+    if isinstance(given, sp.logic.boolalg.Boolean):
+        raise SystemDefinitionError(
+            f"{what} is {given}, which is true or false; give the expression itself, 1 - x**2 for 1"
+            " - x**2 >= 0"
+        )
+    if isinstance(given, numbers.Real) and not isinstance(given, bool):
+        return sp.sympify(given)  # pyright: ignore[reportReturnType]
+    kind = (
+        "a text"
+        if isinstance(given, str)
+        else "a function"
+        if callable(given)
+        else type(given).__name__
+    )
+    raise SystemDefinitionError(
+        f"{what} is {kind}, {shown(given)}; give a sympy expression of the symbols of the system,"
+        " like 1 - x**2"
+    )
 
 
 def read_matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
@@ -40,24 +83,50 @@ def read_matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Im
     )
 
 
-def require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iterable[Any]) -> None:
-    """Check that states and inputs are declared real, and nothing more, and parameters real.
+def declared_sign(symbol: sp.Symbol) -> str | None:
+    """Return the word by which the sign of a real symbol is declared.
+
+    Args:
+        symbol: of a quantity whose values are given at run time.
+
+    Returns:
+        "real" for one of any sign, "positive" and so on; None where more is declared than a sign.
+    """
+    return next((word for word, known in _SIGNS.items() if symbol.assumptions0 == known), None)
+
+
+def require_real(
+    states: Iterable[Any],
+    inputs: Iterable[Any],
+    parameters: Iterable[Any],
+    signals: Iterable[Any] = (),
+) -> None:
+    """Check that states and inputs are declared real, and nothing more, and the others real.
 
     Args:
         states: symbols.
         inputs: symbols.
         parameters: symbols.
+        signals: symbols, of which the sign may be declared too.
 
     Raises:
         SystemDefinitionError: One is no symbol, or declared otherwise.
     """
     wrong = []
-    for symbol in (*states, *inputs, *parameters):
+    for symbol in (*states, *inputs, *parameters, *signals):
         if not isinstance(symbol, sp.Symbol):
             raise SystemDefinitionError(
-                f"{symbol!r} among states, inputs and parameters is no symbol; make it by"
+                f"{symbol!r} among states, inputs, parameters and signals is no symbol; make it by"
                 " sympy.symbols"
             )
+        if symbol in signals:
+            if declared_sign(symbol) is None or symbol == TIME:
+                raise SystemDefinitionError(
+                    f"the signal {symbol} is declared {_declared(symbol) or 'nothing'}; make it by"
+                    f" sympy.symbols({symbol.name!r}, real=True), or with positive=True and the"
+                    " like. The time is no signal: it is known to every system"
+                )
+            continue
         if symbol.assumptions0 != _REAL and not (symbol.is_real and symbol in parameters):
             wrong.append(symbol)
     if wrong:

@@ -13,6 +13,7 @@ from typing import Any
 import sympy as sp
 from sympy.simplify.fu import TR5
 
+from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import RelativeDegreeError
@@ -53,13 +54,29 @@ def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.Immutabl
 
 
 def lie_derivative_f(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """Return L_f phi = grad phi . f, the rate of phi without input and noise.
+    """Return L_f phi = grad phi . f + explicit rate, the rate of phi without input and noise.
 
     Args:
         system: the dynamics.
-        expression: phi, of the states and the parameters.
+        expression: phi, of the states, the parameters, the signals and the time.
     """
-    return (gradient(system, expression) * system.drift)[0, 0]
+    along = (gradient(system, expression) * system.drift)[0, 0]
+    return along + explicit_rate(system, expression)
+
+
+def explicit_rate(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """Return dphi/dt + sum over the signals s of dphi/ds rate_s: what changes phi by itself.
+
+    It is what L_f phi would gain if the signals were states with their rates as drift, and the time
+    one with the drift 1.
+
+    Args:
+        system: the dynamics.
+        expression: phi, of the states, the parameters, the signals and the time.
+    """
+    used = expression.free_symbols
+    rates = {**system.signals, TIME: sp.Integer(1)}
+    return sp.Add(*[sp.diff(expression, s) * rate for s, rate in rates.items() if s in used])
 
 
 def lie_derivative_g(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
@@ -193,10 +210,12 @@ def relative_degree(
         RelativeDegreeError: the input reaches none of the first n derivatives (3 n with the
             generator), or h does not depend on the states.
     """
-    system.require_known("the barrier", expression.free_symbols, system.states)
-    # Differentiation along a flow leaves nothing new after n orders; the Ito term has no such
-    # bound.
-    orders = system.n if derivative is lie_derivative_f else 3 * system.n
+    system.require_known("the barrier", expression.free_symbols, system.measured)
+    # Differentiation along a flow leaves nothing new after as many orders as there are quantities
+    # that change; the Ito term has no such bound.
+    timed = TIME in expression.free_symbols or system.uses_time
+    changing = system.n + len(system.signals) + timed
+    orders = changing if derivative is lie_derivative_f else 3 * changing
     for order in range(orders):
         if any(not vanishes(system, entry) for entry in lie_derivative_g(system, expression)):
             return order + 1

@@ -9,35 +9,40 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import fitting, read_matrix, require_real
+from safe_envs.dynamics.declarations import TIME, fitting, formula, read_matrix, require_real
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 
 
 @dataclass(frozen=True)
 class ControlAffineSDE:
-    """dx = (f(x) + g(x) u) dt + sigma(x) dW.
+    """dx = (f + g u) dt + sigma dW, with f, g and sigma of the states x, signals s and the time t.
 
     Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no
-    time derivative of a barrier can be forgotten.
+    time derivative of a barrier can be forgotten. In a control loop that measures it, it is a
+    signal: its values come in at run time, and its rate ds/dt enters every derivative along the
+    system as a drift would. Signals carry no noise. The time is
+    `safe_envs.problem.signals.TIME`. Envs simulate what moves: there it is a state.
 
     States and inputs are symbols that are declared real and nothing more, parameters real or
-    whatever else their values are: sympy simplifies by these words, sqrt(x**2) to |x| for a real x,
-    to x for a positive one, and not at all without.
+    whatever else their values are, signals real or of one sign: sympy simplifies by these words,
+    sqrt(x**2) to |x| for a real x, to x for a positive one, and not at all without.
 
     Attributes:
         states: n symbols x.
         inputs: m symbols u.
-        drift: f, n x 1 expressions of the states and parameters. Lists are read as matrices, here
-            and below.
+        drift: f, n x 1 expressions of states, signals, parameters and the time. Lists are read as
+            matrices, here and below.
         input_matrix: g, n x m.
         diffusion: sigma, n x d, for a d-dimensional standard Wiener process W.
         parameters: value of every other symbol that occurs.
+        signals: the rate of each quantity that is measured at run time, an expression like those of
+            the drift; 0 for one that does not change by itself, such as a mass.
 
     Raises:
         SystemDefinitionError: a shape does not fit, a symbol is unknown, defined twice or not
-            declared real, or an input occurs in f, g or sigma, so that the system is not
-            control-affine.
+            declared real, or an input occurs in f, g, sigma or the rate of a signal, so that the
+            system is not control-affine.
         ConfigurationError: a parameter is no finite number, or not what its symbol is declared to
             be.
 
@@ -50,9 +55,10 @@ class ControlAffineSDE:
     input_matrix: Any
     diffusion: Any
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
+    signals: Mapping[sp.Symbol, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_real(self.states, self.inputs, self.parameters)
+        require_real(self.states, self.inputs, self.parameters, self.signals)
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
             raise SystemDefinitionError(
@@ -65,6 +71,7 @@ class ControlAffineSDE:
             "input_matrix": read_matrix("input_matrix", self.input_matrix, (n, m)),
             "diffusion": read_matrix("diffusion", self.diffusion, (n, None)),
             "parameters": {p: fitting(p, v) for p, v in self.parameters.items()},
+            "signals": {s: formula(f"the rate of {s}", r) for s, r in self.signals.items()},
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -78,6 +85,7 @@ class ControlAffineSDE:
         rate: Sequence[Any],
         diffusion: Any = None,
         parameters: Mapping[sp.Symbol, float] | None = None,
+        signals: Mapping[sp.Symbol, Any] | None = None,
     ) -> ControlAffineSDE:
         """Split dx = rate(x, u) dt + sigma(x) dW into f and g.
 
@@ -87,6 +95,7 @@ class ControlAffineSDE:
             rate: n expressions of the states, inputs and parameters.
             diffusion: sigma, n x d; none by default.
             parameters: value of every other symbol that occurs.
+            signals: rates of what is measured at run time; see the class.
 
         Returns:
             The system with the parts of the rate.
@@ -98,7 +107,7 @@ class ControlAffineSDE:
             raise SystemDefinitionError(
                 f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty"
             )
-        require_real(states, inputs, parameters or {})
+        require_real(states, inputs, parameters or {}, signals or {})
         column = read_matrix("rate", rate, (len(states), 1))
         used = set(inputs)
         effect = column.jacobian(list(inputs)).applyfunc(
@@ -132,6 +141,7 @@ class ControlAffineSDE:
             effect,
             [[0]] * len(states) if diffusion is None else diffusion,
             parameters or {},
+            signals or {},
         )
 
     def __hash__(self) -> int:
@@ -143,16 +153,18 @@ class ControlAffineSDE:
                 self.input_matrix,
                 self.diffusion,
                 tuple(self.parameters.items()),
+                tuple(self.signals.items()),
             )
         )
 
     def _check_symbols(self) -> None:
-        symbols = [*self.states, *self.inputs, *self.parameters]
+        symbols = [*self.states, *self.inputs, *self.parameters, *self.signals]
         names = [s.name for s in symbols]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise SystemDefinitionError(
-                f"defined more than once among states, inputs and parameters: {', '.join(twice)}"
+                "defined more than once among states, inputs, parameters and signals:"
+                f" {', '.join(twice)}"
             )
         for name in ("drift", "input_matrix", "diffusion"):
             used: set[Any] = getattr(self, name).free_symbols
@@ -161,7 +173,15 @@ class ControlAffineSDE:
                     f"{name} depends on the input {_names(used & set(self.inputs))}; the system"
                     " must be affine in the input: put what multiplies it into input_matrix"
                 )
-            self.require_known(name, used, allowed=(*self.states, *self.parameters))
+            self.require_known(name, used, allowed=(*self.measured, *self.parameters))
+        for signal, rate in self.signals.items():
+            if rate.free_symbols & set(self.inputs):
+                raise SystemDefinitionError(
+                    f"the rate of the signal {signal} depends on an input; what the inputs move is"
+                    " a state: put it there, with its rate in the drift"
+                )
+            known = (*self.measured, *self.parameters)
+            self.require_known(f"the rate of the signal {signal}", rate.free_symbols, known)
 
     def require_known(self, what: str, used: Iterable[Any], allowed: Sequence[sp.Symbol]) -> None:
         """Raise SystemDefinitionError if an expression uses a symbol that is not allowed in it.
@@ -184,6 +204,19 @@ class ControlAffineSDE:
                 f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}."
                 f" Note: {hint}"
             )
+
+    @property
+    def measured(self) -> tuple[sp.Symbol, ...]:
+        """What is known at run time besides the parameters: states, signals and the time."""
+        return (*self.states, *self.signals, TIME)
+
+    @property
+    def uses_time(self) -> bool:
+        """Whether the time occurs in f, g, sigma or the rate of a signal."""
+        return any(
+            TIME in part.free_symbols
+            for part in (self.drift, self.input_matrix, self.diffusion, *self.signals.values())
+        )
 
     @property
     def n(self) -> int:

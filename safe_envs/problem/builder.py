@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 from safe_envs.number_text import finite_number
-from safe_envs.problem.barrier import Barrier, formula
+from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable, input_bounds

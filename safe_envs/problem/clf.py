@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import sympy as sp
 
+from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.lie import generator, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
-from safe_envs.problem.barrier import formula
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,8 @@ class CLF:
     The slack d keeps the QP feasible: without it AV <= 0 cannot hold at the goal under noise.
 
     Attributes:
-        V: Lyapunov function of the states.
+        V: Lyapunov function of the states; in a control loop of the user's also of the system's
+            signals and of the time.
         rate: wanted rate of decay, in 1/s.
         input_weight: w_u > 0, an expression of the parameters.
         slack_weight: w_d > 0, likewise.
@@ -48,13 +50,17 @@ class CLF:
         for name in ("V", "input_weight", "slack_weight"):
             object.__setattr__(self, name, formula(f"{name} of a clf", getattr(self, name)))
 
-    def require_known(self, system: ControlAffineSDE) -> None:
-        """Check that V is a function of the states, and the weights of the parameters.
+    def require_known(self, system: ControlAffineSDE, known: Sequence[sp.Symbol]) -> None:
+        """Check of what V and the weights are functions.
+
+        Args:
+            system: whose parameters the weights may hold.
+            known: symbols that V may hold.
 
         Raises:
             SystemDefinitionError: another symbol is in them.
         """
-        system.require_known("V of the clf", self.V.free_symbols, system.states)
+        system.require_known("V of the clf", self.V.free_symbols, known)
         for weight in (self.input_weight, self.slack_weight):
             system.require_known(
                 "a weight of the clf", weight.free_symbols, tuple(system.parameters)

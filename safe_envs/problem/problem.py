@@ -115,6 +115,8 @@ class SafetyProblem:
             object.__setattr__(self, "features", features)
         object.__setattr__(self, "start", self.start or next(iter(self.starts)))
         object.__setattr__(self, "box", tuple((i.low, i.high) for i in self.inputs))
+        for which, system in (("plant", plant), ("model", model)):
+            _require_autonomous(which, system)
         if (plant.states, plant.inputs) != (model.states, model.inputs):
             raise SystemDefinitionError("plant and model must have the same states and inputs")
         if (
@@ -151,7 +153,7 @@ class SafetyProblem:
             plant.require_known("the nominal controller", law.free_symbols, known)
         object.__setattr__(self, "regions", sound_regions(self.regions, plant))
         if self.clf is not None:
-            self.clf.require_known(model)
+            self.clf.require_known(model, model.states)
         if self.frame is not None:
             self.frame.require_known(plant)
         for i in self.inputs:
@@ -280,3 +282,14 @@ class SafetyProblem:
             changes["starts"] = {**self.starts, "given": Start.given(self.states, start)}
             changes["start"] = "given"
         return replace(self, **changes)
+
+
+def _require_autonomous(which: str, system: ControlAffineSDE) -> None:
+    """Raise SystemDefinitionError for a system with signals or explicit time."""
+    moves = f"the signals {', '.join(map(str, system.signals))}" if system.signals else "the time"
+    if system.signals or system.uses_time:
+        raise SystemDefinitionError(
+            f"the {which} depends on {moves}, which nothing measures in an env; make each a state,"
+            " with its rate in the drift (1 for the time), or filter in a loop of your own by"
+            " SafetyFilter(system, ...)"
+        )

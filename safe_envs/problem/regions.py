@@ -8,9 +8,9 @@ from typing import Any
 
 import sympy as sp
 
+from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import SystemDefinitionError, shown
-from safe_envs.problem.barrier import formula
 
 SAFE, GOAL = "safe", "goal"
 """Names of the sets that a problem has of its own: of its barriers, and where an episode ends."""

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.dynamics import declarations
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.validators import numbers_in
 
-TIME = sp.Symbol("t", nonnegative=True)
+TIME = declarations.TIME
 """Time since the start of the episode, in s: references and rewards may depend on it. No state or
 input, which may have any sign, is the same symbol, even if its name is t."""
 

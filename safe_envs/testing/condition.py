@@ -91,7 +91,7 @@ def check_condition(
     for share in (1.0, _TIGHT):
         bounds = np.stack([middle - share * half, middle + share * half])
         tight = SafetyFilter(
-            safety_filter.model, safety_filter.pairs, bounds.T.tolist(), dt=problem.dt
+            safety_filter.model, safety_filter.pairs, bounds=bounds.T.tolist(), dt=problem.dt
         )
         _check_decisions(tight, x, u, *bounds)
 

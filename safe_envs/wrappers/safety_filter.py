@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from safe_envs.dynamics.codegen import Flavour, compile_function, finite, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError, nearest
-from safe_envs.problem.barrier import Barrier
+from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.validators import real_array
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.conditions.spec_text import Conditions, conditions_for
-from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP
+from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
-from safe_envs.wrappers.filter_qp.qp import control_period, input_bounds, positive_weights
-
-_DOUBLE = np.dtype(np.float64)
+from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
 
 
 class SafetyFilter(ComponentFilter):
@@ -43,52 +40,77 @@ class SafetyFilter(ComponentFilter):
     without constraints takes the place of the proposed one. A slack of a barrier is dearer than
     any d.
 
+    Conditions that are named without rates get ones, as many as each barrier's relative degree.
+
+    In a control loop, what is measured just now comes in at each call; see `filter`: input bounds,
+    the values of the system's `signals` and of the adjustable parameters, and the time. Their rates
+    are part of the derivatives along the system; see `ControlAffineSDE`.
+
+    All that a decision may need is imported and compiled here; see `warm_up`.
+
     Args:
-        model: system that the filter knows.
-        pairs: each barrier with its condition.
-        box: (low, high) of each input, in physical units.
+        system: that the filter knows.
+        barriers: h, safe where h >= 0: a `Barrier` or an expression of states, signals and
+            `safe_envs.problem.signals.TIME`; several of them; or (barrier, condition) pairs.
+        conditions: a `Condition` for all barriers, one for each, or their text, like "hocbf:p=2,8"
+            or "szcbf+hocbf"; see `parse_condition`. "szcbf" with noise and "hocbf" without by
+            default. None with pairs.
+        bounds: (low, high) of all inputs in physical units, or one such pair for each. An end may
+            be infinite unless the filter has a goal, a reciprocal condition or certificate, or an
+            uncertain constraint: these go as far as they can.
         weights: diagonal of W, one positive number for each input; ones by default.
         priorities: weights of the squared slacks, one positive number for each constraint; ones by
             default.
         dt: control period in s, for conditions with a sampling margin of first order.
         clf: goal of the joint QP, whose weights replace W.
+        adjustable: names of the system's parameters whose values may be given at each call.
+
+    Attributes:
+        model: the system, as given.
+        pairs: each barrier with its condition, of the constraints in `constraints`.
+        qp: the QP, whose model has the adjustable parameters as signals.
 
     Raises:
-        SystemDefinitionError: There is no constraint, or a barrier does not fit the model.
+        SystemDefinitionError: The system or a barrier is none, or they do not fit.
         RelativeDegreeError: A condition does not suit a barrier.
-        ConfigurationError: The input bounds, a weight or a priority is not allowed, or dt is
+        ConfigurationError: A condition, a bound, a weight or a name is not allowed, or dt is
             missing.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (what a user states, mostly by keyword)
         self,
-        model: ControlAffineSDE,
-        pairs: Sequence[tuple[Barrier, Condition]],
-        box: Sequence[tuple[float, float]],
+        system: ControlAffineSDE,
+        barriers: Any,
+        conditions: Conditions | Sequence[Condition | str] | None = None,
+        bounds: Any = None,
         weights: Sequence[float] | None = None,
         *,
         priorities: Sequence[float] | None = None,
         dt: float | None = None,
         clf: CLF | None = None,
+        adjustable: Sequence[str | sp.Symbol] = (),
     ) -> None:
-        if not pairs:
-            raise SystemDefinitionError("a filter needs at least one (barrier, condition) pair")
-        if clf is not None and weights is not None:
-            raise ConfigurationError(
-                "weights and clf were given; the weights of a joint QP are those of the clf"
-            )
-        self.model = model
-        self.pairs = tuple(pairs)
-        self.constraints = tuple(
-            condition.constraint(model, barrier) for barrier, condition in self.pairs
+        self.model = arguments.require_system(system)
+        known = arguments.with_adjustable(system, adjustable)
+        self.pairs = arguments.read_pairs(known, barriers, conditions)
+        arguments.require_goal(clf, weights)
+        self.constraints = tuple(c.constraint(known, barrier) for barrier, c in self.pairs)
+        endless = limits.takes_endless(self.constraints, clf)
+        qp = FilterQP(
+            known,
+            self.constraints,
+            *limits.read_bounds(known.inputs, bounds, endless),
+            limits.positive_weights("weights", weights, known.m),
+            limits.positive_weights("priorities", priorities, len(self.pairs)),
+            limits.control_period(self.constraints, dt),
+            clf,
+            arguments.runtime_symbols(known, self.pairs, self.constraints, clf),
         )
-        low, high = input_bounds(model, box)
-        weights = positive_weights("weights", weights, model.m)
-        priorities = positive_weights("priorities", priorities, len(pairs))
-        period = control_period(self.constraints, dt)
-        qp = FilterQP(model, self.constraints, low, high, weights, priorities, period, clf)
         super().__init__(qp, [barrier.name for barrier, _ in self.pairs])
-        self._state_shape, self._input_shape = (model.n,), (model.m,)
+        fixed = [p.name for p in known.parameters]
+        self._given = RuntimeArguments(qp, system.parameters, fixed, endless)
+        self._state_shape, self._input_shape = (system.n,), (system.m,)
+        self.warm_up()
 
     @classmethod
     def for_problem(
@@ -98,6 +120,7 @@ class SafetyFilter(ComponentFilter):
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
+        adjustable: Sequence[str | sp.Symbol] = (),
     ) -> SafetyFilter:
         """Return the filter for the barriers of a problem.
 
@@ -110,18 +133,17 @@ class SafetyFilter(ComponentFilter):
             objective: "nearest" to the proposed action, or "clf" for the joint QP with the
                 problem's goal.
             priorities: see the class.
+            adjustable: see the class.
 
         Raises:
+            SystemDefinitionError: What is given is no problem.
             ConfigurationError: A word is unknown, the number of conditions is wrong, a condition is
                 made for another problem, one corrects the model and another knows the plant, or the
                 problem has no clf.
         """
-        for name, given, allowed in (
-            ("knowledge", knowledge, ("model", "plant")),
-            ("objective", objective, ("nearest", "clf")),
-        ):
-            if given not in allowed:
-                raise ConfigurationError(f"{name} = {given!r}; {nearest(str(given), allowed)}")
+        arguments.require_problem(problem)
+        arguments.require_word("knowledge", knowledge, ("model", "plant"))
+        arguments.require_word("objective", objective, ("nearest", "clf"))
         if objective == "clf" and problem.clf is None:
             raise ConfigurationError(
                 f"objective = 'clf', but {problem.name} has no control Lyapunov function; use"
@@ -138,12 +160,23 @@ class SafetyFilter(ComponentFilter):
         clf = problem.clf if objective == "clf" else None
         return cls(
             known,
-            list(zip(problem.barriers, each, strict=True)),
-            problem.box,
+            problem.barriers,
+            each,
+            bounds=problem.box,
             priorities=priorities,
             dt=problem.dt,
             clf=clf,
+            adjustable=adjustable,
         )
+
+    def warm_up(self) -> SafetyFilter:
+        """Import and compile all that any decision may need; making a filter has done that.
+
+        Returns the filter itself.
+        """
+        self.compile()
+        _ = self._barriers_floats, self._barriers_arrays
+        return self
 
     @cached_property
     def _barriers_floats(self) -> Any:
@@ -155,28 +188,45 @@ class SafetyFilter(ComponentFilter):
 
     def _compile_barriers(self, flavour: Flavour) -> Any:
         return compile_function(
-            self.model.states,
-            [self.model.numeric(barrier.expression) for barrier, _ in self.pairs],
+            self.qp.symbols,
+            [self.qp.model.numeric(barrier.expression) for barrier, _ in self.pairs],
             flavour,
         )
 
-    def filter(self, x: Any, u_nominal: Any) -> FilterDecision:
+    def filter(
+        self,
+        x: Any,
+        u_nominal: Any,
+        *,
+        bounds: Any = None,
+        parameters: Mapping[Any, Any] | None = None,
+        t: Any = None,
+    ) -> FilterDecision:
         """Decide for one state or a batch.
 
         Args:
             x: states, shape (n,) or (..., n).
             u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
+            bounds: input bounds in place of the filter's own: (low, high) for all inputs, one such
+                pair for each, (m, 2), or for each input of each state, (..., m, 2). An input whose
+                bounds are equal is held there.
+            parameters: values by name or symbol: of all signals of the system, and of adjustable
+                parameters, which else have the system's. Numbers, or for a batch arrays (...,).
+            t: time in s, likewise, where a barrier or the system depends on it.
 
         Returns:
             Arrays with the same leading axes.
 
         Raises:
-            InvalidInputError: A shape does not fit, or an entry is no finite real number.
+            InvalidInputError: A shape does not fit, an entry is no finite real number, or a lower
+                bound is above its upper one.
+            ConfigurationError: A name is unknown, a value is missing, or a bound is infinite where
+                it may not be.
             NumericalError: The constraint has no finite value at a state.
         """
-        x, u = _doubles("state", x), _doubles("nominal input", u_nominal)
+        x, u = doubles("state", x), doubles("nominal input", u_nominal)
         if x.shape == self._state_shape and u.shape == self._input_shape:
-            return self._filter_one(x, u)
+            return self._filter_one(x, u, bounds, parameters, t)
         n, m = self.model.n, self.model.m
         if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
             raise InvalidInputError(
@@ -184,12 +234,15 @@ class SafetyFilter(ComponentFilter):
                 " with the same leading axes"
             )
         batch = x.shape[:-1]
+        own = None if bounds is None else self._given.bounds(bounds, batch)
+        values = self._given.values(parameters, t, batch)
         states, inputs = (
             tuple(np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T)) for part in (x, u)
         )
+        states += tuple(values)
         with np.errstate(all="ignore"):
-            _require_finite(x, u)
-            decision = self._decide(states, inputs)
+            require_finite(x, u)
+            decision = self._decide(states, inputs, own)
             barriers = self._barriers_arrays(*states)
             action, margin, active, feasible, slack, cause, proposed, _ = decision
             given = () if proposed is inputs else (proposed,)
@@ -205,13 +258,18 @@ class SafetyFilter(ComponentFilter):
             action, margin, active > 0.0, feasible, slack, cause, goal[0] if goal else u, barrier
         )
 
-    def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterDecision:
+    def _filter_one(
+        self, x: np.ndarray, u: np.ndarray, bounds: Any, parameters: Any, t: Any
+    ) -> FilterDecision:
         state, inputs = x.tolist(), u.tolist()
         if not math.isfinite(sum(state) + sum(inputs)):
             with np.errstate(over="ignore"):
-                _require_finite(x, u)
+                require_finite(x, u)
+        own = None if bounds is None else self._given.bounds(bounds)
+        if self.qp.runtime or parameters is not None:
+            state += self._given.values(parameters, t)
         action, margin, active, feasible, slack, cause, proposed, _ = self.decide_floats(
-            state, inputs
+            state, inputs, own
         )
         try:
             barrier = self._barriers_floats(*state)
@@ -237,21 +295,3 @@ class SafetyFilter(ComponentFilter):
         bad = np.flatnonzero(~np.isfinite(barrier).all(axis=1))
         if bad.size:
             raise self.undefined("the barrier", [float(np.atleast_1d(c)[bad[0]]) for c in x])
-
-
-def _doubles(what: str, given: Any) -> np.ndarray:
-    return (
-        given
-        if type(given) is np.ndarray and given.dtype is _DOUBLE
-        else real_array(what, given).astype(np.float64)
-    )
-
-
-def _require_finite(x: np.ndarray, u: np.ndarray) -> None:
-    for what, values in (("state", x), ("nominal input", u)):
-        if not (finite(values) or np.isfinite(values).all()):
-            where = np.argwhere(~np.isfinite(values))[0].tolist()
-            raise InvalidInputError(
-                f"the {what} has the entry {values[tuple(where)]} at {where}; a filter needs finite"
-                " numbers"
-            )

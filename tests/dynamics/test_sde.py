@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError
+from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, state_problem
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.integrators import Integrator
 
 x, y, u, k = sp.symbols("x y u k", real=True)
@@ -106,3 +107,52 @@ def test_functions_by_pieces_compile():
     for value, expected in ((0.5, 0.75), (-0.5, 0.125)):
         assert floats(value)[0] == pytest.approx(expected)
         assert arrays(np.array([value]))[0] == pytest.approx(expected)
+
+
+p, q = sp.symbols("p q", real=True)
+
+
+def measured(**changes):
+    """A point chased by something that is measured."""
+    given = {"drift": [-p + x * TIME], "signals": {p: q, q: 0}, **changes}
+    return ControlAffineSDE((x,), (u,), given.pop("drift"), [[1]], [[0]], **given)
+
+
+def test_signals_have_rates_and_are_known_to_the_system():
+    system = measured()
+    assert system.signals == {p: q, q: sp.Integer(0)}
+    assert system.measured == (x, p, q, TIME)
+    assert system.uses_time
+    assert not measured(drift=[-p]).uses_time
+    assert measured(drift=[-p], signals={p: TIME}).uses_time
+    assert hash(system) == hash(measured()) != hash(measured(signals={p: 0, q: 0}))
+    assert system != measured(signals={p: 0, q: 0})
+    assert measured(parameters={k: 2.0}).with_parameters(k=3.0).signals == system.signals
+    split = ControlAffineSDE.from_rate((x,), (u,), [u - p], signals={p: 1})
+    assert (split.drift[0], split.signals) == (-p, {p: sp.Integer(1)})
+
+
+@pytest.mark.parametrize(
+    ("signals", "message"),
+    [
+        ({p: u, q: 0}, "the signal p depends on an input; what the inputs move is a state"),
+        ({p: y, q: 0}, "the rate of the signal p uses the unknown symbol y"),
+        ({p: "q", q: 0}, "the rate of p is a text"),
+        ({p: True, q: 0}, "the rate of p is bool"),
+        ({p: 0, q: 0, x: 0}, "defined more than once .*signals: x"),
+        ({p: 0, q: 0, "mass": 0}, "'mass' among states, inputs, parameters and signals"),
+        ({p: 0, q: 0, sp.Symbol("mass"): 0}, "the signal mass is declared nothing"),
+        ({p: 0, q: 0, sp.Symbol("n", integer=True): 0}, "the signal n is declared integer=True"),
+        ({p: 0, q: 0, TIME: 1}, "The time is no signal"),
+        ({q: 0}, "drift uses the unknown symbol p"),
+    ],
+)
+def test_contradictions_of_signals_are_named(signals, message):
+    with pytest.raises(SystemDefinitionError, match=message):
+        measured(signals=signals)
+
+
+def test_an_env_simulates_what_moves():
+    for system, names in ((measured(), "p, q"), (measured(drift=[TIME], signals={}), "the time")):
+        with pytest.raises(SystemDefinitionError, match=f"depends on .*{names}.*a state"):
+            state_problem(system, 1 - x, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)

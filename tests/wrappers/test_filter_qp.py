@@ -117,17 +117,19 @@ def test_margin_of_first_order_keeps_stiff_conditions_at_the_period_of_the_thesi
 
 def test_numeric_margins_are_kept_and_first_order_needs_a_period():
     row = [(Barrier(1 - x), CBF(1.0, sampling_margin=0.25))]
-    assert SafetyFilter(integrator(), row, [(-9.0, 9.0)]).filter(
+    assert SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)]).filter(
         [0.0], [5.0]
     ).action == pytest.approx([0.75])
     row = [(Barrier(1 - x), CBF(1.0, sampling_margin="first-order"))]
     with pytest.raises(ConfigurationError, match="needs the control period"):
-        SafetyFilter(integrator(), row, [(-9.0, 9.0)])
+        SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)])
     with pytest.raises(ConfigurationError, match=r"dt = -1"):
-        SafetyFilter(integrator(), row, [(-9.0, 9.0)], dt=-1.0)
+        SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=-1.0)
     # psi = -u + 1 - x, psi' = -u: the plain action 1 makes psi fall by dt = .1 within the period.
     for state, nominal in (([0.0], [5.0]), ([[0.0]], [[5.0]])):
-        result = SafetyFilter(integrator(), row, [(-9.0, 9.0)], dt=0.1).filter(state, nominal)
+        result = SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=0.1).filter(
+            state, nominal
+        )
         assert np.ravel(result.action) == pytest.approx([0.9])
 
 
@@ -142,7 +144,7 @@ def joint(low=-3.0, high=3.0, rows=None, **changes):
         }
     )
     rows = rows or [(Barrier(1 - x), CBF(1.0)), (Barrier(2 - x**2 - y**2), CBF(2.0))]
-    return goal, SafetyFilter(plane(), rows, [(low, high)] * 2, clf=goal)
+    return goal, SafetyFilter(plane(), rows, bounds=[(low, high)] * 2, clf=goal)
 
 
 def test_joint_program_equals_a_general_solver():
@@ -235,7 +237,11 @@ def test_barrier_slack_is_dearer_than_any_goal():
 def test_goals_are_checked():
     with pytest.raises(ConfigurationError, match="weights of a joint QP"):
         SafetyFilter(
-            plane(), [(Barrier(1 - x), CBF(1.0))], [(-1.0, 1.0)] * 2, [1.0, 1.0], clf=CLF(x**2)
+            plane(),
+            [(Barrier(1 - x), CBF(1.0))],
+            bounds=[(-1.0, 1.0)] * 2,
+            weights=[1.0, 1.0],
+            clf=CLF(x**2),
         )
     with pytest.raises(ConfigurationError, match="Pendulum has no control Lyapunov function"):
         SafetyFilter.for_problem(problem_of("safe_envs/Pendulum-v0"), SCBF(), objective="clf")
@@ -245,7 +251,7 @@ def test_goals_are_checked():
         SafetyFilter(
             plane(),
             [(Barrier(1 - x), CBF(1.0))],
-            [(-1.0, 1.0)] * 2,
+            bounds=[(-1.0, 1.0)] * 2,
             clf=CLF(x**2, slack_weight=0.0),
         )
     with pytest.raises(ConfigurationError, match="no control Lyapunov function"):
@@ -264,7 +270,9 @@ def test_priorities_say_which_row_gives_way():
         ((3.0, 1.0), 0.25),
         ((1.0, 9.0), -0.4),
     ):
-        safety_filter = SafetyFilter(integrator(), rows, [(-3.0, 3.0)], priorities=priorities)
+        safety_filter = SafetyFilter(
+            integrator(), rows, bounds=[(-3.0, 3.0)], priorities=priorities
+        )
         for state in ([0.0], [[0.0]]):
             result = safety_filter.filter(state, np.full_like(state, 2.0))
             np.testing.assert_allclose(np.ravel(result.action), [action], atol=1e-9)
@@ -273,12 +281,12 @@ def test_priorities_say_which_row_gives_way():
             )
     for wrong in ((1.0,), (1.0, 0.0), (1.0, np.nan)):
         with pytest.raises(ConfigurationError, match="priorities"):
-            SafetyFilter(integrator(), rows, [(-3.0, 3.0)], priorities=wrong)
+            SafetyFilter(integrator(), rows, bounds=[(-3.0, 3.0)], priorities=wrong)
 
 
 def test_cause_is_the_active_row_furthest_from_the_proposal():
     rows = [(Barrier(1 - x), CBF(1.0)), (Barrier(2 - x), CBF(1.0)), (Barrier(x + 1), CBF(1.0))]
-    safety_filter = SafetyFilter(integrator(), rows, [(-9.0, 9.0)])
+    safety_filter = SafetyFilter(integrator(), rows, bounds=[(-9.0, 9.0)])
     states, inputs = np.zeros((4, 1)), np.array([[5.0], [0.5], [-7.0], [1.5]])
     assert safety_filter.filter(states, inputs).cause.tolist() == [0, -1, 2, 0]
     assert [safety_filter.filter(s, v).cause for s, v in zip(states, inputs, strict=True)] == [
@@ -289,7 +297,7 @@ def test_cause_is_the_active_row_furthest_from_the_proposal():
     ]
     flat = ControlAffineSDE((x, y), (u,), [-1, 0], [0, 1], [0, 0])
     both = SafetyFilter(
-        flat, [(Barrier(y + 0.5), CBF(1.0)), (Barrier(1 - y), CBF(1.0))], [(-9.0, 9.0)]
+        flat, [(Barrier(y + 0.5), CBF(1.0)), (Barrier(1 - y), CBF(1.0))], bounds=[(-9.0, 9.0)]
     )
     assert both.filter([0.0, 0.0], [4.0]).cause == 1
 
@@ -346,7 +354,7 @@ def test_a_condition_without_meaning_does_not_harm_another_barrier():
     both = ControlAffineSDE((x, y), (u,), [0, 0], [1, 1], [0, 0])
     for half in (10.0, 1e6):
         safety_filter = SafetyFilter(
-            both, [(Barrier(x), CBF(1.0)), (Barrier(-y), RCBF())], [(-half, half)]
+            both, [(Barrier(x), CBF(1.0)), (Barrier(-y), RCBF())], bounds=[(-half, half)]
         )
         for state in ([0.1, 1.0], [[0.1, 1.0]]):
             result = safety_filter.filter(np.array(state), np.zeros((*np.shape(state)[:-1], 1)))
@@ -360,10 +368,10 @@ def test_cause_is_measured_in_the_weighted_distance():
     rows = [(Barrier(1 - x), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))]
     proposal = np.array([4.0, 3.0])  # 3 beyond the first row, 2.5 beyond the second
     for weights, cause in ((None, 0), ([1.0, 4.0], 1)):
-        safety_filter = SafetyFilter(plane(), rows, [(-9.0, 9.0)] * 2, weights=weights)
+        safety_filter = SafetyFilter(plane(), rows, bounds=[(-9.0, 9.0)] * 2, weights=weights)
         assert safety_filter.filter(np.zeros(2), proposal).cause == cause
         assert safety_filter.filter(np.zeros((1, 2)), proposal[None]).cause.tolist() == [cause]
-    alone = SafetyFilter(plane(), rows[:1], [(-9.0, 9.0)] * 2)
+    alone = SafetyFilter(plane(), rows[:1], bounds=[(-9.0, 9.0)] * 2)
     assert alone.filter(np.zeros(2), np.zeros(2)).cause == -1
     assert alone.filter(np.zeros((2, 2)), np.array([[0.0, 0.0], [4.0, 0.0]])).cause.tolist() == [
         -1,
@@ -379,7 +387,9 @@ def test_cause_is_a_distance_and_not_a_miss_of_the_row():
         (1 - 0.5 * x, ([4.0, 2.0], [4.0, 2.9])),
     ):
         safety_filter = SafetyFilter(
-            plane(), [(Barrier(first), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))], [(-9.0, 9.0)] * 2
+            plane(),
+            [(Barrier(first), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))],
+            bounds=[(-9.0, 9.0)] * 2,
         )
         for cause, proposal in enumerate(proposals):
             assert safety_filter.filter(np.zeros(2), proposal).active.all()
@@ -403,7 +413,9 @@ def test_an_uncertainty_with_constant_entries_follows_the_state_all_the_same():
     # 1 - x - u >= |x| in the box of u, and w has no part: entries (0, 0), (0, u), (0, w), (u, u),
     # (u, w), (w, w).
     safety_filter = SafetyFilter(
-        plane(), [(Barrier(1 - x), Doubtful(1.0, form=(x**2, 0, 0, 0, 0, 0)))], [(-9.0, 9.0)] * 2
+        plane(),
+        [(Barrier(1 - x), Doubtful(1.0, form=(x**2, 0, 0, 0, 0, 0)))],
+        bounds=[(-9.0, 9.0)] * 2,
     )
     for state, largest in ((0.0, 1.0), (0.5, 0.0), (-0.5, 1.0), (0.25, 0.5)):
         np.testing.assert_allclose(
@@ -418,7 +430,7 @@ def test_a_loss_without_a_value_is_an_error():
     # psi = sqrt(x) - u with x' = u has the rate u/(2 sqrt(x)) - ..., which is infinite at 0, where
     # the row itself is finite.
     row = [(Barrier(1 - x), Rooted(1.0, sampling_margin="first-order"))]
-    safety_filter = SafetyFilter(integrator(), row, [(-9.0, 9.0)], dt=0.1)
+    safety_filter = SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=0.1)
     for state in ([0.0], [[0.25], [0.0]]):
         with pytest.raises(NumericalError, match="no finite value at x = 0"):
             safety_filter.filter(state, np.full_like(state, -1.0))
@@ -438,11 +450,11 @@ def test_goals_are_checked_for_their_symbols():
     row = [(Barrier(1 - x), CBF(1.0))]
     for goal in (CLF(q**2), CLF(x**2, input_weight=q)):
         with pytest.raises(SystemDefinitionError, match="unknown symbol q"):
-            SafetyFilter(plane(), row, [(-1.0, 1.0)] * 2, clf=goal)
+            SafetyFilter(plane(), row, bounds=[(-1.0, 1.0)] * 2, clf=goal)
     for rate in (-1.0, float("nan")):
         with pytest.raises(ConfigurationError, match="rate"):
             CLF(x**2, rate=rate)
-    undefined = SafetyFilter(plane(), row, [(-1.0, 1.0)] * 2, clf=CLF(1 / x))
+    undefined = SafetyFilter(plane(), row, bounds=[(-1.0, 1.0)] * 2, clf=CLF(1 / x))
     with pytest.raises(NumericalError, match=r"the goal has no finite value at x = 0"):
         undefined.filter(np.zeros(2), np.zeros(2))
     with pytest.raises(NumericalError, match=r"the goal has no finite value at x = 0"):

@@ -44,7 +44,7 @@ def plane():
 
 def test_nearest_action_of_a_scalar_system_in_closed_form():
     # h = 1 - x, x' = u: u <= alpha (1 - x).
-    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(2.0))], [(-3.0, 3.0)])
+    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(2.0))], bounds=[(-3.0, 3.0)])
     for state, nominal, action, active in (
         (0.0, 1.0, 1.0, False),
         (0.0, 2.5, 2.0, True),
@@ -61,7 +61,7 @@ def test_nearest_action_of_a_scalar_system_in_closed_form():
 
 
 def test_infeasible_states_give_the_least_violating_action_with_its_slack():
-    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], [(-3.0, 3.0)])
+    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], bounds=[(-3.0, 3.0)])
     result = safety_filter.filter(np.array([6.0]), np.array([1.0]))
     assert (result.action.tolist(), result.feasible, result.slack.tolist()) == (
         [-3.0],
@@ -125,9 +125,11 @@ def test_batches_equal_single_states(name):
 
 def test_weights_decide_which_input_gives_way():
     rows = [(Barrier(1 - x - y), CBF(1.0))]
-    even = SafetyFilter(plane(), rows, [(-5.0, 5.0)] * 2).filter(np.zeros(2), np.array([1.0, 1.0]))
+    even = SafetyFilter(plane(), rows, bounds=[(-5.0, 5.0)] * 2).filter(
+        np.zeros(2), np.array([1.0, 1.0])
+    )
     np.testing.assert_allclose(even.action, [0.5, 0.5])
-    uneven = SafetyFilter(plane(), rows, [(-5.0, 5.0)] * 2, weights=[1.0, 9.0]).filter(
+    uneven = SafetyFilter(plane(), rows, bounds=[(-5.0, 5.0)] * 2, weights=[1.0, 9.0]).filter(
         np.zeros(2), np.array([1.0, 1.0])
     )
     np.testing.assert_allclose(uneven.action, [0.1, 0.9])
@@ -137,7 +139,7 @@ def test_several_barriers_with_conditions_of_their_own():
     chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
     position, speed = Barrier(1 - x, "position"), Barrier(2 - y, "speed")
     safety_filter = SafetyFilter(
-        chain, [(position, HOCBF((1.0, 1.0))), (speed, CBF(1.0))], [(-4.0, 4.0)]
+        chain, [(position, HOCBF((1.0, 1.0))), (speed, CBF(1.0))], bounds=[(-4.0, 4.0)]
     )
     # b_2 = -u - 2 y + (1 - x) >= 0 and -u + 2 - y >= 0.
     result = safety_filter.filter(np.array([0.0, 0.2]), np.array([3.0]))
@@ -169,7 +171,7 @@ def test_several_barriers_with_conditions_of_their_own():
     ],
 )
 def test_inputs_that_are_none_are_errors(state, nominal):
-    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], [(-1.0, 1.0)])
+    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], bounds=[(-1.0, 1.0)])
     with pytest.raises(InvalidInputError):
         safety_filter.filter(np.array(state), np.array(nominal))
     if np.ndim(state):
@@ -181,7 +183,7 @@ def test_inputs_that_are_none_are_errors(state, nominal):
 
 @pytest.mark.parametrize("h", [sp.log(x), 1 / x, sp.sqrt(x) + 1])
 def test_states_where_the_constraint_has_no_value_are_errors(h):
-    safety_filter = SafetyFilter(integrator(), [(Barrier(h), CBF(1.0))], [(-1.0, 1.0)])
+    safety_filter = SafetyFilter(integrator(), [(Barrier(h), CBF(1.0))], bounds=[(-1.0, 1.0)])
     with pytest.raises(NumericalError, match="no finite value at x = 0"):
         safety_filter.filter(np.array([0.0]), np.array([0.0]))
     with pytest.raises(NumericalError, match="no finite value at x = 0"):
@@ -190,22 +192,22 @@ def test_states_where_the_constraint_has_no_value_are_errors(h):
 
 def test_construction_is_checked():
     rows = [(Barrier(1 - x), CBF(1.0))]
-    for box in ([(1.0, 1.0)], [(0.0, np.inf)], [(np.nan, 1.0)], [(2.0, 1.0)], [(0.0, 1.0)] * 2):
-        with pytest.raises(ConfigurationError, match="box"):
-            SafetyFilter(integrator(), rows, box)
+    for box in ([(1.0, 1.0)], [(np.inf, np.inf)], [(np.nan, 1.0)], [(2.0, 1.0)], [(0.0, 1.0)] * 2):
+        with pytest.raises(ConfigurationError, match="bounds"):
+            SafetyFilter(integrator(), rows, bounds=box)
     for weights in ([0.0], [-1.0], [np.nan], [1.0, 1.0]):
         with pytest.raises(ConfigurationError, match="weights"):
-            SafetyFilter(integrator(), rows, [(-1.0, 1.0)], weights)
-    with pytest.raises(SystemDefinitionError, match="at least one"):
-        SafetyFilter(integrator(), [], [(-1.0, 1.0)])
+            SafetyFilter(integrator(), rows, bounds=[(-1.0, 1.0)], weights=weights)
+    with pytest.raises(SystemDefinitionError, match="barriers is empty"):
+        SafetyFilter(integrator(), [], bounds=[(-1.0, 1.0)])
     with pytest.raises(SystemDefinitionError, match="unknown symbol y"):
-        SafetyFilter(integrator(), [(Barrier(1 - y), CBF(1.0))], [(-1.0, 1.0)])
+        SafetyFilter(integrator(), [(Barrier(1 - y), CBF(1.0))], bounds=[(-1.0, 1.0)])
     with pytest.raises(ConfigurationError, match="knowledge = 'both'"):
         SafetyFilter.for_problem(problem_of("safe_envs/Scalar-v0"), CBF(1.0), "both")
 
 
 def test_single_state_of_batch_one_keeps_its_leading_axis():
-    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], [(-1.0, 1.0)])
+    safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], bounds=[(-1.0, 1.0)])
     assert safety_filter.filter(np.zeros((1, 1)), np.zeros((1, 1))).action.shape == (1, 1)
     assert safety_filter.filter(np.zeros((0, 1)), np.zeros((0, 1))).action.shape == (0, 1)
 

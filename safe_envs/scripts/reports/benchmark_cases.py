@@ -70,7 +70,7 @@ def several_constraints() -> dict[str, Case]:
         (Barrier(3 - x), HOCBF((1, 1))),
         (Barrier(1 - v**2 - w**2), CBF(1.0)),
     ]
-    in_plane = SafetyFilter(point, barriers, [(-2.0, 2.0)] * 2)
+    in_plane = SafetyFilter(point, barriers, bounds=[(-2.0, 2.0)] * 2)
     rng = np.random.default_rng(0)
     angle, radius = rng.uniform(0, 2 * np.pi, NUM_ENVS), rng.uniform(1.1, 2.0, NUM_ENVS)
     states = np.stack(

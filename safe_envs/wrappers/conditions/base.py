@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import sympy as sp
 
+from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.identities import pieces_fit
 from safe_envs.dynamics.lie import Derivative, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
@@ -61,6 +62,8 @@ class Condition(ABC):
             filter that knows the plant.
         method: by which the models that it needs are learned; None if it needs none.
         differentiates: whether it differentiates the barrier, which has to be smooth then.
+        autonomous: whether it is only for models and barriers that neither hold signals nor the
+            time, as what was learned or proved of one.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the constraint.
 
     Raises:
@@ -73,6 +76,7 @@ class Condition(ABC):
     corrects_model: ClassVar[bool] = False
     method: ClassVar[str | None] = None
     differentiates: ClassVar[bool] = True
+    autonomous: ClassVar[bool] = False
 
     sampling_margin: str | float = field(default="none", kw_only=True)
 
@@ -108,8 +112,11 @@ class Condition(ABC):
             RelativeDegreeError: The condition does not suit the barrier's relative degree.
             SystemDefinitionError: A class-K function cannot be differentiated as often as the chain
                 needs.
-            ConfigurationError: The code of a condition from outside fails.
+            ConfigurationError: The condition is only for models without signals and time, or the
+                code of a condition from outside fails.
         """
+        if self.autonomous:
+            _require_autonomous(self.name, model, barrier)
         try:
             return _constraint(self, model, barrier)
         except SafeEnvsError:
@@ -171,6 +178,18 @@ class Condition(ABC):
         return {key: value for key, value in given.items() if value is not None}
 
 
+def _require_autonomous(name: str, model: ControlAffineSDE, barrier: Barrier) -> None:
+    """Raise ConfigurationError for a model or a barrier that changes by itself."""
+    moving = [*model.signals, *([TIME] if model.uses_time else [])]
+    moving += [TIME] if not moving and TIME in barrier.expression.free_symbols else []
+    if moving:
+        raise ConfigurationError(
+            f"{name} was learned or proved for a system without signals, adjustable parameters and"
+            f" time; {barrier.name} or the model depends on {', '.join(map(str, moving))}. Take a"
+            " condition that needs nothing but a model, such as hocbf or szcbf"
+        )
+
+
 def _sympified(found: Any, inputs: int) -> AffineConstraint:
     """Return a constraint whose Python numbers are expressions; raise for anything else."""
     if not isinstance(found, AffineConstraint):
@@ -199,7 +218,7 @@ def _constraint(
     times = len(found.chain) + (condition.sampling_margin == FIRST_ORDER)
     if condition.differentiates and not pieces_fit(
         barrier.expression,
-        model.states,
+        model.measured,
         (2 if condition.stochastic and model.noisy else 1) * times - 1,
     ):
         raise not_smooth(barrier)

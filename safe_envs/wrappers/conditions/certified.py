@@ -66,6 +66,7 @@ class Certified(Condition):
     name = "certified"
     stochastic = True
     differentiates = False
+    autonomous = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -43,6 +43,7 @@ class LearnedCondition(Condition):
     learned: LearnedModel
     method: ClassVar[str]  # pyright: ignore[reportIncompatibleVariableOverride]  (never None)
     corrects_model = True
+    autonomous = True
 
     def require_fit(self, problem: SafetyProblem) -> None:
         """Raise ConfigurationError for a model of another method or another problem."""

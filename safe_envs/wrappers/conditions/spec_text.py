@@ -12,8 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from safe_envs.dynamics.lie import generator, lie_derivative_f, relative_degree
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
 from safe_envs.number_text import real_or_complex
+from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.certified import Certified
@@ -73,8 +76,8 @@ def conditions_for(problem: SafetyProblem, given: Conditions) -> tuple[Condition
     each = (read,) * count if isinstance(read, Condition) else read
     if not isinstance(each, Sequence) or not all(isinstance(c, Condition) for c in each):
         raise ConfigurationError(
-            f"condition = {given!r}; give a Condition, one for each barrier, or their text, like"
-            " 'scbf'"
+            f"condition = {shown(given)}; give a Condition, one for each barrier, or their text,"
+            " like 'scbf'"
         )
     if len(each) != count:
         raise ConfigurationError(
@@ -83,6 +86,36 @@ def conditions_for(problem: SafetyProblem, given: Conditions) -> tuple[Condition
     for condition in each:
         condition.require_fit(problem)
     return tuple(each)
+
+
+def parse_for_system(
+    text: str, system: ControlAffineSDE, barriers: Sequence[Barrier]
+) -> tuple[Condition, ...]:
+    """Read a condition for every barrier of a system without a problem.
+
+    Args:
+        text: as for `parse_conditions`; rates that it does not name are ones.
+        system: the dynamics.
+        barriers: what is safe.
+
+    Raises:
+        ConfigurationError: As `parse_conditions`; or one needs a file, which is of a problem.
+        RelativeDegreeError: No input reaches a barrier whose rates are not named.
+    """
+    found: list[Condition] = []
+    for part, barrier in zip(_parts_for(text, len(barriers), "the filter"), barriers, strict=True):
+        condition, given = _settings(part)
+        if _reads_file(condition):
+            advice = f"make the filter by SafetyFilter.for_problem(problem, {shown(text)})"
+            raise ConfigurationError(
+                f"{condition.name} is learned or proved of a problem; {advice}"
+            )
+        degree = 0
+        if set(given) <= {"sampling_margin"}:
+            derivative = generator if condition.stochastic else lie_derivative_f
+            degree = relative_degree(system, barrier.expression, derivative)
+        found.append(_of_model(part, condition, given, (1.0,) * degree))
+    return tuple(found)
 
 
 def require_readable(text: str, problem: SafetyProblem) -> None:
@@ -124,14 +157,8 @@ def spec_of(conditions: Condition | Sequence[Condition]) -> str:
 def _parsed(
     text: str, problem: SafetyProblem, learned_for: Callable[[Any, str | None], Any]
 ) -> tuple[Condition, ...]:
-    parts, count = parts_of(text), len(problem.barriers)
-    if len(parts) not in (1, count):
-        allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
-        raise ConfigurationError(
-            f"filter {shown(text)} has {len(parts)} conditions; {problem.name} takes {allowed}"
-        )
     found: list[Condition] = []
-    for i, part in enumerate(parts * count if len(parts) == 1 else parts):
+    for i, part in enumerate(_parts_for(text, len(problem.barriers), problem.name)):
         condition, given = _settings(part)
         if issubclass(condition, Certified):
             found.append(_made(part, condition.for_problem, problem, **given))
@@ -141,6 +168,17 @@ def _parsed(
         else:
             found.append(_of_model(part, condition, given, problem.gains_of(i)))
     return tuple(found)
+
+
+def _parts_for(text: str, count: int, taker: str) -> list[ConditionText]:
+    """Return the texts of `count` conditions; a single one is for all."""
+    parts = parts_of(text)
+    if len(parts) not in (1, count):
+        allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
+        raise ConfigurationError(
+            f"filter {shown(text)} has {len(parts)} conditions; {taker} takes {allowed}"
+        )
+    return parts * count if len(parts) == 1 else parts
 
 
 def _of_model(

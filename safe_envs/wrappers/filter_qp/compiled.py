@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import itertools
 import math
 import operator
 from collections.abc import Sequence
@@ -18,7 +20,11 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp import dispatch, second_order_batch, second_order_constraint
+from safe_envs.wrappers.qp.majorant import majorant
 from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance, tolerances
+
+Bounds = tuple[Sequence[Any], Sequence[Any]]
+"""m lower and m upper input bounds, floats or arrays (B,)."""
 
 
 class CompiledQP:
@@ -28,6 +34,7 @@ class CompiledQP:
     differ.
 
     Attributes:
+        bounds: the lower and the upper input bounds where no others are given at run time.
         weights: of the inputs, those of the goal where there is one.
         goal_unit: of the goal's slack, in which it weighs as much as an input.
     """
@@ -43,9 +50,10 @@ class CompiledQP:
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
         arrays = flavour == "arrays"
         self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
-        self._symbols = (*qp.model.states, *(s for term in qp.terms for s in term.symbols))
-        self._low: Sequence[Any] = constants(qp.low) if arrays else qp.low
-        self._high: Sequence[Any] = constants(qp.high) if arrays else qp.high
+        self._symbols = (*qp.symbols, *(s for term in qp.terms for s in term.symbols))
+        self.bounds: Bounds = (
+            (constants(qp.low), constants(qp.high)) if arrays else (qp.low, qp.high)
+        )
         self.weights = qp.weights
         self._choose: Any = np.where if arrays else _choose
         self._larger: Any = np.maximum if arrays else max
@@ -55,7 +63,7 @@ class CompiledQP:
             second_order_batch.project_arrays if arrays else second_order_constraint.project_floats
         )
         if qp.clf is not None:
-            qp.clf.require_known(qp.model)
+            qp.clf.require_known(qp.model, qp.symbols)
             weights = (qp.clf.input_weight, qp.clf.slack_weight)
             input_weight, slack_weight = [float(qp.model.numeric(w)) for w in weights]
             if not (0 < input_weight < math.inf and 0 < slack_weight < math.inf):
@@ -66,11 +74,41 @@ class CompiledQP:
             self.weights = [input_weight] * self._m
             self.goal_unit = math.sqrt(input_weight / slack_weight)
 
+    def compile(self) -> None:
+        """Compile all functions that a decision may call; else each is at its first call."""
+        _ = self._values, self._demands, self._changes, self.planes
+        zero: Any = np.zeros(1) if self._flavour == "arrays" else 0.0
+        for term in self._terms:
+            # Learned terms compile themselves when they are first read, wherever that is.
+            with contextlib.suppress(ArithmeticError, ValueError), np.errstate(all="ignore"):
+                term((zero,) * self._qp.model.n)
+
+    @cached_property
+    def planes(self) -> dict[int, tuple[list[Any], Any]]:
+        """Planes above uncertainties that are the same at every state, for the QP's own bounds."""
+        forms = {i: self._qp.constraints[i].uncertainty or () for i in self._uncertain}
+        return {
+            i: self._plane(tuple(map(float, form)), (self._qp.low, self._qp.high))
+            for i, form in forms.items()
+            if all(e.is_number for e in form)
+        }
+
+    def _plane(self, form: Components, bounds: Bounds) -> tuple[list[Any], Any]:
+        """Return the plane above the uncertainty of a constraint; see `majorant`."""
+        width = self._m + 1
+        place = {
+            pair: k
+            for k, pair in enumerate(itertools.combinations_with_replacement(range(width), 2))
+        }
+        q = [[form[place[min(j, k), max(j, k)]] for k in range(width)] for j in range(width)]
+        return majorant(q, *bounds)
+
     def _with_terms(self, x: Sequence[Any]) -> Sequence[Any]:
-        """Return the state, followed by the learned terms there."""
-        return (
-            (*x, *[value for term in self._terms for value in term(tuple(x))]) if self._terms else x
-        )
+        """Return the state and what follows it, and then the learned terms of the state."""
+        if not self._terms:
+            return x
+        state = tuple(x[: self._qp.model.n])
+        return (*x, *[value for term in self._terms for value in term(state)])
 
     def _require_finite(self, values: Sequence[Any], what: str = "the constraint") -> None:
         total: Any = sum(values)

@@ -28,15 +28,17 @@ class Values:
 
     def __init__(self, qp: FilterQP, data: Data) -> None:
         self._model, self._data = qp.model, data
-        self._symbols: dict[str, Sequence[sp.Symbol]] = {"x": qp.model.states}
+        self._symbols: dict[str, Sequence[sp.Symbol]] = {"x": qp.symbols}
         self._text = Source("")
         self.solver = FilterQPSolver(qp, "floats")
         self.lines: list[str] = []
+        # Learned terms are of the state alone.
+        state = f"({''.join(f'x[{i}], ' for i in range(qp.model.n))})" if qp.runtime else "x"
         calls = []
         for i, term in enumerate(qp.terms):
             name = f"filter_terms_{i}"
             self._text += terms_source(term, name, data)
-            calls.append(f"{name}(x, data, work)")
+            calls.append(f"{name}({state}, data, work)")
         if calls:
             self._symbols["terms"] = tuple(s for term in qp.terms for s in term.symbols)
             self.lines.append(f"terms = {' + '.join(calls)}")

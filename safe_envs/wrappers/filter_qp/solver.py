@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components
-from safe_envs.wrappers.filter_qp.compiled import CompiledQP
+from safe_envs.wrappers.filter_qp.compiled import Bounds, CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
 from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
-from safe_envs.wrappers.qp.majorant import majorant
 
 _FAR = 1e4
 """How many times further than the input bounds reach is far away."""
@@ -25,38 +22,42 @@ _FAR = 1e4
 class FilterQPSolver(CompiledQP):
     """Solves a QP for states given component by component, as floats or as arrays of a batch."""
 
-    def solve_single(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
+    def solve_single(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
         """Solve a plain QP of one constraint; see `solve`."""
+        low, high = bounds or self.bounds
         values = self._values(*self._with_terms(x))
         if self._uncertain:
-            return self._solve_uncertain(values, u)
+            return self._solve_uncertain(values, u, low[0], high[0])
         *a, b = values
         p = self._qp
         if self._flavour == "floats":
             if self._m == 1:
-                v, margin, active, feasible = project_scalar(a[0], b, u[0], p.low[0], p.high[0])
+                v, margin, active, feasible = project_scalar(a[0], b, u[0], low[0], high[0])
                 action = [v]
             else:
                 action, margin, active, feasible = one_constraint.project_floats(
-                    a, b, u, p.low, p.high, p.weights
+                    a, b, u, low, high, p.weights
                 )
             self._require_finite((margin,))
             return FilterDecision(
                 action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0, u
             )
         action, margin, active, feasible = one_constraint.project_arrays(
-            a, b, u, self._low, self._high, p.weights
+            a, b, u, low, high, p.weights
         )
         self._require_finite((margin,))
         met = np.count_nonzero(feasible) == len(feasible)
         slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
         return FilterDecision(action, (margin,), (active,), feasible, (slack,), 0, u)
 
-    def _solve_uncertain(self, values: Components, u: Sequence[Any]) -> FilterDecision:
+    def _solve_uncertain(
+        self, values: Components, u: Sequence[Any], low: Any, high: Any
+    ) -> FilterDecision:
         a, b, *form = values
-        p = self._qp
         action, margin, active, feasible = self._project_uncertain(
-            (a,), (b,), (form,), u[0], p.low[0], p.high[0], p.priorities
+            (a,), (b,), (form,), u[0], low, high, self._qp.priorities
         )
         self._require_finite((margin[0], *form))
         return FilterDecision(
@@ -69,12 +70,35 @@ class FilterQPSolver(CompiledQP):
             u,
         )
 
-    def solve(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
+    def solve_plain(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Solve a plain QP without uncertainty for one state; see `solve`, which this shortens."""
+        low, high = bounds or self.bounds
+        values, m, width = self._values(*self._with_terms(x)), self._m, self._m + 1
+        self._require_finite(values)
+        a, b = [values[i : i + m] for i in range(0, len(values), width)], values[m::width]
+        action, margin, active, feasible = self._project(
+            a, b, u, low, high, self.weights, self._qp.priorities
+        )
+        self._require_finite((*action, *margin))
+        slack = [0.0] * len(b) if feasible else [max(-g, 0.0) for g in margin]
+        acting = active.count(True)
+        if acting == 1 and any(a[active.index(True)]):
+            cause = active.index(True)
+        else:
+            cause = self._cause(a, b, u, active, {}) if acting else -1
+        return FilterDecision(action, margin, active, feasible, slack, cause, u)
+
+    def solve(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
         """Solve any QP.
 
         Args:
-            x: n components of the state.
+            x: components of the state, followed by those of `FilterQP.runtime`.
             u: m components of the proposed input.
+            bounds: input bounds; by default those of the QP.
 
         Returns:
             The decision in components.
@@ -82,12 +106,13 @@ class FilterQPSolver(CompiledQP):
         Raises:
             UndefinedConstraintError: A constraint or the goal has no finite value.
         """
+        bounds = bounds or self.bounds
         x = self._with_terms(x)
         a, b, goal, levels, forms = self._split(self._values(*x))
         target = u
         if goal:
             target = [0.0 * uj for uj in u]
-            u = self._best(goal, target)
+            u = self._best(goal, target, bounds)
         inside = self._inside(levels)
         self._require_finite([*b, *[aj for ai in a for aj in ai]])
         asked = [
@@ -102,12 +127,12 @@ class FilterQPSolver(CompiledQP):
             [self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i]
             for i in range(self._count)
         ]
-        aim = self._outwards(a, inside, target)
-        action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
+        aim = self._outwards(a, inside, target, bounds)
+        action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
         if self._sampled:
             for i in self._sampled:
                 asked[i] = asked[i] - self._qp.dt * self._loss(i, x, action, inside.get(i))
-            action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
+            action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], _dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
@@ -124,17 +149,18 @@ class FilterQPSolver(CompiledQP):
         """Return the input that is best for the goal, without constraints; raises as `solve`.
 
         Args:
-            x: n components of the state.
+            x: components of the state, followed by those of `FilterQP.runtime`.
             nothing: m components of the input 0.
         """
-        return self._best(self._split(self._values(*self._with_terms(x)))[2], nothing)
+        goal = self._split(self._values(*self._with_terms(x)))[2]
+        return self._best(goal, nothing, self.bounds)
 
-    def _best(self, goal: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
+    def _best(self, goal: Sequence[Any], nothing: Sequence[Any], bounds: Bounds) -> Sequence[Any]:
         self._require_finite(goal, "the goal")
-        return self._minimise((), (), nothing, goal)[0]
+        return self._minimise((), (), nothing, bounds, goal)[0]
 
     def _outwards(
-        self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any]
+        self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any], bounds: Bounds
     ) -> Sequence[Any]:
         """Return the proposed input, or one far away where h of a reciprocal condition rises most.
 
@@ -155,7 +181,7 @@ class FilterQPSolver(CompiledQP):
             ]
         rise = self._over_largest(rise)
         steepness = sum([rj * rj / wj for rj, wj in zip(rise, self.weights, strict=True)])
-        ends = list(zip(self._low, self._high, strict=True))
+        ends = list(zip(*bounds, strict=True))
         span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
         far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
         corner = [
@@ -174,36 +200,34 @@ class FilterQPSolver(CompiledQP):
         a: Sequence[Any],
         b: Sequence[Any],
         u: Sequence[Any],
+        bounds: Bounds,
         goal: Sequence[Any],
         forms: dict[int, Components] | None = None,
     ) -> tuple[Any, Any, Any, Any]:
-        p = self._qp
+        p, (low, high) = self._qp, bounds
         if forms:
             for form in forms.values():
                 self._require_finite(form)
             if self._m == 1 and not goal:
                 q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
                 action, margin, active, feasible = self._project_uncertain(
-                    [ai[0] for ai in a], b, q, u[0], p.low[0], p.high[0], p.priorities
+                    [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
                 )
                 return [action], list(margin), list(active), feasible
-            a, b = self._on_the_safe_side(a, b, forms)
+            a, b = self._on_the_safe_side(a, b, forms, bounds)
         if not goal:
-            return self._project(a, b, u, self._low, self._high, self.weights, p.priorities)
+            return self._project(a, b, u, low, high, self.weights, p.priorities)
         # The goal's slack is d = unit e, since the square of d would overflow before d does. Twice
         # the most that the input bounds can make d always meets the goal's constraint, also after
         # rounding.
         growth, along = goal[0], goal[1:]
         most = growth + sum(
-            [
-                self._larger(bj * lo, bj * hi)
-                for bj, lo, hi in zip(along, self._low, self._high, strict=True)
-            ]
+            [self._larger(bj * lo, bj * hi) for bj, lo, hi in zip(along, low, high, strict=True)]
         )
         unit = self.goal_unit
         rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
-        low = (*self._low, 0.0)
-        high = (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
+        low = (*low, 0.0)
+        high = (*high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
         w, priorities = (*self.weights, self.weights[0]), [*p.priorities[: len(a)], 1.0]
         action, margin, active, _ = self._project(
             rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
@@ -216,35 +240,16 @@ class FilterQPSolver(CompiledQP):
         return action, margin, active, feasible
 
     def _on_the_safe_side(
-        self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]
+        self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components], bounds: Bounds
     ) -> tuple[list[Any], list[Any]]:
         """Return affine constraints that are met only where the uncertain ones are."""
         a, b = list(a), list(b)
         for i, form in forms.items():
-            slopes, constant = self.planes[i] if i in self.planes else self._plane(form)
+            known = bounds is self.bounds and i in self.planes
+            slopes, constant = self.planes[i] if known else self._plane(form, bounds)
             a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
             b[i] = b[i] - constant
         return a, b
-
-    def _plane(self, form: Components) -> tuple[list[Any], Any]:
-        """Return the plane above the uncertainty of a constraint; see `majorant`."""
-        width = self._m + 1
-        place = {
-            pair: k
-            for k, pair in enumerate(itertools.combinations_with_replacement(range(width), 2))
-        }
-        q = [[form[place[min(j, k), max(j, k)]] for k in range(width)] for j in range(width)]
-        return majorant(q, self._qp.low, self._qp.high)
-
-    @cached_property
-    def planes(self) -> dict[int, tuple[list[Any], Any]]:
-        """Planes that are the same at every state."""
-        forms = {i: self._qp.constraints[i].uncertainty or () for i in self._uncertain}
-        return {
-            i: self._plane(tuple(map(float, form)))
-            for i, form in forms.items()
-            if all(e.is_number for e in form)
-        }
 
     def _cause(
         self,

@@ -12,6 +12,7 @@ of `safe_envs.wrappers.qp.rounding`.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +25,17 @@ from safe_envs.wrappers.qp import (
     single_active_constraint,
 )
 from safe_envs.wrappers.qp.rounding import ArrayAnswer, Arrays, Entries, FloatAnswer, Floats, stack
+
+
+def prepare(k: int, m: int) -> None:
+    """Import what the QPs of a size need, so that no decision waits for it.
+
+    Args:
+        k: number of constraints.
+        m: number of inputs.
+    """
+    if k > 1 and m > 2:
+        importlib.import_module("safe_envs.wrappers.qp.proxqp")
 
 
 def project_floats(

@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 
+_TINY = 1e-300
+"""A distance that can divide."""
+
 
 def majorant(
     q: Sequence[Sequence[Any]], low: Sequence[Any], high: Sequence[Any]
@@ -35,8 +38,10 @@ def majorant(
         square: Any = sum([q[i][j] * (w[i] * w[j]) for i in range(m + 1) for j in range(m + 1)])
         roots.append(np.sqrt(np.maximum(square, 0.0)))
     half = 2.0 ** (m - 1)
+    # An input that is held, its two bounds being equal, has two equal faces and no slope.
     slopes = [
-        sum([r if k >> j & 1 else -r for k, r in enumerate(roots)]) / (half * (high[j] - low[j]))
+        sum([r if k >> j & 1 else -r for k, r in enumerate(roots)])
+        / (half * np.maximum(high[j] - low[j], _TINY))
         for j in range(m)
     ]
     above = [

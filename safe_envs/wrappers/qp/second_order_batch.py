@@ -30,8 +30,8 @@ def project_arrays(
         b: k offsets, likewise.
         q: k forms, whose entries are likewise.
         v: proposed inputs, shape (B,).
-        low: lower bound, a float.
-        high: upper bound, a float.
+        low: lower bound, a float or an array (B,).
+        high: upper bound, likewise.
         priority: k positive weights of the squared slacks.
 
     Returns:
@@ -54,6 +54,7 @@ def project_arrays(
         )
         in_unit = _in_unit(slope, offset, form)
         starts, ends = _intervals(*in_unit)
+        low, high = [np.broadcast_to(end, size)[acting] for end in (low, high)]
         lo, hi = np.maximum(starts.max(axis=0), low), np.minimum(ends.min(axis=0), high)
         met = lo - hi <= ROUNDING * np.minimum(abs(lo), abs(hi))
         found = np.maximum(np.minimum(np.maximum(wish, lo), hi), low)
@@ -63,7 +64,7 @@ def project_arrays(
                 tuple(part[..., apart] for part in in_unit),
                 (starts[:, apart], ends[:, apart]),
             )
-            nearest = _nearest(row, interval, wish[apart], low, high)
+            nearest = _nearest(row, interval, wish[apart], low[apart], high[apart])
             lost = slope[:, apart], offset[:, apart], form[:, :, apart]
             found[apart] = (
                 nearest[0]
@@ -137,8 +138,8 @@ def _nearest(
     row: tuple[np.ndarray, ...],
     interval: tuple[np.ndarray, np.ndarray],
     v: np.ndarray,
-    low: float,
-    high: float,
+    low: np.ndarray,
+    high: np.ndarray,
 ) -> np.ndarray:
     """`_nearest` for arrays (k, B), with the same formulas."""
     start, end = interval
@@ -150,7 +151,9 @@ def _nearest(
     return np.minimum(np.maximum(u, low), high)
 
 
-def _maximisers(a: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: float) -> np.ndarray:
+def _maximisers(
+    a: np.ndarray, q: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
     """`_maximiser` for arrays (k, B), with the same formulas."""
     q0, q1, q2 = q
     t, kink = a / np.sqrt(q2), -q1 / q2

@@ -189,6 +189,11 @@ def _not_differentiable(given: str) -> ConfigurationError:
 
 
 def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
+    if qp.runtime:
+        raise ConfigurationError(
+            f"the filter takes {', '.join(map(str, qp.runtime))} at each call, which a torch layer"
+            " does not; make them states or fixed parameters"
+        )
     if qp.clf is not None:
         raise ConfigurationError(
             "a filter with a clf does not depend on the proposed input; use objective = 'nearest'"

@@ -29,7 +29,9 @@ def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name)
     for margin in ("none", 0.02) if name == "cubic" else ("none",):
         ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin=margin))
         known = SafetyFilter(
-            learned.system, [(problem.barriers[0], SCBF(sampling_margin=margin))], problem.box
+            learned.system,
+            [(problem.barriers[0], SCBF(sampling_margin=margin))],
+            bounds=problem.box,
         )
         assert_same_decisions(problem, ours, known, tolerance=1e-12)
     if name == "cubic":
@@ -39,7 +41,7 @@ def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name)
         known = SafetyFilter(
             learned.system,
             [(problem.barriers[0], SCBF(sampling_margin="first-order"))],
-            problem.box,
+            bounds=problem.box,
             dt=problem.dt,
         )
         assert_same_decisions(problem, ours, known, tolerance=1e-12)

@@ -247,7 +247,9 @@ def test_several_barriers_get_the_same_constraint():
     assert len(others) == 2
     for other in others:
         assert (other.coefficient, other.offset) == (first.coefficient, first.offset)
-    alone = SafetyFilter(LIMITS.model, [(LIMITS.barriers[0], Certified(certificate))], LIMITS.box)
+    alone = SafetyFilter(
+        LIMITS.model, [(LIMITS.barriers[0], Certified(certificate))], bounds=LIMITS.box
+    )
     rng = np.random.default_rng(0)
     x = np.zeros((20, LIMITS.plant.n))
     x[:, names.index("z")] = middle + rng.uniform(-1.2, 1.2, 20)
@@ -361,7 +363,9 @@ def test_a_certificate_of_the_plant_needs_a_filter_that_knows_it():
 
 def test_a_barrier_that_it_is_not_of_is_refused():
     with pytest.raises(ConfigurationError, match="not of the barrier"):
-        SafetyFilter(DISK.model, [(Barrier(2 - x_1), Certified(certificate_of(DISK, H)))], DISK.box)
+        SafetyFilter(
+            DISK.model, [(Barrier(2 - x_1), Certified(certificate_of(DISK, H)))], bounds=DISK.box
+        )
 
 
 def test_states_of_other_names_are_told():

@@ -66,7 +66,7 @@ def test_the_direct_way_is_the_learned_noise(gap, diffusion, margin):
             else DDSCBF(diffusion, margin=margin)
         )
         known = SafetyFilter(
-            found, [(gap.barriers[0], SCBF(sampling_margin=sampled))], gap.box, dt=gap.dt
+            found, [(gap.barriers[0], SCBF(sampling_margin=sampled))], bounds=gap.box, dt=gap.dt
         )
         assert_same_decisions(gap, SafetyFilter.for_problem(gap, ours), known, tolerance=1e-12)
 

@@ -323,7 +323,7 @@ def case_of(name: str) -> tuple[SafetyFilter, np.ndarray, np.ndarray]:
     safety_filter = SafetyFilter(
         integrators(m),
         [(Barrier(h, name=f"h_{i}"), condition) for i, (h, condition) in enumerate(pairs)],
-        [(-1.0, 1.5), (-2.0, 0.5), (-1.0, 1.0)][:m],
+        bounds=[(-1.0, 1.5), (-2.0, 0.5), (-1.0, 1.0)][:m],
         priorities=[1.0, 4.0, 0.3][: len(pairs)],
         dt=0.05,
         **options,
@@ -376,8 +376,8 @@ def test_everything_compiled(name: str) -> None:
 
 
 def test_filters_that_differ_in_their_numbers_share_a_program() -> None:
-    one = SafetyFilter(integrators(1), [(Barrier(CURVED), CBF(1.3))], [(-1.0, 1.0)])
-    other = SafetyFilter(integrators(1), [(Barrier(CURVED), CBF(2.7))], [(-2.0, 3.0)])
+    one = SafetyFilter(integrators(1), [(Barrier(CURVED), CBF(1.3))], bounds=[(-1.0, 1.0)])
+    other = SafetyFilter(integrators(1), [(Barrier(CURVED), CBF(2.7))], bounds=[(-2.0, 3.0)])
     texts = {filter_source(each.qp, Data()).text for each in (one, other)}
     assert len(texts) == 1
 
