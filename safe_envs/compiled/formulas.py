@@ -18,8 +18,8 @@ from safe_envs.compiled.formula_kernels import (
     formula_sign,
 )
 from safe_envs.compiled.trigonometry_kernel import arc_tangent, cosine, sine
-from safe_envs.dynamics.codegen import prepared
 from safe_envs.dynamics.computable import excerpt
+from safe_envs.dynamics.plain_expressions import prepared
 from safe_envs.dynamics.printers import FloatPrinter
 from safe_envs.errors import SystemDefinitionError
 

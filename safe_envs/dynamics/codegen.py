@@ -10,20 +10,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from types import MethodType
 from typing import Any, Literal
 
 import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from safe_envs.dynamics.computable import excerpt, require_computable
+from safe_envs.dynamics.computable import excerpt
+from safe_envs.dynamics.plain_expressions import prepared
 from safe_envs.dynamics.printers import ArrayPrinter, FloatPrinter
 from safe_envs.errors import SystemDefinitionError
 
 Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
 
-_LARGEST_EXPANDED_POWER = 8
+_OWNER = sp.Symbol("owner")
+"""First argument of generated code, which makes no use of it."""
 
 
 _settled: dict[int, np.ndarray] = {}
@@ -108,18 +111,43 @@ def compile_function(
             a numerical form, or a number that is not real or too large; or a symbol is an argument
             twice.
     """
-    return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour)
+    return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour).evaluate
+
+
+class _CompiledExpressions:
+    """The owner of a compiled function, which is a method of it.
+
+    As a method the function is as fast as without an owner, and is copied and pickled by it: what
+    is pickled is the expressions, of which code is generated again.
+
+    Attributes:
+        source: arguments, expressions and flavour, of which it is made.
+        evaluate: the function.
+    """
+
+    __slots__ = ("evaluate", "source")
+
+    def __init__(self, source: tuple[Any, ...], function: Callable[..., Components]) -> None:
+        # By its name a method that was pickled is found again.
+        function.__name__ = "evaluate"
+        self.source, self.evaluate = source, MethodType(function, self)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _compile, self.source
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _CompiledExpressions:
+        return self
 
 
 @lru_cache(maxsize=1024)
 def _compile(
     arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour
-) -> Callable[..., Components]:
+) -> _CompiledExpressions:
     names, formulas, numbers, shared = prepared(arguments, expressions)
     printer = ArrayPrinter() if flavour == "arrays" else FloatPrinter()
     try:
         function = sp.lambdify(
-            names,
+            (_OWNER, *names),
             numbers,
             modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
             printer=printer,
@@ -133,35 +161,8 @@ def _compile(
     if isinstance(printer, ArrayPrinter):
         function.__globals__.update(printer.constants)
     elif any(e.has(sp.Piecewise, sp.Heaviside, sp.sinc) for e in formulas):
-        return _piece_by_piece(function, names, formulas)
-    return function
-
-
-@lru_cache(maxsize=256)
-def prepared(
-    arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]
-) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
-    """Prepare what all flavours of code share.
-
-    An env and a batch of it ask for the same formulas, one after the other, and to find what they
-    share takes longest.
-
-    Args:
-        arguments: symbols of a function.
-        expressions: what it returns.
-
-    Returns:
-        The arguments and the formulas with plain names; the formulas with rounded numbers; and what
-        `sympy.cse` makes of these: the common subexpressions, and the formulas of them.
-
-    Raises:
-        SystemDefinitionError: See `compile_function`.
-    """
-    for expression in expressions:
-        require_computable(expression, arguments)
-    names, formulas = in_plain_names(arguments, expressions)
-    numbers = tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas)
-    return names, formulas, numbers, _shared_subexpressions(numbers)
+        function = _piece_by_piece(function, names, formulas)
+    return _CompiledExpressions((arguments, expressions, flavour), function)
 
 
 def _piece_by_piece(
@@ -172,91 +173,20 @@ def _piece_by_piece(
     A subexpression that other pieces share may have no value.
     """
     careful = sp.lambdify(
-        names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0
+        (_OWNER, *names),
+        tuple(formulas),
+        modules=[math],
+        printer=FloatPrinter(),
+        docstring_limit=0,
     )
 
-    def function(*arguments: float) -> Components:
+    def function(*arguments: Any) -> Components:
         try:
             return quick(*arguments)
         except (ArithmeticError, ValueError):
             return careful(*arguments)
 
     return function
-
-
-def in_plain_names(
-    arguments: Sequence[sp.Symbol], expressions: Sequence[Any]
-) -> tuple[tuple[sp.Symbol, ...], tuple[Any, ...]]:
-    """Rename arguments to a000, a001, ..., so that generated code holds no name of a user's.
-
-    A name of the user's may be a keyword, a function, no identifier at all, or one of those that
-    common subexpressions get. The new names sort like the old ones, for sympy orders the terms of a
-    sum by them, and rounding follows the order.
-
-    Args:
-        arguments: symbols.
-        expressions: formulas of them.
-
-    Returns:
-        The new symbols in the order of the arguments, and the formulas of them.
-    """
-    ordered = sorted(arguments, key=sp.default_sort_key)
-    plain = {s: sp.Symbol(f"a{i:03d}", **s.assumptions0) for i, s in enumerate(ordered)}
-    known: dict[Any, Any] = dict(plain)
-
-    def renamed(expression: Any) -> Any:
-        if not expression.args:
-            return known.get(expression, expression)
-        if expression not in known:
-            parts = [renamed(part) for part in expression.args]
-            # Sympy would compare all parts with each other once more, which takes longer than all
-            # else.
-            as_it_is = {"evaluate": False} if isinstance(expression, sp.Max | sp.Min) else {}
-            known[expression] = expression.func(*parts, **as_it_is)
-        return known[expression]
-
-    return tuple(plain[s] for s in arguments), tuple(renamed(e) for e in expressions)
-
-
-def _shared_subexpressions(
-    expressions: Any,
-) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
-    """Take out common subexpressions, and write small integer powers as products.
-
-    `pow` is many times slower.
-    """
-    shared: Any
-    reduced: Any
-    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("x"), list=False)
-    fresh = sp.numbered_symbols("p")
-    replacements: list[tuple[sp.Symbol, sp.Expr]] = []
-
-    def expand(expression: Any) -> Any:
-        if not expression.args:
-            return expression
-        arguments = [expand(a) for a in expression.args]
-        if (
-            isinstance(expression, sp.Pow)
-            and expression.exp.is_Integer
-            and 2 <= abs(expression.exp) <= _LARGEST_EXPANDED_POWER
-        ):
-            base = arguments[0]
-            if not base.is_Symbol:
-                symbol = next(fresh)
-                replacements.append((symbol, base))
-                base = symbol
-            product = sp.Mul(*[base] * abs(int(expression.exp)), evaluate=False)
-            return product if expression.exp > 0 else sp.Pow(product, -1, evaluate=False)
-        if arguments == list(expression.args):
-            return expression
-        # Only these would undo what was done, and not every other function knows the word.
-        as_it_is = {"evaluate": False} if isinstance(expression, sp.Add | sp.Mul | sp.Pow) else {}
-        return expression.func(*arguments, **as_it_is)
-
-    for symbol, expression in shared:
-        expanded = expand(expression)
-        replacements.append((symbol, expanded))
-    return replacements, type(reduced)(expand(e) for e in reduced)
 
 
 def constants(values: Sequence[float]) -> list[np.ndarray]:

@@ -124,8 +124,26 @@ def interval_function(
 def _compile(
     symbols: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], rounded: bool
 ) -> IntervalFunction:
-    program = ExpressionProgram(symbols, expressions, IntervalOperations(rounded))
-    return lambda values: program([_interval(v) for v in values])
+    return _IntervalProgram(symbols, expressions, rounded)
+
+
+class _IntervalProgram:
+    """A function of intervals, which is pickled as the expressions that it is made of."""
+
+    def __init__(
+        self, symbols: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], rounded: bool
+    ) -> None:
+        self._source = symbols, expressions, rounded
+        self._program = ExpressionProgram(symbols, expressions, IntervalOperations(rounded))
+
+    def __call__(self, values: Sequence[Any]) -> tuple[Interval, ...]:
+        return self._program([_interval(v) for v in values])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _compile, self._source
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _IntervalProgram:
+        return self
 
 
 def _negative_arccos(values: Any) -> Any:

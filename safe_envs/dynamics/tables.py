@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,4 +22,8 @@ def tabulated(
         expressions: k of them, with numbers for all parameters.
     """
     compiled = compile_function(tuple(states), tuple(expressions), "arrays")
-    return lambda x: stacked(compiled(*np.ascontiguousarray(x.T)), len(x))
+    return partial(_table, compiled)
+
+
+def _table(compiled: Callable[..., Any], x: np.ndarray) -> np.ndarray:
+    return stacked(compiled(*np.ascontiguousarray(x.T)), len(x))

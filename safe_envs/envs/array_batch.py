@@ -12,6 +12,7 @@ from safe_envs.envs.delay_line import Actuators
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import VectorStep
 from safe_envs.envs.noise import NoiseStreams
+from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.simulation import Simulation, require_sound
 from safe_envs.envs.spaces import BatchActions, observation_box
@@ -60,21 +61,41 @@ class ArrayBatch:
         """Return what a batch remembers besides states and counters, in arrays."""
         return {} if self.actuators is None else self.actuators.snapshot()
 
-    def place(self, snapshot: Mapping[str, np.ndarray], seeded: Sequence[int]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Take it from a snapshot."""
+        if self.actuators is not None:
+            self.actuators.restore(snapshot)
+
+    def rest(self, envs: np.ndarray) -> None:
+        """Put the resting input in the place of all that is under way in some envs.
+
+        Args:
+            envs: which, indices or a mask.
+        """
+        if self.actuators is not None:
+            self.actuators.restart(envs)
+
+    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
         """Put the envs into states, where their episodes are.
 
         Args:
-            snapshot: with the states, shape (num_envs, n), and what `snapshot` returned.
+            states: shape (num_envs, n).
             seeded: indices of the envs whose noise goes to the step of their episode.
         """
-        self.components = tuple(np.array(snapshot["state"], dtype=float).T.copy())
-        if self.actuators is not None:
-            self.actuators.restore(snapshot)
+        self.components = tuple(np.array(states, dtype=float).T.copy())
         self.noise.seek(seeded, self._episodes.steps[seeded])
 
-    def begin(self, envs: np.ndarray) -> VectorStep:
-        """Begin the next episode of some envs, bool (num_envs,), and read all states."""
-        self._restart(np.flatnonzero(envs))
+    def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
+        """Begin the next episode of some envs, and read all states.
+
+        Args:
+            envs: which, bool (num_envs,).
+            points: where; None for draws from the problem's distribution.
+
+        Returns:
+            What is read off the states.
+        """
+        self._restart(np.flatnonzero(envs), points)
         return self._read(tuple(self._actions.center), counted=envs)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
@@ -121,20 +142,23 @@ class ArrayBatch:
             reward = np.where(due, 0.0, reward)
         return observation, reward, terminated, truncated, info
 
-    def _restart(self, envs: np.ndarray) -> None:
+    def _restart(self, envs: np.ndarray, points: StartingPoints | None = None) -> None:
         """Put some envs, given by their indices, at the start of an episode."""
         begun = self._streams.begin_episodes(envs)
         self.noise.begin(envs)
-        start = self._simulation.starts.draw_batch(self._streams.reader, *begun)
+        if points is None:
+            start, steps = self._simulation.starts.draw_batch(self._streams.reader, *begun), 0
+        else:
+            start, steps = points.states[envs].T.copy(), points.steps[envs]
+            self.noise.seek(envs, steps)
         if (envs.size,) == self._shape:
             self.components = tuple(start)
         else:
             self.components = tuple([x.copy() for x in self.components])
             for x, fresh in zip(self.components, start, strict=True):
                 x[envs] = fresh
-        self._episodes.restart(envs)
-        if self.actuators is not None:
-            self.actuators.restart(envs)
+        self._episodes.restart(envs, steps)
+        self.rest(envs)
 
     def _read(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""

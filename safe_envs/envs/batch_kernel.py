@@ -41,6 +41,7 @@ def step_batch(  # noqa: PLR0913
     scaled: bool,
     stepping: bool,
     filtered: bool,
+    placed: bool,
     restarts: np.ndarray,
     limit: int,
     dt: float,
@@ -77,6 +78,8 @@ def step_batch(  # noqa: PLR0913
         stepping: whether the envs step that begin no episode; otherwise they are only read.
         filtered: whether `decide` chooses the input, and `inputs`, `choices` and `tallies` have
             entries for it.
+        placed: whether the envs that begin an episode do so where `states_before` and
+            `counts_before` have them, and not at a draw.
         restarts: the envs that begin an episode.
         limit: control periods until an episode is truncated.
         dt: control period in s.
@@ -113,12 +116,16 @@ def step_batch(  # noqa: PLR0913
     for i in range(len(restarts)):
         u = resting_input(data)
         if restarts[i]:
-            x = draw_start(keys[i, 0], keys[i, 1], episodes[i], uniforms, data)
+            x = state_at(states_before, i)
+            counts[i, STEPS] = counts_before[i, STEPS]
+            counts[i, PERIOD] = counts_before[i, PERIOD]
+            if not placed:
+                x = draw_start(keys[i, 0], keys[i, 1], episodes[i], uniforms, data)
+                counts[i, STEPS] = 0
+                counts[i, PERIOD] = 0
             if not isfinite(x[0]):
                 return NO_START
             chunks[i] = -1
-            counts[i, STEPS] = 0
-            counts[i, PERIOD] = 0
             states[i, len(x)] = inf
             states[i, len(x) + 1] = 0.0
             if filtered:

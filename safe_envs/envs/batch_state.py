@@ -7,6 +7,7 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.batch_layout import PERIODS, STEPS
 from safe_envs.envs.episode import Episodes
+from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.spaces import BatchActions
 from safe_envs.envs.world_source import noise_channels
@@ -59,6 +60,22 @@ class BatchState:
         for column in columns:
             column.setflags(write=False)
         return columns
+
+    def before(
+        self, envs: np.ndarray | None, points: StartingPoints | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return states and counts as a step finds them.
+
+        Args:
+            envs: the envs that begin an episode, bool (num_envs,); None for none.
+            points: where they begin; None for draws.
+        """
+        if points is None:
+            return self.states, self.counts
+        states, counts = self.states.copy(), self.counts.copy()
+        states[envs, : self.problem.plant.n] = points.states[envs]
+        counts[envs] = points.steps[envs, None]
+        return states, counts
 
     def commit(self, states: np.ndarray, counts: np.ndarray, restarted: np.ndarray | None) -> None:
         """Take states and counts as those of the envs.

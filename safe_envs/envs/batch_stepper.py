@@ -16,6 +16,7 @@ from safe_envs.envs.batch_kernel import step_batch
 from safe_envs.envs.batch_source import batch_source
 from safe_envs.envs.batch_state import BatchState
 from safe_envs.envs.info import Info, VectorStep, filter_info, safety_info
+from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.simulation import require_sound, start_sampler
 from safe_envs.envs.world_source import world_source
 from safe_envs.errors import NumericalError
@@ -23,6 +24,9 @@ from safe_envs.errors import NumericalError
 UNFILTERED = Source(
     "def decide(x, u, data, work):\n    return u, u, False, True, (0.0,), 0, True\n"
 )
+
+_GENERATED = ("_step", "_data", "_work")
+"""Attributes of a stepper that follow from the problem and the filter."""
 
 
 class BatchFilter(NamedTuple):
@@ -56,15 +60,10 @@ class BatchStepper:
 
     def __init__(self, batch: BatchState, batch_filter: BatchFilter | None) -> None:
         self._batch, self._filter = batch, batch_filter
-        problem, data = batch.problem, Data()
+        problem = batch.problem
         n, m = batch.shape
         self._rest = np.empty(0) if batch_filter is None else batch_filter.rest
-        generated = world_source(problem, data) + batch_source(problem, data)
-        generated += UNFILTERED if batch_filter is None else batch_filter.source(data)
-        title = f"{problem.name} in batches" + " with a filter" * (batch_filter is not None)
-        program = Program(title, [step_batch], generated)
-        self._step: Callable[..., int] = program.compiled()["step_batch"]
-        self._data, self._work = data.array(), np.empty(max(generated.work, 1))
+        self._generate()
         self._nowhere = np.zeros(n, dtype=bool)
         self._nothing = np.zeros(batch.shape)
         self._observation_shape = (n, len(problem.features))
@@ -74,9 +73,35 @@ class BatchStepper:
         self.tallies = np.zeros((self._rows, 2), dtype=np.int64)
         self._told = self._at_rest()
 
-    def begin(self, envs: np.ndarray) -> VectorStep:
-        """Begin the next episode of some envs; the others keep what their filter told."""
-        return self._run(self._nothing, True, False, envs)
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what is compiled, which a copy makes itself."""
+        return {key: value for key, value in vars(self).items() if key not in _GENERATED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._generate()
+
+    def _generate(self) -> None:
+        """Make the compiled function, its numbers and its scratch array."""
+        problem, batch_filter, data = self._batch.problem, self._filter, Data()
+        generated = world_source(problem, data) + batch_source(problem, data)
+        generated += UNFILTERED if batch_filter is None else batch_filter.source(data)
+        title = f"{problem.name} in batches" + " with a filter" * (batch_filter is not None)
+        program = Program(title, [step_batch], generated)
+        self._step: Callable[..., int] = program.compiled()["step_batch"]
+        self._data, self._work = data.array(), np.empty(max(generated.work, 1))
+
+    def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
+        """Begin the next episode of some envs; the others keep what their filter told.
+
+        Args:
+            envs: which, bool (num_envs,).
+            points: where; None for draws from the problem's distribution.
+
+        Returns:
+            What is read off the states.
+        """
+        return self._run(self._nothing, True, False, envs, points)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`."""
@@ -100,7 +125,12 @@ class BatchStepper:
         return self._run(given, scaled, True, due)
 
     def _run(
-        self, given: np.ndarray, scaled: bool, stepping: bool, restarts: np.ndarray | None
+        self,
+        given: np.ndarray,
+        scaled: bool,
+        stepping: bool,
+        restarts: np.ndarray | None,
+        points: StartingPoints | None = None,
     ) -> VectorStep:
         batch, filtered = self._batch, self._filter is not None
         # For an array that cannot be written to, Numba would compile once more.
@@ -114,11 +144,13 @@ class BatchStepper:
         told = self._new_told() if stepping else self._told.copied()
         observations, rewards = np.empty(self._observation_shape, np.float32), np.empty(n)
         readings = np.empty(self._reading_shape)
+        before = batch.before(restarts, points)
         status = self._step(
             given,
             scaled,
             stepping,
             filtered,
+            points is not None,
             self._nowhere if restarts is None else restarts,
             *batch.settings,
             batch.streams.words,
@@ -129,8 +161,7 @@ class BatchStepper:
             self._work,
             self._data,
             self._rest,
-            batch.states,
-            batch.counts,
+            *before,
             self.tallies,
             states,
             counts,

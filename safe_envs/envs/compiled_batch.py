@@ -13,6 +13,7 @@ from safe_envs.envs.batch_state import BatchState
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import VectorStep
+from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.problem.problem import SafetyProblem
 
@@ -56,11 +57,21 @@ class CompiledBatch:
         """Return nothing; see `ArrayBatch.snapshot`."""
         return {}
 
-    def place(self, snapshot: Mapping[str, np.ndarray], seeded: Sequence[int]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Do nothing; see `ArrayBatch.restore`."""
+
+    def rest(self, envs: np.ndarray) -> None:
+        """Do nothing; see `ArrayBatch.rest`.
+
+        Args:
+            envs: not used.
+        """
+
+    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
         """Put the envs into states; see `ArrayBatch.place`.
 
         Args:
-            snapshot: see there.
+            states: see there.
             seeded: see there.
         """
         state, episodes = self._state, self._state.episodes
@@ -68,12 +79,12 @@ class CompiledBatch:
         counts[:, STEPS] = episodes.steps
         counts[seeded, PERIOD] = episodes.steps[seeded]
         state.chunks[seeded] = -1
-        rows = np.column_stack([snapshot["state"], episodes.h_min, episodes.episode_cost])
+        rows = np.column_stack([states, episodes.h_min, episodes.episode_cost])
         state.commit(np.ascontiguousarray(rows, dtype=float), counts, None)
 
-    def begin(self, envs: np.ndarray) -> VectorStep:
+    def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
         """Begin the next episode of some envs; see `ArrayBatch.begin`."""
-        return self._unfiltered.begin(envs)
+        return self._unfiltered.begin(envs, points)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `ArrayBatch.step`.

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from safe_envs.envs.spec import register_system
 from safe_envs.envs.system_env import SystemEnv, SystemVectorEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.object_import import resolved
@@ -52,9 +53,7 @@ def register(env_id: str, system: str | Factory) -> None:
             f" my_lab/{env_id.split('/')[-1]}"
         )
     gym.registry.pop(env_id, None)
-    gym.register(
-        env_id, entry_point=_ENTRY, vector_entry_point=f"{_ENTRY}Vector", kwargs={"system": place}
-    )
+    register_system(env_id, _ENTRY, f"{_ENTRY}Vector", system=place)
 
 
 class Custom(SystemEnv):

@@ -8,14 +8,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from safe_envs.dynamics.philox import Key, StreamReader, key_of
 from safe_envs.envs.delay_line import Actuators
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream
+from safe_envs.envs.reset_options import RequestedStart, ResetOptions
 from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
+from safe_envs.envs.spec import SystemSpec
 from safe_envs.errors import InvalidInputError, NumericalError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
@@ -74,6 +77,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._scales = list(zip(center, half, strict=True))
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
+        self._spec: EnvSpec | None = None
         self._noise = NoiseStream(self._simulation.integrator.channels, self._limit)
         self._reader = StreamReader()
         self._key: Key | None = None
@@ -83,6 +87,21 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._actuators = None if problem.direct else Actuators(problem)
         self._x: tuple[float, ...] | None = None
         self._episode = Episode()
+        self._reset_options = ResetOptions(problem, self._limit)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The spec that the env was made of, with the length of its episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, given: EnvSpec | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self._spec = None if given is None else SystemSpec.of(given, self._limit)
+
+    @property
+    def episode(self) -> Episode:
+        """Counters of the episode."""
+        return self._episode
 
     @property
     def components(self) -> tuple[float, ...]:
@@ -93,8 +112,28 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
 
     @property
     def state(self) -> np.ndarray:
-        """The exact state, shape (n,), in the units of the problem's states."""
+        """The exact state, shape (n,), in the units of the problem's states.
+
+        It can be set within an episode. Its clock, its noise and its counters go on, and nothing is
+        counted before the next step. Inputs that are under way give way to the resting one. A
+        filter with a memory forgets what it kept, and keeps from there on what it can keep from the
+        new state.
+
+        Raises:
+            InvalidInputError: the state has another shape, is not finite, or outside the workspace.
+            ResetNeeded: there is no episode yet.
+        """
         return np.array(self.components)
+
+    @state.setter
+    def state(self, given: Any) -> None:
+        # Without an episode there is none to put a state into.
+        _ = self.components
+        self._x = tuple(self._reset_options.states(given)[0].tolist())
+        self._episode.placements += 1
+        if self._actuators is not None:
+            self._actuators.restart()
+        self._show_start()
 
     def physical_action(self, action: Any) -> list[float]:
         """Map an action in [-1, 1] to the input bounds; what lies beyond is clipped.
@@ -128,25 +167,31 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode from the problem's initial distribution.
+        """Start an episode, by default with a draw from the problem's initial distribution.
+
+        A given state or time changes nothing else: the noise of a control period is the one that it
+        has in any episode of this seed and number.
 
         Args:
             seed: of starts and noise, of which every episode since the seed has its own; None goes
                 on to the next one. `np_random` is seeded too, but nothing is drawn from it, unless
                 it was set: then every episode takes a key of its own from it.
-            options: ignored.
+            options: "state", the start state (n,), or "start", the name of one of the problem's
+                start distributions; and "t", the time in s that has passed, in whole control
+                periods. A state may be unsafe, but not outside the workspace.
 
         Returns:
             The observation, float32 (k,), and the info.
+
+        Raises:
+            ConfigurationError: an option is unknown, or does not go with another.
+            InvalidInputError: a state or a time is not allowed.
         """
+        requested = self._reset_options.read(options)
         super().reset(seed=seed)
-        self._begin_episode(seeded=seed is not None)
-        self._episode.restart()
-        if self._actuators is not None:
-            self._actuators.restart()
+        self._begin_episode(seed is not None, requested)
         observation, _, _, info = self._observe([c for c, _ in self._scales])
-        if self.viewer is not None:
-            self.viewer.restart([self._x], [0.0], [0])
+        self._show_start()
         return observation, info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
@@ -203,8 +248,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.viewer is not None:
             self.viewer.close()
 
-    def _begin_episode(self, seeded: bool) -> None:
-        """Go to the streams of the next episode, and draw its start."""
+    def _begin_episode(self, seeded: bool, requested: RequestedStart | None) -> None:
+        """Go to the streams of the next episode, and to its start."""
         if self.np_random_seed == _UNKNOWN:
             low, high = self.np_random.integers(2**64, size=2, dtype=np.uint64).tolist()
             self._key, self._number = (low, high), 0
@@ -212,8 +257,22 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self._key, self._number = key_of(self.np_random_seed), 0
         else:
             self._number += 1
-        self._x = self._simulation.starts.draw(self._reader, self._key, self._number)
-        self._noise.begin(self._key, self._number)
+        steps, sampler = 0, self._simulation.starts
+        if requested is not None:
+            steps, sampler = requested.steps.item(), self._reset_options.sampler(requested.start)
+        if requested is None or requested.states is None:
+            self._x = sampler.draw(self._reader, self._key, self._number)
+        else:
+            self._x = tuple(requested.states[0].tolist())
+        self._noise.begin(self._key, self._number, steps)
+        self._episode.restart(steps)
+        if self._actuators is not None:
+            self._actuators.restart()
+
+    def _show_start(self) -> None:
+        """Let what is drawn begin at the present state."""
+        if self.viewer is not None:
+            self.viewer.restart([self._x], [self._episode.steps * self.problem.dt], [0])
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x, episode = self.components, self._episode

@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.info import Info, safety_info, with_masks
 from safe_envs.errors import ConfigurationError
@@ -23,16 +22,18 @@ class Episode:
         steps: control periods.
         h_min: smallest barrier value.
         cost: sum of the costs.
+        placements: how often a state was set that no step led to, in all episodes.
     """
 
-    __slots__ = ("cost", "h_min", "steps")
+    __slots__ = ("cost", "h_min", "placements", "steps")
 
     def __init__(self) -> None:
+        self.placements = 0
         self.restart()
 
-    def restart(self) -> None:
-        """Begin an episode."""
-        self.steps, self.h_min, self.cost = 0, math.inf, 0.0
+    def restart(self, steps: int = 0) -> None:
+        """Begin an episode, after some control periods of it."""
+        self.steps, self.h_min, self.cost = steps, math.inf, 0.0
 
     def count(self, barriers: Sequence[float], h: float) -> Info:
         """Count a state.
@@ -63,6 +64,8 @@ class Episodes:
         begun: the envs whose episode began in the last step, bool (num_envs,).
         everywhere: True for each env; not to be written to.
         started: whether all envs have a state.
+        placements: how often a state of each env was set that no step led to, in all episodes;
+            another array after each time.
         last_states: with same-step autoreset, the states in which the episodes that ended last did
             so, (num_envs, n); of the other envs anything.
     """
@@ -75,6 +78,7 @@ class Episodes:
         self.begun = self._nowhere = np.zeros(num_envs, dtype=bool)
         self.everywhere = np.ones(num_envs, dtype=bool)
         self.started = False
+        self.placements = np.zeros(num_envs, dtype=np.int64)
         self.last_states = np.empty((num_envs, 0))
 
     def due(self) -> np.ndarray | None:
@@ -108,10 +112,15 @@ class Episodes:
         # It is in the info, and the caller may use theirs again.
         return mask.copy()
 
-    def restart(self, envs: np.ndarray) -> None:
-        """Begin the episodes of some envs, given by indices or by a mask."""
+    def restart(self, envs: np.ndarray, steps: np.ndarray | int = 0) -> None:
+        """Begin the episodes of some envs.
+
+        Args:
+            envs: their indices, or a mask.
+            steps: control periods that have passed, of all of them or of each.
+        """
         self.started = True
-        self.steps[envs] = 0
+        self.steps[envs] = steps
         self.h_min[envs] = np.inf
         self.episode_cost[envs] = 0.0
         self.ended[envs] = False
@@ -154,6 +163,10 @@ class Episodes:
         np.minimum(self.h_min, h, out=self.h_min)
         return safety_info(violation, cost, barriers, self.h_min.copy(), self.episode_cost.copy())
 
+    def place(self, envs: np.ndarray) -> None:
+        """Count that states were set in some envs, given by a mask."""
+        self.placements = self.placements + envs
+
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return copies of the counters, from which `restore` goes on."""
         return {name: getattr(self, name).copy() for name in _COUNTERS}
@@ -161,17 +174,9 @@ class Episodes:
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Take the counters from a snapshot."""
         self.started = True
+        self.place(self.everywhere)
         for name in _COUNTERS:
             setattr(self, name, np.array(snapshot[name]))
-
-
-def autoreset_of(given: str | AutoresetMode) -> AutoresetMode:
-    """Return the way in which ended episodes restart; an unknown one is a ConfigurationError."""
-    try:
-        return AutoresetMode(given)
-    except ValueError as error:
-        allowed = ", ".join(mode.value for mode in AutoresetMode)
-        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error
 
 
 def last_of_episode(ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:

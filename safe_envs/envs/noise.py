@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -32,14 +33,15 @@ class NoiseStream:
         self._reader = StreamReader()
         self.begin((0, 0), 0)
 
-    def begin(self, key: Key, episode: int) -> None:
-        """Go to the first control period of an episode.
+    def begin(self, key: Key, episode: int, period: int = 0) -> None:
+        """Go to a control period of an episode.
 
         Args:
             key: of the seed.
             episode: its number since the seed.
+            period: of the episode, the first one by default.
         """
-        self._key, self._episode, self._drawn = key, episode, 0
+        self._key, self._episode, self._drawn = key, episode, period
         self._rows: list[list[float]] = []
         self._position = 0
 
@@ -80,14 +82,27 @@ class NoiseStreams:
         # Env i has the slots 2 i and 2 i + 1, one for its episode and one for the beginning of the
         # next; what a slot holds stands at its end.
         n = streams.num_envs
-        self._buffer = np.empty((2 * n, self._chunk, channels))
-        self._rows = self._buffer.reshape(2 * n * self._chunk, channels)
+        self._make_room()
         self._slot = 2 * np.arange(n)
         self._row = (self._slot + 1) * self._chunk
         self._end = self._row.copy()
         self._drawn = np.zeros(n, dtype=np.int64)
         self._ahead = np.zeros(n, dtype=np.int64)
         self._before_refill = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what was drawn ahead, which a copy draws itself."""
+        kept = {name: each for name, each in vars(self).items() if name not in ("_buffer", "_rows")}
+        return {**kept, "_drawn": self._drawn - (self._end - self._row)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._make_room()
+        self.seek(np.arange(self._streams.num_envs), self._drawn)
+
+    def _make_room(self) -> None:
+        self._buffer = np.empty((2 * self._streams.num_envs, self._chunk, self._channels))
+        self._rows = self._buffer.reshape(len(self._buffer) * self._chunk, self._channels)
 
     def seek(self, envs: Sequence[int] | np.ndarray, periods: np.ndarray) -> None:
         """Go to a control period of the episodes of some envs.

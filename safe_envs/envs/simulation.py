@@ -50,10 +50,15 @@ class Simulation:
         return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
 
 
-def start_sampler(problem: SafetyProblem) -> StartSampler:
-    """Return what draws the start states of a problem."""
-    title = f"{problem.name!r} ({problem.start})"
-    return StartSampler(problem.starts[problem.start], problem.model, title)
+def start_sampler(problem: SafetyProblem, start: str | None = None) -> StartSampler:
+    """Return what draws the start states of a problem.
+
+    Args:
+        problem: with the distributions.
+        start: name of one; None for the one in use.
+    """
+    name = problem.start if start is None else start
+    return StartSampler(problem.starts[name], problem.model, f"{problem.name!r} ({name})")
 
 
 def readings(problem: SafetyProblem) -> tuple[Any, ...]:

@@ -9,26 +9,25 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
 from safe_envs.compiled.engine import compiled_or_none, require_engine
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.array_batch import ArrayBatch
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.compiled_batch import CompiledBatch
-from safe_envs.envs.episode import Episodes, autoreset_of, last_of_episode
+from safe_envs.envs.episode import Episodes, last_of_episode
 from safe_envs.envs.info import Info, VectorStep, with_masks
-from safe_envs.envs.seeding import EpisodeStreams, Seeds
-from safe_envs.envs.simulation import steps_until
-from safe_envs.envs.spaces import BatchActions, action_box, observation_box
+from safe_envs.envs.reset_options import RequestedStart, ResetOptions, StartingPoints
+from safe_envs.envs.seeding import Seeds
+from safe_envs.envs.vector_interface import VectorInterface
 from safe_envs.errors import InvalidInputError, require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
+from safe_envs.rendering.viewer import open_viewer
 
 _Stepper = ArrayBatch | CompiledBatch | BatchStepper
 
 
-class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class SafeVectorEnv(VectorInterface):
     """`num_envs` copies of a problem, stepped together.
 
     Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i,
@@ -69,24 +68,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         require_whole("num_envs", num_envs, 1)
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
-        self._autoreset = autoreset_of(autoreset_mode)
-        self.problem, self.num_envs = problem, num_envs
-        self.metadata = {
-            "render_modes": [*RENDER_MODES[1:]],
-            "render_fps": frames_a_second(problem),
-            "autoreset_mode": self._autoreset,
-        }
-        self.single_observation_space = observation_box(problem)
-        self.single_action_space = action_box(problem)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._actions = BatchActions(problem, num_envs)
-        self._streams = EpisodeStreams(num_envs)
+        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps)
         self.episodes = Episodes(num_envs)
-        limit = steps_until(problem, max_episode_steps)
+        self._reset_options = ResetOptions(problem, self._limit, num_envs)
         require_engine(engine)
         self.engine = engine
-        parts = (problem, self._streams, self.episodes, limit)
+        parts = (problem, self._streams, self.episodes, self._limit)
         compiled = compiled_or_none(engine, math.inf, lambda: CompiledBatch(*parts))
         self._batch = ArrayBatch(*parts) if compiled is None else compiled
 
@@ -109,28 +96,22 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def state(self) -> np.ndarray:
-        """The exact states, shape (num_envs, n), in the units of the problem's states."""
+        """The exact states, shape (num_envs, n), in the units of the problem's states.
+
+        They can be set within episodes, by an array (n,) for all envs too; see `SafeEnv.state`.
+        """
         return np.stack(self.components, axis=-1)
 
-    @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A generator of each env, seeded as Gymnasium does; the env does not draw from it."""
-        self._streams.seed([None] * self.num_envs)
-        return self._streams.generators()
-
-    @property
-    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The seed of each env."""
-        self._streams.seed([None] * self.num_envs)
-        return tuple(self._streams.seeds)
-
-    def physical_action(self, actions: Any) -> Components:
-        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
-        return self._actions.physical(actions)
-
-    def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
-        """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
-        return self._actions.normalized(physical)
+    @state.setter
+    def state(self, given: Any) -> None:
+        before = self.state
+        states = self._reset_options.states(given)
+        moved = (states != before).any(axis=1)
+        self._batch.place(states, [])
+        self._batch.rest(moved)
+        self.episodes.place(moved)
+        if self.viewer is not None:
+            self.viewer.restart(states, self._times, np.flatnonzero(moved).tolist())
 
     def reset(
         self, *, seed: Seeds = None, options: dict[str, Any] | None = None
@@ -139,10 +120,15 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Args:
             seed: seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env.
-            options: may hold "reset_mask", a bool array of shape (num_envs,).
+            options: those of `SafeEnv.reset`, where the state may also have the shape (num_envs, n)
+                and the time (num_envs,); and "reset_mask", a bool array (num_envs,).
 
         Returns:
             The observations, float32 (num_envs, k), and the info.
+
+        Raises:
+            ConfigurationError: an option is unknown, or does not go with another.
+            InvalidInputError: a state or a time is not allowed.
         """
         return self.reset_filtered(self._batch, seed, options)
 
@@ -170,7 +156,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         seeded = self._streams.seed(self._streams.for_each_env(seed))
         self.episodes.restore(snapshot)
         self._streams.begin_episodes(seeded)
-        self._batch.place(snapshot, seeded)
+        self._batch.place(snapshot["state"], seeded)
+        self._batch.restore(snapshot)
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, range(self.num_envs))
 
@@ -214,9 +201,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             The observations and the info.
         """
         seeds = self._streams.for_each_env(seed)
-        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
+        mask = self.episodes.reset_mask(self._reset_options.checked(options).get("reset_mask"))
+        requested = self._reset_options.read(options, mask)
         self._streams.seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
-        observation, _, _, _, info = stepper.begin(mask)
+        points = None if requested is None else self._points(requested, mask)
+        observation, _, _, _, info = stepper.begin(mask, points)
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
         return observation, with_masks(info, mask)
@@ -253,6 +242,17 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
             return None
         return self.viewer.frames() if self.components else None
+
+    def _points(self, requested: RequestedStart, mask: np.ndarray) -> StartingPoints:
+        """Return where the envs of a mask begin."""
+        states, streams = requested.states, self._streams
+        if states is None:
+            envs = np.flatnonzero(mask)
+            keys, episodes = [streams.keys[i] for i in envs], streams.episodes[envs] + 1
+            sampler = self._reset_options.sampler(requested.start)
+            states = np.empty((self.num_envs, self.problem.plant.n))
+            states[envs] = sampler.draw_batch(streams.reader, keys, episodes.tolist()).T
+        return StartingPoints(states, requested.steps)
 
     def _due(self) -> np.ndarray | None:
         """Return the envs whose coming step begins an episode; None for none."""

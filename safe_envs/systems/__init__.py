@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import gymnasium as gym
+from safe_envs.envs.spec import register_system
 
 MODULES = {
     "DubinsDisk": "dubins",
@@ -31,14 +31,10 @@ CUSTOM_ID = "safe_envs/Custom-v0"
 
 def register_all() -> None:
     """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
-    gym.register(
-        CUSTOM_ID,
-        entry_point="safe_envs.envs.custom:Custom",
-        vector_entry_point="safe_envs.envs.custom:CustomVector",
-    )
+    register_system(CUSTOM_ID, "safe_envs.envs.custom:Custom", "safe_envs.envs.custom:CustomVector")
     for name, module in MODULES.items():
-        gym.register(
+        register_system(
             f"safe_envs/{name}-v0",
-            entry_point=f"safe_envs.systems.{module}:{name}",
-            vector_entry_point=f"safe_envs.systems.vectors:{name}Vector",
+            f"safe_envs.systems.{module}:{name}",
+            f"safe_envs.systems.vectors:{name}Vector",
         )

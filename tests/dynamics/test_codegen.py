@@ -3,7 +3,11 @@ floats and for arrays."""
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -321,3 +325,46 @@ def test_settled_arrays_are_remembered_and_cannot_be_changed():
     assert not np.any(taken)
     # Those of an earlier step are not kept.
     assert read(a, b)[0] is not sine
+
+
+NEW_PROCESS = """
+import pickle, sys
+sys.path[:] = {path!r}
+found = [function(.3, .7) for function in pickle.loads({pickled!r})]
+print([[float(value).hex() for value in values] for values in found])
+"""
+
+
+def test_functions_are_pickled_as_the_expressions_that_they_are_made_of():
+    x, y = sp.symbols("x y", real=True)
+    hidden = sp.Dummy("x", real=True)
+    expressions = [
+        sp.sin(x * y) ** 3 / 7,
+        sp.sqrt(x**2 + y**2),
+        sp.erf(hidden) + x,
+        sp.Rational(1, 3),
+    ]
+    pieces = [sp.Piecewise((sp.log(x), x > 0), (1 / y, True))]
+    functions = [
+        compile_function((x, y), [e.subs(hidden, y) for e in expressions], "floats"),
+        compile_function((x, hidden), expressions[2:], "arrays"),
+        compile_function((x, y), pieces, "floats"),
+    ]
+    pickled = pickle.dumps(functions)
+    for copies in (pickle.loads(pickled), copy.deepcopy(functions)):
+        for function, other in zip(functions, copies, strict=True):
+            assert other(0.3, 0.7) == function(0.3, 0.7)
+    # There no function is at hand, and hashes of symbols are others.
+    script = NEW_PROCESS.format(path=sys.path, pickled=pickled)
+    told = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert told.stdout.strip() == str(
+        [[float(value).hex() for value in function(0.3, 0.7)] for function in functions]
+    )
+
+
+def test_unpickling_a_function_reads_no_text_as_code():
+    x = sp.Symbol("__import__('os').abort()")
+    function = compile_function((x,), [x + 1], "floats")
+    assert pickle.loads(pickle.dumps(function))(1.0) == (2.0,)

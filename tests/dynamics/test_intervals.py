@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 
 import mpmath
 import numpy as np
@@ -260,3 +262,11 @@ def test_arguments_stay_as_they_are():
 def test_what_has_no_interval_form_is_named(expression, named):
     with pytest.raises(SystemDefinitionError, match=named):
         interval_function((X,), (expression,))
+
+
+def test_functions_are_pickled_and_copied():
+    x = sp.Symbol("x", real=True)
+    function = interval_function((x,), [sp.sqrt(x) + sp.sin(x) ** 2, 1 / sp.sqrt(x)])
+    at = [Interval(np.array([0.5, 1.0]), np.array([0.6, 3.0]))]
+    for other in (pickle.loads(pickle.dumps(function)), copy.deepcopy(function)):
+        np.testing.assert_array_equal(other(at), function(at))

@@ -52,7 +52,7 @@ def test_the_constraint_is_that_of_the_system_augmented_by_hand():
         parameters={k: 2.0},
     )
     pairs = [(Barrier(1 - x**2), *parse_conditions("hocbf:p=1,3,5", limited))]
-    hand = SafetyFilter(by_hand, pairs, [(-4.0, 6.0)])
+    hand = SafetyFilter(by_hand, pairs, bounds=(-4.0, 6.0))
     ours = SafetyFilter.for_problem(limited, "hocbf:p=1,3,5")
     # Where no bound of u is within reach of one period: -2 + .4 <= u <= 3 - .6.
     states = np.random.default_rng(0).uniform([-0.9, -1.0, -1.59], [0.9, 1.0, 2.39], (500, 3))

@@ -19,7 +19,7 @@ from safe_envs.agents.training.native_vec_env import NativeVecEnv
 from safe_envs.envs.info import Info
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.registry import env_class, full_id
 from safe_envs.wrappers import SafetyFilterVectorWrapper
 from safe_envs.wrappers.conditions import Condition
@@ -90,8 +90,8 @@ class SafeVecEnv(NativeVecEnv):
 
     The infos are `LazyInfo`s: their entries are made when they are read. The info of an env that is
     done describes the last step of its episode, with "terminal_observation";
-    "TimeLimit.truncated" tells whether only time ended it. `reset` discards what `set_options` was
-    given, as the scalar envs have no options.
+    "TimeLimit.truncated" tells whether only time ended it. `reset` takes what `set_options` was
+    given: the options of `SafeEnv.reset`, in which the envs may differ but for the start's name.
 
     The algorithms learn on the action that the policy proposed, and on-policy ones have to: they
     see a filter only through the transition, in which all proposals that it corrects to the same
@@ -139,8 +139,12 @@ class SafeVecEnv(NativeVecEnv):
 
         Returns:
             Observations, float32 of shape (num_envs, n); the infos are in `reset_infos`.
+
+        Raises:
+            ConfigurationError: an option of `set_options` is unknown, or one env has others.
+            InvalidInputError: a state or a time is not allowed.
         """
-        observation, info = self.env.reset(seed=self._seeds)
+        observation, info = self.env.reset(seed=self._seeds, options=_joined(self._options))
         self._reset_seeds()
         self._reset_options()
         self.batch_info = self._at_rest(info)
@@ -225,3 +229,20 @@ def _arrays(info: Info) -> Info:
 @lru_cache(maxsize=64)
 def _of_arrays(keys: tuple[str, ...]) -> tuple[str, ...]:
     return tuple([key for key in keys if not key.startswith(("_", "final_"))])
+
+
+def _joined(options: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the options of each env as those of a batch."""
+    first = options[0]
+    if any(each.keys() != first.keys() for each in options) or "reset_mask" in first:
+        raise ConfigurationError(
+            f"set_options was given {shown(options)}; give each env the same of state, start and t"
+        )
+    if any(each.get("start") != first.get("start") for each in options):
+        raise ConfigurationError(
+            f"set_options was given {shown(options)}; all envs start from one distribution"
+        )
+    return {
+        name: value if name == "start" else [each[name] for each in options]
+        for name, value in first.items()
+    }

@@ -38,6 +38,8 @@ class DelayMemory:
         text: of its conditions.
     """
 
+    judges_episodes = False
+
     def __init__(
         self, safety_filter: SafetyFilter, problem: SafetyProblem, delay: int, num_envs: int
     ) -> None:
@@ -47,16 +49,27 @@ class DelayMemory:
         rest = resting_input(problem.box)
         self._one, self._batch = DelayLine(delay, rest), DelayLine(delay, rest, num_envs)
 
-    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
         """Put resting inputs under way.
 
         Args:
             x: not used.
             envs: which begin an episode, bool (num_envs,); None for all.
+            instants: not used.
         """
         self._batch.restart(envs)
-        if envs is None:
+        if envs is None or len(envs) == 1:
             self._one.restart()
+
+    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
+        """Put resting inputs under way in envs whose states somebody set, as they do themselves.
+
+        Args:
+            x: not used.
+            envs: whose states were set, bool (num_envs,).
+            instants: not used.
+        """
+        self.begin(x, envs)
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
         """Decide for one env; see `DelayedFilter.filter`.

@@ -38,16 +38,29 @@ class EpisodeFilter(Protocol):
 
     Attributes:
         text: of the filter.
+        judges_episodes: whether what it keeps is of whole episodes, so that none can begin late.
     """
 
     text: str
+    judges_episodes: bool
 
-    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
         """Begin episodes.
 
         Args:
             x: n components of the states of all envs.
             envs: which begin an episode, bool (num_envs,); None for all.
+            instants: control periods of each episode that have passed, int or (num_envs,).
+        """
+        ...
+
+    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
+        """Go on from states that no decision led to: somebody set them.
+
+        Args:
+            x: see `begin`.
+            envs: whose states were set.
+            instants: see `begin`.
         """
         ...
 
@@ -96,18 +109,30 @@ class Memoryless:
         text: of its conditions.
     """
 
+    judges_episodes = False
+
     def __init__(self, safety_filter: SafetyFilter) -> None:
         self.safety_filter = safety_filter
         self.text = spec_of([each for _, each in safety_filter.pairs])
         self.decide_floats = safety_filter.decide_floats
         self.decide_arrays = safety_filter.decide_arrays
 
-    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
         """Do nothing.
 
         Args:
             x: not used.
             envs: not used.
+            instants: not used.
+        """
+
+    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
+        """Do nothing.
+
+        Args:
+            x: not used.
+            envs: not used.
+            instants: not used.
         """
 
     def advance(self, x: Sequence[Any], ended: Any) -> None:

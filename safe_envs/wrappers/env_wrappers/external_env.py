@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -57,7 +58,15 @@ class ActionMap(NamedTuple):
                 f"factor = {factor!r} and offset = {offset!r} of an action map; give finite"
                 " numbers, and no factor 0"
             )
-        return cls(lambda action: o + f * action, lambda u: (u - o) / f)
+        return cls(partial(_scaled, f, o), partial(_unscaled, f, o))
+
+
+def _scaled(factor: np.ndarray, offset: np.ndarray, action: np.ndarray) -> np.ndarray:
+    return offset + factor * action
+
+
+def _unscaled(factor: np.ndarray, offset: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return (u - offset) / factor
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
+from safe_envs.envs.reset_options import refuse_time
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.actuators import resting_input
 from safe_envs.problem.problem import SafetyProblem
@@ -65,6 +66,7 @@ class FilterLayer:
         if inner.viewer is not None:
             inner.viewer.caption = text
         self._inner = inner
+        self._placements = self.episodes_below().placements
         # Inputs that pass through an env's numbers are rounded, by float32 at worst.
         self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
         return text
@@ -92,6 +94,27 @@ class FilterLayer:
             return observation
         last = self._filter.report()["promise"].reshape(*np.shape(observation)[:-1], 1)
         return np.concatenate([observation, last], axis=-1, dtype=observation.dtype)
+
+    def require_whole_episodes(self, options: Any) -> None:
+        """Raise ConfigurationError where a reset gives a time to episodes that are judged whole.
+
+        Args:
+            options: of the reset; those of a third-party env have other meanings.
+        """
+        if self._filter.judges_episodes and self._inner is self._inner.unwrapped:
+            refuse_time(options, f"the filter {self._filter.text}")
+
+    def episodes_below(self) -> Any:
+        """Return the counters of the env's episode, or of those of a batch."""
+        raise NotImplementedError
+
+    def follow(self) -> None:
+        """Let the filter know of states that were set since it was last called."""
+        episodes = self.episodes_below()
+        if episodes.placements is not self._placements:
+            changed = np.atleast_1d(episodes.placements != self._placements)
+            self._placements = episodes.placements
+            self._filter.resume(self._inner.components, changed, episodes.steps)
 
     def execute(self, env: Any, decided: Sequence[Any], directly: bool) -> Any:
         """Return what the step of an env under the decided input returns.

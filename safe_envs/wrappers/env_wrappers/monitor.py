@@ -99,6 +99,11 @@ class SafetyMonitor(
         self._episode = Episode()
 
     @property
+    def episode(self) -> Episode:
+        """Counters of the episode."""
+        return self._episode
+
+    @property
     def components(self) -> tuple[float, ...]:
         """The state that the last observation shows, as plain floats."""
         if self._x is None:

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.envs.env import SafeEnv
+from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
 from safe_envs.wrappers.env_wrappers.layers import (
@@ -96,17 +97,26 @@ class SafetyFilterWrapper(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode; see `gymnasium.Env.reset`."""
+        """Start an episode; see `SafeEnv.reset`.
+
+        With a specification to keep, an episode begins at time 0.
+
+        Raises:
+            ConfigurationError: see `SafeEnv.reset`; or a time is given with a specification.
+        """
+        self.require_whole_episodes(options)
+        self.follow()
         observation, info = self.env.reset(seed=seed, options=options)
         self._interventions = 0
         self._infeasible = 0
-        self._filter.begin(self._inner.components)
+        self._filter.begin(self._inner.components, instants=self._inner.episode.steps)
         info = {**info, **rest_info(self._inner.problem), **self._reported()}
         return self.observed(observation), info
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Info]:
         """Filter the action and hold it for one control period."""
         proposed = self._inner.physical_action(action)
+        self.follow()
         decision = self._filter.decide_floats(self._inner.components, proposed)
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
         if self._inner.viewer is not None:
@@ -134,6 +144,10 @@ class SafetyFilterWrapper(
             **self._reported(),
         )
         return self.observed(observation), reward, terminated, truncated, info
+
+    def episodes_below(self) -> Episode:
+        """Return the counters of the env's episode."""
+        return self._inner.episode
 
     def _reported(self) -> Info:
         return {key: value.item() for key, value in self._filter.report().items()}

@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
+from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
@@ -74,13 +75,18 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
+        """Start episodes in every env, or those of a mask.
+
+        See `SafeVectorEnv.reset` and `SafetyFilterWrapper.reset`.
+        """
         if self._stepper is not None:
             return self._inner.reset_filtered(self._stepper, seed, options)
+        self.require_whole_episodes(options)
+        self.follow()
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
-        self._filter.begin(self._inner.components, present)
+        self._filter.begin(self._inner.components, present, self._inner.episodes.steps)
         at_rest = {
             key: np.full((self.num_envs, *np.shape(value)), value)
             for key, value in self._rest.items()
@@ -101,12 +107,14 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         counts = [np.asarray(snapshot[name], dtype=np.int64) for name in _TALLIES]
         self._counted.tallies = np.column_stack(counts)
         self._filter.restore(snapshot)
+        self._placements = self.episodes_below().placements
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
         if self._stepper is not None:
             return self._inner.step_filtered(self._stepper, actions)
         proposed = self._inner.physical_action(actions)
+        self.follow()
         decision = self._filter.decide_arrays(self._inner.components, proposed)
         active = (
             decision.active[0]
@@ -133,6 +141,10 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             added |= self._filter.report()
         info.update(with_masks(added, info["_cost"]))
         return self.observed(observation), reward, terminated, truncated, info
+
+    def episodes_below(self) -> Episodes:
+        """Return the counters of the envs' episodes."""
+        return self._inner.episodes
 
     def _reached(self) -> Components:
         """Return the components of the states that a step led to, of ended episodes too."""

@@ -13,6 +13,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info
+from safe_envs.envs.reset_options import refuse_time
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.layers import state_layer
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
@@ -24,7 +25,8 @@ class SpecificationMonitor(
 ):
     """Adds robustness, satisfied, verdict and automaton_state to `info`.
 
-    Actions, rewards and ends of episodes pass unchanged. At the last step of an episode
+    Actions, rewards and ends of episodes pass unchanged. The trace is of the states at reset and
+    after each step; a state that is set between steps is not in it. At the last step of an episode
     `info["satisfied"]` says whether it met the specification.
 
     Args:
@@ -57,7 +59,13 @@ class SpecificationMonitor(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode; see `gymnasium.Env.reset`."""
+        """Start an episode, at time 0; see `SafeEnv.reset`.
+
+        Raises:
+            ConfigurationError: see `SafeEnv.reset`; or another time is given.
+        """
+        if self._inner is self._inner.unwrapped:
+            refuse_time(options, "the specification")
         observation, info = self.env.reset(seed=seed, options=options)
         self.tracker.begin(self._x, np.ones(1, dtype=bool))
         return observation, {**info, **self._report()}

@@ -11,6 +11,7 @@ import sympy as sp
 from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.info import Info, VectorStep, with_masks
+from safe_envs.envs.reset_options import refuse_time
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
 from safe_envs.wrappers.env_wrappers.specification_monitor import with_regions
 from safe_envs.wrappers.value.specification_tracker import SpecificationTracker
@@ -50,7 +51,9 @@ class SpecificationMonitorVector(gym.vector.VectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
+        """Start episodes in every env, or those of a mask; see `SpecificationMonitor.reset`."""
+        if self._inner is self._inner.unwrapped:
+            refuse_time(options, "the specification")
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self.tracker.begin(self._inner.components, present)

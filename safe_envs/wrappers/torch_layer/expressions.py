@@ -9,7 +9,7 @@ import sympy as sp
 import torch
 from sympy.printing.pytorch import TorchPrinter
 
-from safe_envs.dynamics.codegen import in_plain_names
+from safe_envs.dynamics.plain_expressions import in_plain_names
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.filter_qp import FilterQP
 

@@ -70,6 +70,14 @@ class TorchFilter(torch.nn.Module):
         self._sets = ActiveSets(qp)
         self._constraints = compiled_constraints(qp)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the compiled constraints, which a copy makes itself."""
+        return {key: value for key, value in vars(self).items() if key != "_constraints"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._constraints = compiled_constraints(self.safety_filter.qp)
+
     @classmethod
     def for_problem(
         cls,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -43,8 +44,21 @@ class ExpectedBounds:
             self._rest = 0.0
         self._means = grid_arrays(smoothing.means, ROUNDING if step.is_noisy else POINT_SLACK)
         self._parts: CellSets | None = None
+        self._prepare()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without what a copy prepares itself: functions and smoothed tables."""
+        prepared = ("_functions", "_ahead", "_filled")
+        return {key: value for key, value in vars(self).items() if key not in prepared}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Take the compiled functions, and make room for smoothed tables."""
         self._functions = bellman_functions()
-        shape = len(table.lower) * table.states, smoothing.means.cells
+        shape = len(self._table.lower) * self._table.states, self._smoothing.means.cells
         self._ahead = {sign: np.empty(shape, dtype=np.float32) for sign in (1, -1)}
         self._filled = {sign: np.zeros(shape[0], dtype=bool) for sign in (1, -1)}
 

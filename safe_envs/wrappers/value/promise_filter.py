@@ -149,25 +149,29 @@ class PromiseFilter:
                     f" {name} than {problem.name}; make it for the env's own problem"
                 )
 
-    def start(self, x: Components) -> np.ndarray:
+    def start(self, x: Components, k: np.ndarray | None = None) -> np.ndarray:
         """Return p_0 at the starts of episodes.
 
         For a specification no barrier is looked at: q_0 is 0 where it is violated.
 
         Args:
             x: n components of the states, arrays (B,).
+            k: control instants at which they start, int (B,); None for 0, as for a specification.
 
         Returns:
-            min(p, max q_0) in the safe set and 0 outside, shape (B,).
+            min(p, max q_k) in the safe set and 0 outside, shape (B,).
         """
-        k = np.zeros(len(x[0]), dtype=np.int64)
+        k = np.zeros(len(x[0]), dtype=np.int64) if k is None else k
         if isinstance(self.look_ahead, ProductLookAhead):
-            best = self.look_ahead.scanned(k, self.look_ahead.starts(x)).max(axis=1)
-            return np.where(best > 0.0, np.minimum(best, self.settings.probability), 0.0)
-        best = self.look_ahead.scanned(k, x).max(axis=1)
+            return self.attainable(k, self.look_ahead.starts(x))
         with np.errstate(all="ignore"):
             safe = (stacked(self._barriers(*x), len(x[0])) > 0.0).all(axis=1)
-        return np.where(safe & (best > 0.0), np.minimum(best, self.settings.probability), 0.0)
+        return np.where(safe, self.attainable(k, x), 0.0)
+
+    def attainable(self, k: np.ndarray, x: Components) -> np.ndarray:
+        """Return min(p, max q_k), 0 where it is negative, shape (B,); see `choose`."""
+        best = self.look_ahead.scanned(k, x).max(axis=1)
+        return np.where(best > 0.0, np.minimum(best, self.settings.probability), 0.0)
 
     def choose(
         self, k: np.ndarray, level: np.ndarray, x: Components, u: Components

@@ -32,6 +32,7 @@ class PromiseMemory:
     Attributes:
         safety_filter: the filter.
         text: of its settings.
+        judges_episodes: whether the promise is of a specification, which is of whole episodes.
         levels: p_k of each episode, what is still kept; shape (num_envs,).
         losses: how often p_k had to be lowered by more than rounding, which a right table never
             makes necessary.
@@ -47,6 +48,7 @@ class PromiseMemory:
         self._states = np.zeros(num_envs, dtype=np.int64)
         ahead = promise_filter.look_ahead
         self._product = ahead if isinstance(ahead, ProductLookAhead) else None
+        self.judges_episodes = self._product is not None
         self._expected = np.ones(num_envs)
         self._caps = np.full(num_envs, np.inf)
         self.levels = np.zeros(num_envs)
@@ -56,24 +58,54 @@ class PromiseMemory:
         # A constraint on all barriers together has no single one as its cause.
         self._cause = 0 if count == 1 else -1
 
-    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None) -> None:
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
         """Begin episodes.
 
         Args:
             x: n components of the states.
             envs: which begin, bool (num_envs,); None for all.
+            instants: control periods that have passed, int or (num_envs,); 0 for a specification.
         """
         chosen = slice(None) if envs is None else np.flatnonzero(envs)
         starts = tuple([c[chosen] for c in _arrays(x)])
         if len(starts[0]):
-            self._instants[chosen], self._ended[chosen] = 0, False
+            k = self._go_to(chosen, instants)
+            self._ended[chosen] = False
             self.levels = self.levels.copy()
-            self.levels[chosen] = self.safety_filter.start(starts)
+            self.levels[chosen] = self.safety_filter.start(starts, k)
             if self._product is not None:
                 pairs = self._product.starts(starts)
                 self._states[chosen] = pairs[-1]
-                sure = self._product.settled(self._instants[chosen], pairs) == 1.0
+                sure = self._product.settled(k, pairs) == 1.0
                 self.levels[chosen] = np.where(sure, 1.0, self.levels[chosen])
+
+    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
+        """Promise anew from states that somebody set: what was promised was of others.
+
+        Of a specification the traces stay what they are up to the states that were replaced.
+
+        Args:
+            x: n components of the states.
+            envs: whose states were set, bool (num_envs,).
+            instants: control periods that have passed, int or (num_envs,).
+        """
+        chosen = np.flatnonzero(envs)
+        at, k = tuple([c[chosen] for c in _arrays(x)]), self._go_to(chosen, instants)
+        self.levels = self.levels.copy()
+        if self._product is None:
+            self.levels[chosen] = self.safety_filter.start(at, k)
+            return
+        pairs = (*at, self._states[chosen])
+        # A table takes an episode to be over in a goal, but it is not over before the next step.
+        is_open = np.isnan(self._product.settled(k, pairs))
+        promised = np.where(is_open, self.safety_filter.attainable(k, pairs), 0.0)
+        self.levels[chosen] = np.where(self._product.met(k, pairs[-1]), 1.0, promised)
+
+    def _go_to(self, chosen: Any, instants: Any) -> np.ndarray:
+        """Set the control instants of some episodes; return them, at most the table's last."""
+        self._instants = self._instants.copy()
+        self._instants[chosen] = np.broadcast_to(instants, self._instants.shape)[chosen]
+        return np.minimum(self._instants[chosen], self._last)
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
         """Decide for one state; see `SafetyFilter.decide_floats`.

@@ -70,6 +70,10 @@ class Step:
         self._scenarios = scenarios(reduced.intervals)
         self.noise: NoiseBoxes = noise_boxes(self._intervals())
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the compiled kernel, which a copy makes itself."""
+        return {key: value for key, value in vars(self).items() if key != "_kernel"}
+
     @property
     def substeps(self) -> int:
         """Sub-steps of a control period."""

@@ -147,9 +147,39 @@ def test_seeds_are_used_once():
     np.testing.assert_array_equal(first[1], gym.make(DUBINS).reset(seed=6)[0])
     env.seed()
     assert len(set(env._seeds)) == 2
-    env.set_options({"reset_mask": [True, False]})
+
+
+def test_options_are_of_the_next_reset_alone():
+    env = make_sb3_env(DUBINS, 2, "scbf", seed=5)
+    states = np.array([[0.5, 0.1, 0.2], [-0.4, 0.3, 1.0]])
+    env.set_options([{"state": x, "t": t} for x, t in zip(states, (0.1, 0.2), strict=True)])
     env.reset()
+    np.testing.assert_array_equal(env.get_attr("state"), states)
+    np.testing.assert_array_equal(
+        env.env.unwrapped.episodes.steps * env.env.unwrapped.problem.dt, [0.1, 0.2]
+    )
     assert env._options == [{}, {}]
+    env.set_options({"state": states[0]})
+    env.reset()
+    np.testing.assert_array_equal(env.get_attr("state"), states[[0, 0]])
+    env.reset()
+    assert not (np.array(env.get_attr("state")) == states).any()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"reset_mask": [True, False]},
+        [{"t": 0.1}, {}],
+        [{"start": "one"}, {"start": "other"}],
+        {"speed": 1.0},
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options):
+    env = make_sb3_env(DUBINS, 2, seed=5)
+    env.set_options(options)
+    with pytest.raises(ConfigurationError, match=r"set_options|unknown option 'speed'"):
+        env.reset()
 
 
 def test_attributes_are_rows_or_shared():
@@ -179,7 +209,10 @@ def test_attributes_are_set_for_all_envs():
     with pytest.raises(ConfigurationError, match="'note' is shared by all 2 envs"):
         env.set_attr("note", "changed", indices=0)
     with pytest.raises(AttributeError):
-        env.set_attr("state", np.zeros((2, 3)))
+        env.set_attr("components", np.zeros((2, 3)))
+    env.reset()
+    env.set_attr("state", [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    np.testing.assert_array_equal(env.get_attr("state"), [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
 
 
 def test_methods_are_called_once_for_the_batch():

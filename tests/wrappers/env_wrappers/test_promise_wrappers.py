@@ -195,3 +195,88 @@ def test_copies_go_their_own_ways():
         assert env.step(actions(k)[0])[-1]["promise"] == twin.step(actions(k)[0])[-1]["promise"]
     env.step(actions(4)[0])
     assert env._filter.levels[0] != twin._filter.levels[0]
+
+
+def followed(env, count, first=0):
+    """Return what the filter says of some steps."""
+    infos = [env.step(actions(k)[: getattr(env, "num_envs", 1)])[-1] for k in range(first, count)]
+    return [{key: info[key] for key in KEYS} for info in infos]
+
+
+@pytest.mark.parametrize("state", [0.3, 0.99, -2.5])
+def test_from_a_state_that_is_set_is_kept_what_can_be_from_there(state):
+    env, late = scalar_env(), scalar_env()
+    env.reset(seed=0)
+    late.reset(seed=0, options={"state": [state], "t": 3 * late.unwrapped.problem.dt})
+    for k in range(3):
+        env.step(actions(k)[0])
+    memory, before = env._filter, env._filter.levels.item()
+    assert before > 0.0
+    losses, env._interventions = memory.losses, 0
+    env.unwrapped.state = [state]
+    for k in range(3, 6):
+        mine, theirs = env.step(actions(k)[0])[-1], late.step(actions(k)[0])[-1]
+        for key in KEYS:
+            np.testing.assert_array_equal(mine[key], theirs[key])
+        assert mine["promise"] > 0.0
+    # What the other state was worth is no loss of the table's.
+    assert memory.losses - losses == late._filter.losses
+
+
+def test_nothing_is_kept_from_an_unsafe_state():
+    env = scalar_env()
+    env.reset(seed=0)
+    env.unwrapped.state = [1.5]
+    info = env.step(actions(0)[0])[-1]
+    assert (info["feasible"], info["promise"]) == (False, 0.0)
+    _, info = env.reset(options={"state": [1.5]})
+    assert (info["violation"], info["promise"]) == (True, 0.0)
+    # What is kept from a safe state on is of the rest of the episode.
+    env.unwrapped.state = [0.0]
+    info = env.step(actions(0)[0])[-1]
+    assert info["feasible"]
+    assert info["promise"] > 0.0
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_envs_whose_states_stay_keep_what_they_kept(mode):
+    env, other = vector_env(mode), vector_env(mode)
+    for each in (env, other):
+        each.reset(seed=0)
+        followed(each, 3)
+    states, kept = env.unwrapped.state, env._filter.levels.copy()
+    states[2] = 0.9
+    env.unwrapped.state = states
+    levels = env._filter.safety_filter.start((np.array([0.9]),), np.array([3]))
+    # Envs that are reset meanwhile do not hide the one that was set.
+    mask = np.array([True, False, False, False])
+    for each in (env, other):
+        each.reset(options={"reset_mask": mask})
+    env.follow()
+    np.testing.assert_array_equal(env._filter.levels[[1, 3]], kept[[1, 3]])
+    assert env._filter.levels[2] == levels.item() != kept[2]
+    for mine, theirs in zip(followed(env, 6, 3), followed(other, 6, 3), strict=True):
+        for key in KEYS:
+            np.testing.assert_array_equal(mine[key][[0, 1, 3]], theirs[key][[0, 1, 3]])
+
+
+def test_a_snapshot_that_the_env_restores_alone_leaves_no_old_bound():
+    env = vector_env()
+    env.reset(seed=0)
+    begun = env.unwrapped.snapshot()
+    followed(env, 5)
+    env.unwrapped.restore(begun)
+    env.follow()
+    x = tuple(begun["state"].T)
+    np.testing.assert_array_equal(env._filter.levels, env._filter.safety_filter.start(x))
+    np.testing.assert_array_equal(env._filter._instants, 0)
+
+
+def test_a_late_start_ends_with_the_table():
+    env = scalar_env(**SHORT)
+    steps, dt = env.unwrapped.problem.steps, env.unwrapped.problem.dt
+    env.reset(seed=0, options={"t": (steps - 1) * dt})
+    *_, truncated, info = env.step(actions(0)[0])
+    assert truncated
+    assert info["promise"] > 0.0
+    assert not env.step(actions(0)[0])[-1]["feasible"]

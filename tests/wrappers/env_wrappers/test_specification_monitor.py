@@ -214,3 +214,30 @@ def test_mistakes_are_refused_before_a_step() -> None:
     x = sp.Symbol("x", real=True)
     found = SpecificationMonitor(env, "eventually hill", {"hill": 1 - x**2})
     assert copy.deepcopy(found).tracker.specification.atoms == ("hill",)
+
+
+def test_specifications_judge_whole_episodes() -> None:
+    state = near().starts[near().start].proposals(1)[0]
+    env = SpecificationMonitor(SafeEnv(near()), "eventually[2,4] goal")
+    envs = SpecificationMonitorVector(SafeVectorEnv(near(), 2), "eventually[2,4] goal")
+    for each, late in ((env, 0.2), (envs, 0.2), (envs, [0.0, 0.2])):
+        each.reset(seed=0, options={"state": state, "t": 0.0})
+        before = each.unwrapped.state
+        with pytest.raises(ConfigurationError, match="the specification is of whole episodes"):
+            each.reset(seed=0, options={"t": late})
+        np.testing.assert_array_equal(each.unwrapped.state, before)
+
+
+def test_a_state_that_is_set_is_not_in_the_trace() -> None:
+    env = SpecificationMonitor(SafeEnv(near()), "eventually goal")
+    env.reset(seed=0)
+    in_goal = env.unwrapped.state
+    in_goal[:2] = 1.4, 1.0
+    start = env.unwrapped.state
+    env.unwrapped.state = in_goal
+    env.unwrapped.state = start
+    *_, info = env.step(np.zeros(1))
+    assert not info["satisfied"]
+    env.unwrapped.state = in_goal
+    *_, info = env.step(np.zeros(1))
+    assert info["satisfied"]

@@ -303,3 +303,46 @@ def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
     assert first.startswith("held input, comp.: bounds of promise filters are computed")
     assert "at least the mean of min(p, L_0)" in second
     assert len(computed_notes(["promise:p=0.9"])) == 1
+
+
+@pytest.mark.parametrize("text", [REACH, WINDOW])
+def test_from_states_that_are_set_is_kept_what_can_be_after_the_trace(text):
+    chosen, episodes, late = filter_of(text, 0.9), 2000, 2
+    env = SafeVectorEnv(chosen.problem, episodes)
+    filtered = SafetyFilterVectorWrapper(env, chosen)
+    monitor, memory = SpecificationMonitorVector(filtered, text), memory_in(filtered)
+    _, info = monitor.reset(seed=1, options={"state": [-0.2]})
+    for _ in range(late):
+        *_, info = monitor.step(np.zeros((episodes, 1)))
+    before, a = memory.levels, info["automaton_state"]
+    env.state = x = np.linspace(-0.75, 0.65, episodes)[:, None]
+    filtered.follow()
+    best = chosen.look_ahead.scanned(np.full(episodes, late), (x[:, 0], a)).max(axis=1)
+    levels = memory.levels
+    np.testing.assert_array_equal(levels, np.clip(best, 0.0, 0.9))
+    assert (levels < before).any()
+    met, alive = np.zeros(episodes, dtype=bool), np.ones(episodes, dtype=bool)
+    for k in range(late, STEPS):
+        u = hostile(chosen, k, env.components, memory._states)
+        *_, terminated, truncated, info = monitor.step(u[:, None] / 2.0)
+        over = (terminated | truncated) & alive
+        met[over] = info["satisfied"][over]
+        alive &= ~over
+    assert met.mean() >= levels.mean() - 3.0 * np.sqrt(0.25 / episodes)
+
+
+def test_a_goal_that_a_state_is_set_into_is_not_yet_an_end():
+    chosen = filter_of(REACH, 0.9)
+    memory, _ = memory_of(chosen, np.array([0.0, 0.0]))
+    memory.advance((np.array([0.0, 0.0]),), np.zeros(2, dtype=bool))
+    memory.resume((np.array([0.75, 0.0]),), np.array([True, False]), np.ones(2, dtype=int))
+    assert memory.levels[0] == 0.0
+    assert memory.levels[1] > 0.0
+
+
+def test_a_late_start_is_no_whole_episode():
+    chosen = filter_of(REACH, 0.9)
+    envs = SafetyFilterVectorWrapper(SafeVectorEnv(chosen.problem, 2), chosen)
+    envs.reset(seed=0, options={"t": 0.0})
+    with pytest.raises(ConfigurationError, match="is of whole episodes, from time 0 on"):
+        envs.reset(options={"t": PERIOD})

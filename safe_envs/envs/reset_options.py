@@ -1,0 +1,186 @@
+"""Where episodes begin when a reset is given a state, a start distribution or a time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safe_envs.envs.simulation import start_sampler
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, shown
+from safe_envs.problem.initial_distribution import StartSampler
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.validators import real_array
+
+_NAMES = ("state", "start", "t")
+
+_WHOLE = 1e-6
+"""By how much of a control period a time may miss a whole number of them."""
+
+
+class RequestedStart(NamedTuple):
+    """Where a reset asks for the episodes of a batch of envs, or of one env, to begin.
+
+    Attributes:
+        states: shape (B, n), or None for draws; anything for envs that begin no episode.
+        start: name of the distribution that is drawn from.
+        steps: control periods that have passed, int64 (B,).
+    """
+
+    states: np.ndarray | None
+    start: str
+    steps: np.ndarray
+
+
+class StartingPoints(NamedTuple):
+    """Where envs of a batch begin their episodes.
+
+    Attributes:
+        states: shape (num_envs, n); anything for envs that begin no episode.
+        steps: control periods that have passed, int64 (num_envs,).
+    """
+
+    states: np.ndarray
+    steps: np.ndarray
+
+
+class ResetOptions:
+    """Reads the options of `reset`, and checks states that are given.
+
+    Args:
+        problem: of the envs.
+        limit: control periods until an episode is truncated.
+        num_envs: size of a batch; None for a scalar env, whose states have the shape (n,).
+    """
+
+    def __init__(self, problem: SafetyProblem, limit: int, num_envs: int | None = None) -> None:
+        self._problem, self._limit, self._num_envs = problem, limit, num_envs
+        self._samplers: dict[str, StartSampler] = {}
+
+    def checked(self, options: Any) -> Mapping[str, Any]:
+        """Return the options of `reset` as a mapping of known names.
+
+        Raises:
+            ConfigurationError: They are no mapping, or an option is unknown.
+        """
+        if not isinstance(options, Mapping | None):
+            raise ConfigurationError(
+                f"options = {shown(options)}; give a mapping, like {{'state': x, 't': 1.0}}"
+            )
+        known = _NAMES if self._num_envs is None else (*_NAMES, "reset_mask")
+        for name in options or {}:
+            if name not in known:
+                raise ConfigurationError(
+                    f"unknown option {shown(name)} of reset; {nearest(str(name), known)}"
+                )
+        return options or {}
+
+    def read(
+        self, options: Mapping[str, Any] | None, begins: np.ndarray | None = None
+    ) -> RequestedStart | None:
+        """Return what is asked for; None where nothing is.
+
+        Args:
+            options: of `reset`.
+            begins: which envs of a batch begin an episode, bool (num_envs,).
+
+        Raises:
+            ConfigurationError: An option is unknown, the name of a start is, or both a state and a
+                start are given.
+            InvalidInputError: A state or a time is not allowed.
+        """
+        options = self.checked(options)
+        state, start, time = [options.get(name) for name in _NAMES]
+        if state is None and start is None and time is None:
+            return None
+        if state is not None and start is not None:
+            raise ConfigurationError(
+                f"reset was given both a state and the start {shown(start)}; give one of them"
+            )
+        return RequestedStart(
+            None if state is None else self.states(state, begins),
+            self._problem.start if start is None else self._named(start),
+            self._steps(0.0 if time is None else time, begins),
+        )
+
+    def states(self, given: Any, wanted: np.ndarray | None = None) -> np.ndarray:
+        """Return states as an array of doubles of their own, (1, n) or (num_envs, n).
+
+        Args:
+            given: shape (n,); of a batch this stands for all its envs, and (num_envs, n) will do.
+            wanted: the envs of a batch whose states are looked at; None for all.
+
+        Raises:
+            InvalidInputError: The states have another shape, are not finite, or outside the
+                workspace.
+        """
+        found, problem = real_array("state", given), self._problem
+        n, count = problem.plant.n, self._num_envs
+        shapes = [(n,)] if count is None else [(n,), (count, n)]
+        if found.shape not in shapes:
+            names = ", ".join(s.symbol.name for s in problem.states)
+            raise InvalidInputError(
+                f"the state has shape {found.shape}; {problem.name} takes"
+                f" {' or '.join(map(str, shapes))}: {names}"
+            )
+        states = np.array(np.broadcast_to(found, (count or 1, n)), dtype=float)
+        checked = states if wanted is None else states[wanted]
+        for v, values in zip(problem.states, checked.T, strict=True):
+            bad = ~(np.isfinite(values) & (values >= v.low) & (values <= v.high))
+            if bad.any():
+                raise InvalidInputError(
+                    f"the state has {v.symbol} = {values[bad][0]}; give a number in the workspace"
+                    f" [{v.low}, {v.high}]"
+                )
+        return states
+
+    def sampler(self, start: str) -> StartSampler:
+        """Return what draws from a start distribution, given by its name."""
+        if start not in self._samplers:
+            self._samplers[start] = start_sampler(self._problem, start)
+        return self._samplers[start]
+
+    def _named(self, start: Any) -> str:
+        starts = self._problem.starts
+        if not isinstance(start, str) or start not in starts:
+            raise ConfigurationError(
+                f"unknown start {shown(start)}; {nearest(str(start), starts)}; a state is given by"
+                " the option 'state'"
+            )
+        return start
+
+    def _steps(self, given: Any, wanted: np.ndarray | None) -> np.ndarray:
+        times, dt, count = real_array("time", given), self._problem.dt, self._num_envs
+        if times.shape != () and times.shape != (count,):
+            raise InvalidInputError(
+                f"t has shape {times.shape}; give a number in s"
+                + ("" if count is None else f", or {count} of them")
+            )
+        times = np.array(np.broadcast_to(times, count or 1), dtype=float)
+        if wanted is not None:
+            times[~wanted] = 0.0
+        with np.errstate(all="ignore"):
+            periods = times / dt
+            steps = np.rint(periods)
+            bad = ~((abs(periods - steps) <= _WHOLE) & (steps >= 0) & (steps < self._limit))
+        if bad.any():
+            raise InvalidInputError(
+                f"t = {times[bad][0]} s; give a whole number of control periods of {dt} s, from 0"
+                f" to {(self._limit - 1) * dt:g} s, before the episode ends"
+            )
+        return steps.astype(np.int64)
+
+
+def refuse_time(options: Mapping[str, Any] | None, judge: str) -> None:
+    """Raise ConfigurationError where a reset sets the time of an episode that is judged as a whole.
+
+    Args:
+        options: of `reset`.
+        judge: what judges it.
+    """
+    time = options.get("t") if isinstance(options, Mapping) else None
+    if time is not None and np.any(np.asarray(time) != 0):
+        raise ConfigurationError(
+            f"t = {shown(time)}: {judge} is of whole episodes, from time 0 on; leave t out"
+        )

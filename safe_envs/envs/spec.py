@@ -1,0 +1,106 @@
+"""How long the episodes of registered envs are, in their specs."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import fields
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs import registration
+from gymnasium.envs.registration import EnvSpec, load_env_creator
+
+from safe_envs.errors import ConfigurationError
+
+_MAKERS = (registration.make.__code__, registration.make_vec.__code__)
+
+_NOT_OF_PROBLEMS = {
+    "autoreset_mode",
+    "engine",
+    "max_episode_steps",
+    "num_envs",
+    "render_mode",
+    "vector_kwargs",
+    "vectorization_mode",
+    "wrappers",
+}
+"""Arguments of `gym.make_vec` and of envs that their problems do not have."""
+
+
+class SystemSpec(EnvSpec):
+    """The spec of an env that ends its episodes itself, after the horizon of its problem.
+
+    `max_episode_steps` is what was given, by Gymnasium's TimeLimit for one, or else the length of
+    the env's own episodes. `gym.make` and `gym.make_vec` read only what was given: by the length
+    they would limit the episodes of an env, whatever `dt` and `horizon` it is made with.
+
+    Attributes:
+        own_steps: control periods until the env itself truncates an episode; None for those of the
+            problem that it has by default.
+    """
+
+    own_steps: int | None = None
+
+    @classmethod
+    def of(cls, spec: EnvSpec, own_steps: int | None = None) -> SystemSpec:
+        """Return a spec with everything that another one was given.
+
+        Args:
+            spec: the other one.
+            own_steps: see the class.
+        """
+        found = cls(**_given(spec))
+        found.own_steps = own_steps
+        return found
+
+    @property
+    def max_episode_steps(self) -> int | None:
+        """Control periods until an episode is truncated; None where that is not known."""
+        if self.given_steps is not None or sys._getframe(1).f_code in _MAKERS:
+            return self.given_steps
+        return self._default_steps() if self.own_steps is None else self.own_steps
+
+    @max_episode_steps.setter
+    def max_episode_steps(self, steps: int | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.given_steps = steps
+
+    def to_json(self) -> str:
+        """Return what was given as JSON; see `EnvSpec.to_json`."""
+        return EnvSpec(**_given(self)).to_json()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, EnvSpec) and _given(self) == _given(other)
+
+    def _default_steps(self) -> int | None:
+        creator: Any = load_env_creator(self.entry_point)  # pyright: ignore[reportArgumentType]
+        given = {name: value for name, value in self.kwargs.items() if name not in _NOT_OF_PROBLEMS}
+        try:
+            steps = creator.make_problem(**given).steps
+        except ConfigurationError:  # The id for any system has none of its own.
+            return None
+        return min(steps, self.kwargs.get("max_episode_steps") or steps)
+
+
+def register_system(
+    env_id: str, entry_point: str, vector_entry_point: str, **arguments: Any
+) -> None:
+    """Register an id with Gymnasium.
+
+    Args:
+        env_id: the id.
+        entry_point: place of its `SystemEnv`.
+        vector_entry_point: place of its `SystemVectorEnv`.
+        **arguments: of the env.
+    """
+    gym.register(
+        env_id, entry_point, vector_entry_point=vector_entry_point, kwargs=arguments or None
+    )
+    gym.registry[env_id] = SystemSpec.of(gym.registry[env_id])
+
+
+def _given(spec: EnvSpec) -> dict[str, Any]:
+    """Return the arguments of which a spec is made."""
+    found = {f.name: getattr(spec, f.name) for f in fields(EnvSpec) if f.init}
+    if isinstance(spec, SystemSpec):
+        found["max_episode_steps"] = spec.given_steps
+    return found

@@ -1,0 +1,98 @@
+"""What Gymnasium asks of a batch of envs of a problem besides stepping them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.envs.seeding import EpisodeStreams
+from safe_envs.envs.simulation import steps_until
+from safe_envs.envs.spaces import BatchActions, action_box, observation_box
+from safe_envs.envs.spec import SystemSpec
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second
+
+
+class VectorInterface(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Spaces, metadata, spec and seeds of a batch of envs; base of `SafeVectorEnv`.
+
+    Attributes:
+        problem: that is simulated.
+
+    Args:
+        problem: see above.
+        num_envs: size of the batch.
+        autoreset_mode: when ended episodes restart.
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+
+    Raises:
+        ConfigurationError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        problem: SafetyProblem,
+        num_envs: int,
+        autoreset_mode: str | AutoresetMode,
+        max_episode_steps: int | None,
+    ) -> None:
+        self._autoreset = _mode(autoreset_mode)
+        self._limit = steps_until(problem, max_episode_steps)
+        self._spec: EnvSpec | None = None
+        self.problem, self.num_envs = problem, num_envs
+        self.metadata = {
+            "render_modes": [*RENDER_MODES[1:]],
+            "render_fps": frames_a_second(problem),
+            "autoreset_mode": self._autoreset,
+        }
+        self.single_observation_space = observation_box(problem)
+        self.single_action_space = action_box(problem)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._actions = BatchActions(problem, num_envs)
+        self._streams = EpisodeStreams(num_envs)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The spec that the envs were made of, with the length of their episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, given: EnvSpec | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self._spec = None if given is None else SystemSpec.of(given, self._limit)
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """A generator of each env, seeded as Gymnasium does; the env does not draw from it."""
+        self._streams.seed([None] * self.num_envs)
+        return self._streams.generators()
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The seed of each env."""
+        self._streams.seed([None] * self.num_envs)
+        return tuple(self._streams.seeds)
+
+    def physical_action(self, actions: Any) -> Components:
+        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
+        return self._actions.physical(actions)
+
+    def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
+        """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
+        return self._actions.normalized(physical)
+
+
+def _mode(given: str | AutoresetMode) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError as error:
+        allowed = ", ".join(mode.value for mode in AutoresetMode)
+        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error
