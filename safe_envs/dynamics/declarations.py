@@ -141,6 +141,30 @@ def require_real(
         )
 
 
+def advice_on_unknown(unknown: Iterable[sp.Symbol], allowed: Iterable[sp.Symbol]) -> str:
+    """Return what to do about symbols that an expression may not hold.
+
+    Args:
+        unknown: the symbols.
+        allowed: those that it may hold.
+    """
+    if TIME in unknown:
+        return (
+            "the time is known to rewards, features, and filters in a loop of your own; here, make"
+            " it a state whose rate is 1"
+        )
+    twins = {s.name for s in unknown} & {s.name for s in allowed}
+    if twins:
+        return (
+            f"{', '.join(sorted(twins))} has other assumptions there: Symbol('x', real=True) is not"
+            " Symbol('x'); the time is problem.TIME"
+        )
+    return (
+        "a parameter gets its value in parameters={...} of the system, and what is measured at run"
+        " time its rate in signals={...}"
+    )
+
+
 def _declared(symbol: sp.Symbol) -> str:
     """Return what a symbol was declared to be, like "positive=True"."""
     return ", ".join(

@@ -9,7 +9,14 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import TIME, fitting, formula, read_matrix, require_real
+from safe_envs.dynamics.declarations import (
+    TIME,
+    advice_on_unknown,
+    fitting,
+    formula,
+    read_matrix,
+    require_real,
+)
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 
@@ -193,16 +200,9 @@ class ControlAffineSDE:
         """
         unknown = set(used) - set(allowed)
         if unknown:
-            twins = {s.name for s in unknown} & {s.name for s in allowed}
-            hint = (
-                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not"
-                " Symbol('x'); the time is problem.TIME"
-                if twins
-                else "a parameter gets its value in parameters={...} of the system"
-            )
             raise SystemDefinitionError(
                 f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}."
-                f" Note: {hint}"
+                f" Note: {advice_on_unknown(unknown, allowed)}"
             )
 
     @property

@@ -156,3 +156,9 @@ def test_an_env_simulates_what_moves():
     for system, names in ((measured(), "p, q"), (measured(drift=[TIME], signals={}), "the time")):
         with pytest.raises(SystemDefinitionError, match=f"depends on .*{names}.*a state"):
             state_problem(system, 1 - x, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)
+
+
+def test_the_time_is_no_part_of_an_envs_barrier():
+    still = measured(drift=[0], signals={})
+    with pytest.raises(SystemDefinitionError, match=r"unknown symbol t; .*a state whose rate is 1"):
+        state_problem(still, 1 - x - TIME, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)

@@ -344,6 +344,13 @@ def test_functions_that_torch_lacks_are_refused():
         TorchFilter(SafetyFilter(model, [(Barrier(1 - x), CBF(alpha=1.0))], bounds=[(-1.0, 1.0)]))
 
 
+def test_what_comes_in_at_each_call_is_no_argument_of_a_layer():
+    x, u, p = sp.symbols("x u p", real=True)
+    model = ControlAffineSDE((x,), (u,), [0], [[1]], [[0]], signals={p: 0})
+    with pytest.raises(ConfigurationError, match="takes p at each call"):
+        TorchFilter(SafetyFilter(model, p - x, "cbf", (-1.0, 1.0)))
+
+
 def test_the_promise_filter_has_no_gradient_and_says_what_to_use():
     problem = make_problem("safe_envs/Scalar-v0")
     with pytest.raises(ConfigurationError, match=r"'promise:p=0\.9'.*no gradient.*'scbf'"):

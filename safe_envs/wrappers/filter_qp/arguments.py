@@ -137,7 +137,13 @@ def read_pairs(system: ControlAffineSDE, barriers: Any, conditions: Any) -> Pair
         entries, conditions = [list(part) for part in zip(*entries, strict=True)]
     named = named_barriers(entries)
     for barrier in named:
-        used = barrier.expression.free_symbols
+        used: set[Any] = barrier.expression.free_symbols
+        fixed = ", ".join(sorted(p.name for p in used & set(system.parameters)))
+        if fixed:
+            raise SystemDefinitionError(
+                f"barrier {barrier.name} holds the parameter {fixed}, which a filter takes as a"
+                f" number; write its value, or name it in adjustable=({fixed!r},)"
+            )
         system.require_known(f"barrier {barrier.name}", used, system.measured)
     return tuple(zip(named, _read_conditions(system, named, conditions), strict=True))
 

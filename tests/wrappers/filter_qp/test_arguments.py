@@ -135,7 +135,7 @@ ENDLESS = (-math.inf, 1.0)
         ({"barriers": H > 0}, "give the expression itself"),
         ({"barriers": None}, "a barrier is NoneType"),
         ({"barriers": 1 - y}, "unknown symbol y; allowed: .*t, v, x"),
-        ({"barriers": 1 - mass * x}, "unknown symbol mass"),
+        ({"barriers": 1 - mass * x}, "holds the parameter mass.* adjustable="),
         ({"barriers": sp.Integer(1)}, "no relative degree"),
         ({"barriers": [(H, HOCBF()), H]}, "pairs alone, or barriers alone"),
         ({"barriers": [(H, HOCBF())]}, "pairs alone, or barriers alone"),
