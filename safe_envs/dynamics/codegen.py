@@ -43,6 +43,10 @@ class _Remembering:
         self._ufunc = ufunc
         self.known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Another object would not be told when its arrays are outdated.
+        return _remembering, (self._ufunc.__name__,)
+
     def __call__(self, argument: Any) -> Any:
         entry = self.known.get(id(argument))
         if entry is not None and entry[0] is argument:
@@ -55,6 +59,10 @@ class _Remembering:
 
 
 _REMEMBERING = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")}
+
+
+def _remembering(name: str) -> _Remembering:
+    return _REMEMBERING[name]
 
 
 def _elementwise(function: Callable[[float], float]) -> Callable[[Any], np.ndarray]:

@@ -187,7 +187,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             ConfigurationError: an option is unknown, or does not go with another.
             InvalidInputError: a state or a time is not allowed.
         """
-        requested = self._reset_options.read(options)
+        requested = None if options is None else self._reset_options.read(options)
         super().reset(seed=seed)
         self._begin_episode(seed is not None, requested)
         observation, _, _, info = self._observe([c for c, _ in self._scales])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
-from dataclasses import fields
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +12,12 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from safe_envs.errors import ConfigurationError
 
-_MAKERS = (registration.make.__code__, registration.make_vec.__code__)
+_MAKERS = (
+    registration.make.__code__,
+    registration.make_vec.__code__,
+    getattr(dataclasses, "_replace", dataclasses.replace).__code__,
+)
+"""Code that makes envs, or other specs, of a spec."""
 
 _NOT_OF_PROBLEMS = {
     "autoreset_mode",
@@ -31,8 +36,9 @@ class SystemSpec(EnvSpec):
     """The spec of an env that ends its episodes itself, after the horizon of its problem.
 
     `max_episode_steps` is what was given, by Gymnasium's TimeLimit for one, or else the length of
-    the env's own episodes. `gym.make` and `gym.make_vec` read only what was given: by the length
-    they would limit the episodes of an env, whatever `dt` and `horizon` it is made with.
+    the env's own episodes. What makes envs and further specs of a spec reads only what was given:
+    by the length, `gym.make` would limit the episodes of an env whatever `dt` and `horizon` it is
+    made with.
 
     Attributes:
         own_steps: control periods until the env itself truncates an episode; None for those of the
@@ -100,7 +106,7 @@ def register_system(
 
 def _given(spec: EnvSpec) -> dict[str, Any]:
     """Return the arguments of which a spec is made."""
-    found = {f.name: getattr(spec, f.name) for f in fields(EnvSpec) if f.init}
+    found = {f.name: getattr(spec, f.name) for f in dataclasses.fields(EnvSpec) if f.init}
     if isinstance(spec, SystemSpec):
         found["max_episode_steps"] = spec.given_steps
     return found

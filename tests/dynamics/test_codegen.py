@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 
+import cloudpickle
 import numpy as np
 import pytest
 import sympy as sp
@@ -368,3 +369,14 @@ def test_unpickling_a_function_reads_no_text_as_code():
     x = sp.Symbol("__import__('os').abort()")
     function = compile_function((x,), [x + 1], "floats")
     assert pickle.loads(pickle.dumps(function))(1.0) == (2.0,)
+
+
+def test_functions_that_go_to_a_cluster_know_when_arrays_are_outdated():
+    x = sp.Symbol("x", real=True)
+    function = compile_function((x,), [sp.sin(x)], "arrays")
+    # By cloudpickle generated code goes along as it is.
+    other = pickle.loads(cloudpickle.dumps(function))
+    for value in (0.3, 0.4):
+        (at,) = settled((np.full(2, value),), (2,))
+        assert other(at)[0] is function(at)[0]
+        np.testing.assert_array_equal(other(at)[0], np.sin([value, value]))

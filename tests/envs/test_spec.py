@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 
 import gymnasium as gym
@@ -84,6 +85,15 @@ def test_a_limit_that_is_given_is_gymnasiums():
     assert envs.spec.max_episode_steps == gym.make_vec(envs.spec).spec.max_episode_steps == 3
     envs = gym.make_vec(ACC, 2, "sync", max_episode_steps=3)
     assert [each.spec.max_episode_steps for each in (envs, *envs.envs)] == [3, 3, 3]
+
+
+def test_a_spec_with_other_arguments_tells_their_length():
+    for spec in (gym.spec(ACC), gym.make(ACC).spec):
+        other = dataclasses.replace(spec, kwargs={"horizon": 250.0})
+        assert gym.make(other).spec.max_episode_steps == 5000
+        assert TimeLimit not in layers(gym.make(other))
+        assert gym.make_vec(other, 2).spec.max_episode_steps == 5000
+        assert "max_episode_steps=None" not in repr(spec)
 
 
 def test_time_is_shown_by_gymnasiums_wrapper():

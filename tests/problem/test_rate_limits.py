@@ -134,7 +134,8 @@ def test_what_else_follows():
     assert limited.inputs[0].unit == "rad/s/s"
     assert limited.frame is not None
     assert limited.frame.section[-1] == problem.inputs[0].symbol
-    assert limited.configured(noise=0.1, dt=problem.dt).rates == ((-5.0, 5.0),)
+    assert limited.configured(dt=problem.dt, box=limited.box) == limited
+    assert limited.configured(noise=0.1).rates == ((-5.0, 5.0),)
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0, 1.0])
     assert SafeEnv(given).reset(seed=0)[0][-1] == 1.0
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0])

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.envs.env import SafeEnv
+from safe_envs.envs.episode import Episode, Episodes
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.envs.reset_options import refuse_time
 from safe_envs.errors import ConfigurationError
@@ -66,7 +67,6 @@ class FilterLayer:
         if inner.viewer is not None:
             inner.viewer.caption = text
         self._inner = inner
-        self._placements = self.episodes_below().placements
         # Inputs that pass through an env's numbers are rounded, by float32 at worst.
         self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
         return text
@@ -104,17 +104,20 @@ class FilterLayer:
         if self._filter.judges_episodes and self._inner is self._inner.unwrapped:
             refuse_time(options, f"the filter {self._filter.text}")
 
-    def episodes_below(self) -> Any:
-        """Return the counters of the env's episode, or of those of a batch."""
-        raise NotImplementedError
+    def watch_states(self, episodes: Episode | Episodes) -> None:
+        """Look from now on for states that are set.
+
+        Args:
+            episodes: counters of the env's episode, or of those of a batch.
+        """
+        self._episodes, self._placements = episodes, episodes.placements
 
     def follow(self) -> None:
         """Let the filter know of states that were set since it was last called."""
-        episodes = self.episodes_below()
-        if episodes.placements is not self._placements:
-            changed = np.atleast_1d(episodes.placements != self._placements)
-            self._placements = episodes.placements
-            self._filter.resume(self._inner.components, changed, episodes.steps)
+        if self._episodes.placements is not self._placements:
+            changed = np.atleast_1d(self._episodes.placements != self._placements)
+            self.watch_states(self._episodes)
+            self._filter.resume(self._inner.components, changed, self._episodes.steps)
 
     def execute(self, env: Any, decided: Sequence[Any], directly: bool) -> Any:
         """Return what the step of an env under the decided input returns.

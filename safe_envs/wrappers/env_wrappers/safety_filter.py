@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.envs.env import SafeEnv
-from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
 from safe_envs.wrappers.env_wrappers.layers import (
@@ -77,6 +76,7 @@ class SafetyFilterWrapper(
         text = self.attach(
             inner, condition, knowledge, objective, priorities, observe_promise, delay
         )
+        self.watch_states(inner.episode)
         # The monitor records the view: an env that is made again from its spec has one already.
         gym.utils.RecordConstructorArgs.__init__(
             self,
@@ -109,7 +109,7 @@ class SafetyFilterWrapper(
         observation, info = self.env.reset(seed=seed, options=options)
         self._interventions = 0
         self._infeasible = 0
-        self._filter.begin(self._inner.components, instants=self._inner.episode.steps)
+        self._filter.begin(self._inner.components, instants=self._episodes.steps)
         info = {**info, **rest_info(self._inner.problem), **self._reported()}
         return self.observed(observation), info
 
@@ -144,10 +144,6 @@ class SafetyFilterWrapper(
             **self._reported(),
         )
         return self.observed(observation), reward, terminated, truncated, info
-
-    def episodes_below(self) -> Episode:
-        """Return the counters of the env's episode."""
-        return self._inner.episode
 
     def _reported(self) -> Info:
         return {key: value.item() for key, value in self._filter.report().items()}

@@ -12,7 +12,6 @@ from gymnasium.vector.utils import batch_space
 
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
-from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
@@ -63,6 +62,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         self.attach(
             inner, condition, knowledge, objective, priorities, observe_promise, delay, env.num_envs
         )
+        self.watch_states(inner.episodes)
         gym.vector.VectorWrapper.__init__(self, env)
         if observe_promise:
             self.single_observation_space = self.observation_box(env.single_observation_space)
@@ -86,7 +86,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
-        self._filter.begin(self._inner.components, present, self._inner.episodes.steps)
+        self._filter.begin(self._inner.components, present, self._episodes.steps)
         at_rest = {
             key: np.full((self.num_envs, *np.shape(value)), value)
             for key, value in self._rest.items()
@@ -107,7 +107,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         counts = [np.asarray(snapshot[name], dtype=np.int64) for name in _TALLIES]
         self._counted.tallies = np.column_stack(counts)
         self._filter.restore(snapshot)
-        self._placements = self.episodes_below().placements
+        self.watch_states(self._episodes)
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
@@ -141,10 +141,6 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             added |= self._filter.report()
         info.update(with_masks(added, info["_cost"]))
         return self.observed(observation), reward, terminated, truncated, info
-
-    def episodes_below(self) -> Episodes:
-        """Return the counters of the envs' episodes."""
-        return self._inner.episodes
 
     def _reached(self) -> Components:
         """Return the components of the states that a step led to, of ended episodes too."""
