@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import Components, Flavour
+from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.delay_line import DelayLine
@@ -42,22 +41,8 @@ class Prediction:
     """
 
     def __init__(self, model: ControlAffineSDE, dt: float, substeps: int = 1) -> None:
-        self._settings = (model, dt, substeps)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the settings: what is compiled from them is compiled again."""
-        return {"_settings": self._settings}
-
-    @cached_property
-    def _floats(self) -> Integrator:
-        return self._integrator("floats")
-
-    @cached_property
-    def _arrays(self) -> Integrator:
-        return self._integrator("arrays")
-
-    def _integrator(self, flavour: Flavour) -> Integrator:
-        return Integrator(*self._settings, flavour)
+        self._floats = Integrator(model, dt, substeps, "floats")
+        self._arrays = Integrator(model, dt, substeps, "arrays")
 
     def of_one(self, x: Sequence[float], inputs: Iterable[Sequence[float]]) -> Sequence[float]:
         """Return the components of the state after some inputs, each for one control period.
@@ -106,7 +91,10 @@ class DelayedFilter:
     and filters there: `decision.barrier`, `margin` and the rest are of the predicted state. Where
     the prediction is exact, so is the filter: the plant is filtered as one without delay is, from
     the period on in which the first decided input arrives. Until then it executes the resting
-    input, which no filter can change.
+    input, which no filter can change. As of its filter, all that it needs is compiled when it is
+    made.
+
+    Conditions that correct the model, of learned terms, correct no prediction: it is the model's.
 
     What is given at each call is of now, as the state is: signals and the time are predicted with
     their rates. The input bounds are those of the input to be sent.
