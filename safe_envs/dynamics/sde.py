@@ -160,7 +160,7 @@ class ControlAffineSDE:
                 self.input_matrix,
                 self.diffusion,
                 tuple(self.parameters.items()),
-                tuple(self.signals.items()),
+                frozenset(self.signals.items()),
             )
         )
 

@@ -344,11 +344,14 @@ def test_functions_that_torch_lacks_are_refused():
         TorchFilter(SafetyFilter(model, [(Barrier(1 - x), CBF(alpha=1.0))], bounds=[(-1.0, 1.0)]))
 
 
-def test_what_comes_in_at_each_call_is_no_argument_of_a_layer():
+def test_a_layer_takes_finite_bounds_and_nothing_at_each_call():
     x, u, p = sp.symbols("x u p", real=True)
     model = ControlAffineSDE((x,), (u,), [0], [[1]], [[0]], signals={p: 0})
     with pytest.raises(ConfigurationError, match="takes p at each call"):
         TorchFilter(SafetyFilter(model, p - x, "cbf", (-1.0, 1.0)))
+    still = ControlAffineSDE((x,), (u,), [0], [[1]], [[0]])
+    with pytest.raises(ConfigurationError, match="give finite ones"):
+        TorchFilter(SafetyFilter(still, 1 - x, "cbf", (-math.inf, 1.0)))
 
 
 def test_the_promise_filter_has_no_gradient_and_says_what_to_use():

@@ -142,7 +142,7 @@ class RuntimeArguments:
             if seen & (1 << place):
                 raise ConfigurationError(f"parameters gives {self._named[place]} twice")
             seen |= 1 << place
-            found[place] = _number(self._named[place].name, value, batch)
+            found[place] = _number(f"value of {self._named[place]}", value, batch)
 
     def _unknown(self, key: Any) -> ConfigurationError:
         name = key.name if isinstance(key, sp.Symbol) else key
@@ -183,7 +183,7 @@ class RuntimeArguments:
         m = len(self._inputs)
         if type(given) is tuple and len(given) == 2 and _is_interval(*given):
             return [float(given[0])] * m, [float(given[1])] * m
-        pairs = real_array("bounds", given).astype(np.float64, copy=False)
+        pairs = real_array("pair of bounds", given).astype(np.float64, copy=False)
         if pairs.shape == (2,):
             pairs = np.broadcast_to(pairs, (m, 2))
         if pairs.shape[-2:] != (m, 2) or pairs.shape[:-2] not in ((), batch):
@@ -224,7 +224,7 @@ def _number(what: str, given: Any, batch: tuple[int, ...] | None) -> Any:
     found = real_array(what, given)
     if found.shape not in ((), batch):
         each = f", or an array {batch}, one for each state" if batch else ""
-        raise InvalidInputError(f"{what} has the shape {found.shape}; give a number{each}")
+        raise InvalidInputError(f"the {what} has the shape {found.shape}; give a number{each}")
     if not np.isfinite(found).all():
-        raise InvalidInputError(f"{what} = {shown(given)}; give finite numbers")
+        raise InvalidInputError(f"the {what} is {shown(given)}; give finite numbers")
     return float(found) if found.ndim == 0 else found.astype(np.float64).reshape(-1)

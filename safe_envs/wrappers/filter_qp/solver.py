@@ -83,11 +83,7 @@ class FilterQPSolver(CompiledQP):
         )
         self._require_finite((*action, *margin))
         slack = [0.0] * len(b) if feasible else [max(-g, 0.0) for g in margin]
-        acting = active.count(True)
-        if acting == 1 and any(a[active.index(True)]):
-            cause = active.index(True)
-        else:
-            cause = self._cause(a, b, u, active, {}) if acting else -1
+        cause = _furthest(a, b, u, active, self.weights) if True in active else -1
         return FilterDecision(action, margin, active, feasible, slack, cause, u)
 
     def solve(
@@ -280,6 +276,28 @@ class FilterQPSolver(CompiledQP):
             cause = self._choose(distance > furthest, i, cause)
             furthest = self._larger(furthest, distance)
         return cause
+
+
+def _furthest(
+    a: Sequence[Sequence[float]],
+    b: Sequence[float],
+    u: Sequence[float],
+    active: Sequence[bool],
+    weights: Sequence[float],
+) -> int:
+    """Return what `FilterQPSolver._cause` does, in floats, where every condition has a meaning."""
+    acting = [i for i, acts in enumerate(active) if acts and any(a[i])]
+    if len(acting) < 2:
+        return acting[0] if acting else -1
+    cause, furthest = -1, -math.inf
+    for i in acting:
+        unit = max(map(abs, a[i]))  # so that squares neither overflow nor vanish
+        parts = [aj / unit for aj in a[i]]
+        square = sum([p * p / wj for p, wj in zip(parts, weights, strict=True)])
+        distance = -(_dot(a[i], u) + b[i]) / unit / square**0.5
+        if distance > furthest:
+            cause, furthest = i, distance
+    return cause
 
 
 def _dot(a: Sequence[Any], u: Sequence[Any]) -> Any:

@@ -13,6 +13,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.filter_qp import FilterQP
+from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.torch_layer.active_set import ActiveSets, nearest_step
 from safe_envs.wrappers.torch_layer.expressions import compiled_constraints
@@ -201,6 +202,11 @@ def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
         raise ConfigurationError(
             f"the filter takes {', '.join(map(str, qp.runtime))} at each call, which a torch layer"
             " does not; make them states or fixed parameters"
+        )
+    if max(map(abs, (*qp.low, *qp.high))) >= WIDEST:
+        raise ConfigurationError(
+            "the filter has input bounds without an end, and a torch layer measures by their width"
+            " what holds an action; give finite ones"
         )
     if qp.clf is not None:
         raise ConfigurationError(

@@ -70,11 +70,12 @@ def test_formulas_by_pieces_goals_and_reciprocal_conditions_are_compiled_at_once
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     x, u, p = sp.symbols("x u p", real=True)
-    smooth = sp.Piecewise((x**3, x > 0), (x**3 / (1 + sp.sqrt(-x) ** 8), True))
-    system = ControlAffineSDE((x,), (u,), [smooth], [[1]], [[x]], signals={p: 1})
+    # A shared logarithm has no value where the other piece applies.
+    pieces = sp.Piecewise((x * sp.log(x) + x**2 * sp.log(x) ** 2, x > 0), (x, True))
+    system = ControlAffineSDE((x,), (u,), [pieces], [[1]], [[x]], signals={p: 1})
     made = SafetyFilter(system, [p - x, x + p], [SRCBF(), "scbf"], (-2, 2))
 
-    def refuse(*given: object) -> None:
+    def refuse(*given: object, **named: object) -> None:
         raise AssertionError("compiled after construction")
 
     monkeypatch.setattr(codegen.sp, "lambdify", refuse)
