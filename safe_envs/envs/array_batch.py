@@ -61,16 +61,19 @@ class ArrayBatch:
         """Return what a batch remembers besides states and counters, in arrays."""
         return {} if self.actuators is None else self.actuators.snapshot()
 
-    def place(self, snapshot: Mapping[str, np.ndarray], seeded: Sequence[int]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Take it from a snapshot."""
+        if self.actuators is not None:
+            self.actuators.restore(snapshot)
+
+    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
         """Put the envs into states, where their episodes are.
 
         Args:
-            snapshot: with the states, shape (num_envs, n), and what `snapshot` returned.
+            states: shape (num_envs, n).
             seeded: indices of the envs whose noise goes to the step of their episode.
         """
-        self.components = tuple(np.array(snapshot["state"], dtype=float).T.copy())
-        if self.actuators is not None:
-            self.actuators.restore(snapshot)
+        self.components = tuple(np.array(states, dtype=float).T.copy())
         self.noise.seek(seeded, self._episodes.steps[seeded])
 
     def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:

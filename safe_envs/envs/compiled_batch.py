@@ -57,11 +57,14 @@ class CompiledBatch:
         """Return nothing; see `ArrayBatch.snapshot`."""
         return {}
 
-    def place(self, snapshot: Mapping[str, np.ndarray], seeded: Sequence[int]) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Do nothing; see `ArrayBatch.restore`."""
+
+    def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
         """Put the envs into states; see `ArrayBatch.place`.
 
         Args:
-            snapshot: see there.
+            states: see there.
             seeded: see there.
         """
         state, episodes = self._state, self._state.episodes
@@ -69,7 +72,7 @@ class CompiledBatch:
         counts[:, STEPS] = episodes.steps
         counts[seeded, PERIOD] = episodes.steps[seeded]
         state.chunks[seeded] = -1
-        rows = np.column_stack([snapshot["state"], episodes.h_min, episodes.episode_cost])
+        rows = np.column_stack([states, episodes.h_min, episodes.episode_cost])
         state.commit(np.ascontiguousarray(rows, dtype=float), counts, None)
 
     def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:

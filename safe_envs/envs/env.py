@@ -114,9 +114,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def state(self) -> np.ndarray:
         """The exact state, shape (n,), in the units of the problem's states.
 
-        It can be set within an episode. Its clock, its noise and its counters go on, and nothing is
-        counted before the next step. A filter with a memory forgets what it kept, and keeps from
-        there on what it can keep from the new state.
+        It can be set within an episode. Its clock, its noise, its counters and the inputs that are
+        under way go on, and nothing is counted before the next step. A filter with a memory forgets
+        what it kept, and keeps from there on what it can keep from the new state.
 
         Raises:
             InvalidInputError: the state has another shape, is not finite, or outside the workspace.
@@ -187,8 +187,6 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         requested = None if options is None else self._reset_options.read(options)
         super().reset(seed=seed)
         self._begin_episode(seed is not None, requested)
-        if self._actuators is not None:
-            self._actuators.restart()
         observation, _, _, info = self._observe([c for c, _ in self._scales])
         self._show_start()
         return observation, info
@@ -265,6 +263,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self._x = tuple(requested.states[0].tolist())
         self._noise.begin(self._key, self._number, steps)
         self._episode.restart(steps)
+        if self._actuators is not None:
+            self._actuators.restart()
 
     def _show_start(self) -> None:
         """Let what is drawn begin at the present state."""

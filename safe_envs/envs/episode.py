@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.info import Info, safety_info, with_masks
 from safe_envs.errors import ConfigurationError
@@ -178,15 +177,6 @@ class Episodes:
         self.place(self.everywhere)
         for name in _COUNTERS:
             setattr(self, name, np.array(snapshot[name]))
-
-
-def autoreset_of(given: str | AutoresetMode) -> AutoresetMode:
-    """Return the way in which ended episodes restart; an unknown one is a ConfigurationError."""
-    try:
-        return AutoresetMode(given)
-    except ValueError as error:
-        allowed = ", ".join(mode.value for mode in AutoresetMode)
-        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error
 
 
 def last_of_episode(ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:

@@ -107,7 +107,7 @@ class SafeVectorEnv(VectorInterface):
         before = self.state
         states = self._reset_options.states(given)
         moved = (states != before).any(axis=1)
-        self._batch.place({**self._batch.snapshot(), "state": states}, [])
+        self._batch.place(states, [])
         self.episodes.place(moved)
         if self.viewer is not None:
             self.viewer.restart(states, self._times, np.flatnonzero(moved).tolist())
@@ -155,7 +155,8 @@ class SafeVectorEnv(VectorInterface):
         seeded = self._streams.seed(self._streams.for_each_env(seed))
         self.episodes.restore(snapshot)
         self._streams.begin_episodes(seeded)
-        self._batch.place(snapshot, seeded)
+        self._batch.place(snapshot["state"], seeded)
+        self._batch.restore(snapshot)
         if self.viewer is not None:
             self.viewer.restart(self.state, self._times, range(self.num_envs))
 

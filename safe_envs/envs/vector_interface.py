@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from safe_envs.dynamics.codegen import Components
-from safe_envs.envs.episode import autoreset_of
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.simulation import steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
 from safe_envs.envs.spec import SystemSpec
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second
 
@@ -44,7 +44,7 @@ class VectorInterface(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: str | AutoresetMode,
         max_episode_steps: int | None,
     ) -> None:
-        self._autoreset = autoreset_of(autoreset_mode)
+        self._autoreset = _mode(autoreset_mode)
         self._limit = steps_until(problem, max_episode_steps)
         self._spec: EnvSpec | None = None
         self.problem, self.num_envs = problem, num_envs
@@ -88,3 +88,11 @@ class VectorInterface(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
         """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
         return self._actions.normalized(physical)
+
+
+def _mode(given: str | AutoresetMode) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError as error:
+        allowed = ", ".join(mode.value for mode in AutoresetMode)
+        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error

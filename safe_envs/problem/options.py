@@ -43,10 +43,17 @@ def _read_box(option: str, texts: Sequence[str]) -> list[float] | list[list[floa
 
 
 def _option(
-    text: str, reader: Reader | None = None, metavar: str | None = None, repeatable: bool = False
+    text: str,
+    reader: Reader | None = None,
+    metavar: str | None = None,
+    repeatable: bool = False,
+    least: int | None = None,
 ) -> Any:
-    """Return a field with what a command line needs: the reader is None where a number is read."""
-    of_texts = {"reader": reader, "metavar": metavar, "repeatable": repeatable}
+    """Return a field with what a command line needs: the reader is None where a number is read.
+
+    The least number is that of an option that takes whole ones.
+    """
+    of_texts = {"reader": reader, "metavar": metavar, "repeatable": repeatable, "least": least}
     return field(default=None, metadata={"help": text, **of_texts})
 
 
@@ -92,7 +99,7 @@ class ProblemOptions:
     model: Mapping[str, float] | None = _parameters("Parameter that the designer believes.")
     barrier: Mapping[str, Any] | None = _parameters("Argument of the barrier.", words=True)
     dt: float | None = _option("Control period in s.")
-    substeps: int | None = _option("Integration steps in a control period.")
+    substeps: int | None = _option("Integration steps in a control period.", least=1)
     horizon: float | None = _option("Length of an episode in s.")
     box: Sequence[Any] | None = _option(
         "Physical bounds of all inputs, or once for each.", _read_box, "LO,HI", True
@@ -100,8 +107,10 @@ class ProblemOptions:
     start: str | Sequence[float] | None = _option(
         "Initial state, or the name of a distribution.", _read_start, "A,B,.."
     )
-    delay: int | None = _option("Delay of the plant's inputs, in control periods.")
-    model_delay: int | None = _option("Delay that filters believe; that of the plant by default.")
+    delay: int | None = _option("Delay of the plant's inputs, in control periods.", least=0)
+    model_delay: int | None = _option(
+        "Delay that filters believe; that of the plant by default.", least=0
+    )
     slew_limit: Sequence[Any] | None = _option(
         "Bounds of the actuators' rates, which filters do not know.", _read_box, "LO,HI", True
     )
@@ -159,6 +168,13 @@ class ProblemOptions:
 
 OPTION_NAMES = tuple(option.name for option in fields(ProblemOptions))
 """Every option, in the order of the command line."""
+
+WHOLE_OPTIONS: dict[str, int] = {
+    option.name: option.metadata["least"]
+    for option in fields(ProblemOptions)
+    if option.metadata["least"] is not None
+}
+"""The least value of each option that takes whole numbers."""
 
 PARAMETER_GROUPS = ("plant", "model", "barrier")
 """The options that are values by name."""

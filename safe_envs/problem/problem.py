@@ -249,7 +249,7 @@ class SafetyProblem:
         given = ProblemOptions.of(self.name, options, ())
         levels = noise_levels(self, given.noise)
         if self.rates:
-            require_apart(given, self.dt)
+            require_apart(given, self)
         changes: dict[str, Any] = {
             "plant": self.plant.with_parameters(**{**levels, **(given.plant or {})}),
             "model": self.model.with_parameters(**{**levels, **(given.model or {})}),

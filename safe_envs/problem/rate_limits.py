@@ -45,7 +45,7 @@ from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
-from safe_envs.problem.signals import Feature, Variable
+from safe_envs.problem.signals import Feature, Variable, input_bounds
 from safe_envs.validators import numbers_in
 
 _ROUNDING = 1e-6
@@ -120,18 +120,20 @@ def with_resting_inputs(start: Any, problem: Any) -> Any:
     return [*numbers_in(start).tolist(), *resting_input(problem.box)]
 
 
-def require_apart(given: ProblemOptions, dt: float) -> None:
+def require_apart(given: ProblemOptions, problem: Any) -> None:
     """Check that options leave alone what the rates of a problem's inputs have been derived from.
 
     Args:
-        given: options for a problem whose inputs have limited rates.
-        dt: its control period in s.
+        given: options for the problem.
+        problem: a `SafetyProblem` whose inputs have limited rates.
 
     Raises:
         ConfigurationError: They do not.
     """
-    changed = [name for name in ("box", "rate_limit") if getattr(given, name) is not None]
-    changed += ["dt"] * (given.dt not in (None, dt))
+    boxes = (None, list(problem.box))
+    box = None if given.box is None else input_bounds(given.box, len(problem.inputs))
+    changed = ["dt"] * (given.dt not in (None, problem.dt)) + ["box"] * (box not in boxes)
+    changed += ["rate_limit"] * (given.rate_limit is not None)
     if changed:
         raise ConfigurationError(
             f"{', '.join(changed)}: the inputs of this problem have limited rates, which were"

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from functools import cached_property
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
-from safe_envs.dynamics.codegen import Components, Flavour
+from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.delay_line import DelayLine
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.number_text import finite_number
 from safe_envs.problem.actuators import require_delay, resting_input
+from safe_envs.problem.signals import TIME
 from safe_envs.validators import real_array
-from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
+from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
@@ -39,22 +41,8 @@ class Prediction:
     """
 
     def __init__(self, model: ControlAffineSDE, dt: float, substeps: int = 1) -> None:
-        self._settings = (model, dt, substeps)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the settings: what is compiled from them is compiled again."""
-        return {"_settings": self._settings}
-
-    @cached_property
-    def _floats(self) -> Integrator:
-        return self._integrator("floats")
-
-    @cached_property
-    def _arrays(self) -> Integrator:
-        return self._integrator("arrays")
-
-    def _integrator(self, flavour: Flavour) -> Integrator:
-        return Integrator(*self._settings, flavour)
+        self._floats = Integrator(model, dt, substeps, "floats")
+        self._arrays = Integrator(model, dt, substeps, "arrays")
 
     def of_one(self, x: Sequence[float], inputs: Iterable[Sequence[float]]) -> Sequence[float]:
         """Return the components of the state after some inputs, each for one control period.
@@ -103,7 +91,13 @@ class DelayedFilter:
     and filters there: `decision.barrier`, `margin` and the rest are of the predicted state. Where
     the prediction is exact, so is the filter: the plant is filtered as one without delay is, from
     the period on in which the first decided input arrives. Until then it executes the resting
-    input, which no filter can change.
+    input, which no filter can change. As of its filter, all that it needs is compiled when it is
+    made.
+
+    Conditions that correct the model, of learned terms, correct no prediction: it is the model's.
+
+    What is given at each call is of now, as the state is: signals and the time are predicted with
+    their rates. The input bounds are those of the input to be sent.
 
     Args:
         safety_filter: decides at the predicted state.
@@ -132,8 +126,10 @@ class DelayedFilter:
             raise ConfigurationError(f"dt = {period} s; a control period is positive")
         qp = safety_filter.qp
         self.safety_filter, self.delay = safety_filter, delay
-        self._prediction = Prediction(safety_filter.model, period, substeps)
-        box = list(zip(np.ravel(qp.low).tolist(), np.ravel(qp.high).tolist(), strict=True))
+        self._prediction = Prediction(_with_runtime_states(qp), period, substeps)
+        fixed = [p.name for p in qp.model.parameters]
+        self._given = RuntimeArguments(qp, safety_filter.model.parameters, fixed, True)
+        box = list(zip(qp.low, qp.high, strict=True))
         self._rest = resting_input(box) if rest is None else self._input("rest", rest)
         self.reset()
 
@@ -148,7 +144,15 @@ class DelayedFilter:
         found = self._line.snapshot()
         return found.reshape(*(self._batch or ()), *found.shape[-2:])
 
-    def filter(self, x: Any, u_nominal: Any) -> FilterDecision:
+    def filter(
+        self,
+        x: Any,
+        u_nominal: Any,
+        *,
+        bounds: Any = None,
+        parameters: Mapping[Any, Any] | None = None,
+        t: Any = None,
+    ) -> FilterDecision:
         """Decide what to send now, and remember it.
 
         Args:
@@ -156,17 +160,24 @@ class DelayedFilter:
                 until `reset`.
             u_nominal: proposed inputs in physical units, shape (m,) or (..., m): for the period in
                 which they are executed.
+            bounds: of the input that is to be sent; see `SafetyFilter.filter`.
+            parameters: values now of signals and adjustable parameters; see there.
+            t: the time now in s; see there.
 
         Returns:
             The decision at the predicted state; `action` is to be sent.
 
         Raises:
             InvalidInputError: A shape does not fit, or an entry is no finite real number.
+            ConfigurationError: See `SafetyFilter.filter`.
             NumericalError: The prediction or the constraint has no finite value.
         """
         state = real_array("state", x).astype(np.float64)
         self._begin(state)
-        decision = self.safety_filter.filter(self._predicted(state), u_nominal)
+        later: dict[str, Any] = {"parameters": parameters, "t": t}
+        if self.delay:
+            state, later = self._predicted(state, parameters, t)
+        decision = self.safety_filter.filter(state, u_nominal, bounds=bounds, **later)
         self._line.exchange(self._components(decision.action))
         return decision
 
@@ -203,18 +214,25 @@ class DelayedFilter:
                 f" {self._batch}: call reset() before other plants are filtered"
             )
 
-    def _predicted(self, x: np.ndarray) -> np.ndarray:
+    def _predicted(
+        self, x: np.ndarray, parameters: Any, t: Any
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return the predicted states, and the values that a call of the filter takes there."""
+        batch = x.shape[:-1] if x.ndim > 1 else None
+        now = [*self._components(x), *self._given.values(parameters, t, batch)]
         under_way = self._line.under_way
-        if not under_way:
-            return x
-        if x.ndim == 1:
-            return np.array(self._prediction.of_one(x.tolist(), under_way))
-        found = self._prediction.of_batch(tuple(self._components(x)), under_way)
-        predicted = np.stack(found, axis=-1).reshape(x.shape)
-        if not np.isfinite(predicted).all():
-            i = np.argwhere(~np.isfinite(predicted))[0].tolist()
-            raise NumericalError(f"the model has no finite prediction from the state at {i[:-1]}")
-        return predicted
+        if batch is None:
+            found = self._prediction.of_one(now, under_way)
+        else:
+            found = self._prediction.of_batch(tuple(now), under_way)
+            lost = np.flatnonzero(~np.isfinite(found).all(axis=0))
+            if lost.size:
+                at = [int(i) for i in np.unravel_index(lost[0], batch)]
+                raise NumericalError(f"the model has no finite prediction from the state at {at}")
+        n, runtime = x.shape[-1], self.safety_filter.qp.runtime
+        values = {s: np.reshape(c, batch or ()) for s, c in zip(runtime, found[n:], strict=True)}
+        later = {"t": values.pop(TIME, None), "parameters": values or None}
+        return np.stack(found[:n], axis=-1).reshape(x.shape), later
 
     def _components(self, values: np.ndarray) -> Sequence[Any]:
         """Return components of arrays (..., k): floats of one, arrays (B,) of a batch."""
@@ -229,3 +247,25 @@ class DelayedFilter:
                 f"{what} = {given!r}; give {self.safety_filter.model.m} finite numbers"
             )
         return values.tolist()
+
+
+def _with_runtime_states(qp: FilterQP) -> ControlAffineSDE:
+    """Return a filter's model with what is given at each call as states, by their rates."""
+    model, m = qp.model, qp.model.m
+    if not qp.runtime:
+        return model
+    moving = {s: sp.Symbol(f"{s.name}_at_run_time", real=True) for s in qp.runtime}
+    rates = [sp.sympify(1 if s == TIME else model.signals[s]) for s in qp.runtime]
+
+    def below(matrix: Any, rows: Any) -> Any:
+        return sp.Matrix(matrix).col_join(rows).xreplace(moving)
+
+    count = len(rates)
+    return ControlAffineSDE(
+        states=(*model.states, *moving.values()),
+        inputs=model.inputs,
+        drift=below(model.drift, sp.Matrix(rates)),
+        input_matrix=below(model.input_matrix, sp.zeros(count, m)),
+        diffusion=below(model.diffusion, sp.zeros(count, sp.Matrix(model.diffusion).cols)),
+        parameters=model.parameters,
+    )

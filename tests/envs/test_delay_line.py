@@ -14,6 +14,7 @@ from safe_envs import ConfigurationError, SafeEnv, SafeVectorEnv
 from safe_envs.envs.array_batch import ArrayBatch
 from safe_envs.envs.delay_line import Actuators, DelayLine
 from safe_envs.errors import NotCompilableError
+from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
 from tests.envs.test_vector_env import assert_same, only_where_present, pair
 
@@ -130,6 +131,18 @@ def test_a_line_is_copied_with_what_is_under_way(remake):
     other = DelayLine(2, (0.0,))
     other.restore(line.snapshot())
     assert other.under_way == line.under_way
+
+
+@pytest.mark.parametrize("remake", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copied_env_goes_on_with_what_is_under_way(remake):
+    env = SafetyFilterWrapper(SafeEnv(problem_of(PENDULUM, delay=2)), "scbf")
+    env.reset(seed=0)
+    env.step([0.3])
+    again = remake(env)
+    for action in (0.5, -0.5, 0.1):
+        mine, other = again.step([action])[4], env.step([action])[4]
+        for key in ("executed_action", "safe_action", "barrier"):
+            np.testing.assert_array_equal(mine[key], other[key])
 
 
 def test_the_compiled_engine_leaves_delays_to_numpy():

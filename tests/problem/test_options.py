@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import get_type_hints
 
 import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.sweeps.cell import ENV_OPTIONS
-from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS, ProblemOptions
+from safe_envs.agents.sweeps.settings import sections
+from safe_envs.problem.options import (
+    OPTION_NAMES,
+    PARAMETER_GROUPS,
+    WHOLE_OPTIONS,
+    ProblemOptions,
+)
 from safe_envs.registry import make_problem
 
 READERS = {option.name: option.metadata["reader"] for option in fields(ProblemOptions)}
@@ -53,6 +60,14 @@ def test_texts_of_another_form_are_named(name, text, message):
 
 
 def test_every_option_can_be_varied_by_a_sweep():
+    kinds = get_type_hints(ProblemOptions)
+    assert {name for name, kind in kinds.items() if kind == int | None} == set(WHOLE_OPTIONS)
+    grid = {"delay": [0, 2], "model_delay": [0, 1], "substeps": [1], "slew_limit": [[-1, 1]]}
+    fixed = {"env": "Pendulum-v0", "filter": "scbf"}
+    _, found, _ = sections({"fixed": fixed, "grid": grid}, "a sweep")
+    assert repr(found) == repr(grid | {"slew_limit": [[-1.0, 1.0]]})
+    with pytest.raises(ConfigurationError, match=r"delay = -1; give a whole number from 0"):
+        sections({"fixed": fixed | {"delay": -1}}, "a sweep")
     assert {*ENV_OPTIONS, *PARAMETER_GROUPS} == {"system", *OPTION_NAMES}
 
 

@@ -52,7 +52,7 @@ def test_the_constraint_is_that_of_the_system_augmented_by_hand():
         parameters={k: 2.0},
     )
     pairs = [(Barrier(1 - x**2), *parse_conditions("hocbf:p=1,3,5", limited))]
-    hand = SafetyFilter(by_hand, pairs, bounds=[(-4.0, 6.0)])
+    hand = SafetyFilter(by_hand, pairs, bounds=(-4.0, 6.0))
     ours = SafetyFilter.for_problem(limited, "hocbf:p=1,3,5")
     # Where no bound of u is within reach of one period: -2 + .4 <= u <= 3 - .6.
     states = np.random.default_rng(0).uniform([-0.9, -1.0, -1.59], [0.9, 1.0, 2.39], (500, 3))
@@ -134,7 +134,8 @@ def test_what_else_follows():
     assert limited.inputs[0].unit == "rad/s/s"
     assert limited.frame is not None
     assert limited.frame.section[-1] == problem.inputs[0].symbol
-    assert limited.configured(noise=0.1, dt=problem.dt).rates == ((-5.0, 5.0),)
+    assert limited.configured(dt=problem.dt, box=limited.box) == limited
+    assert limited.configured(noise=0.1).rates == ((-5.0, 5.0),)
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0, 1.0])
     assert SafeEnv(given).reset(seed=0)[0][-1] == 1.0
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0])

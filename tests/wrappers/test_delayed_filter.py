@@ -13,6 +13,7 @@ from safe_envs import ControlAffineSDE
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import DelayedFilter, SafetyFilter
 from safe_envs.wrappers.conditions import HOCBF
 from safe_envs.wrappers.delayed_filter import Prediction
@@ -91,6 +92,41 @@ def test_a_batch_is_filtered_as_its_states_one_by_one():
     np.testing.assert_allclose(many.sent.reshape(6, 2, 2), [one.sent for one in ones], atol=1e-12)
 
 
+def test_signals_parameters_and_the_time_are_predicted_with_their_rates():
+    p, q, mass = sp.symbols("p q mass", real=True)
+    cart = ControlAffineSDE(
+        (x, y), (u,), [y, 0], [0, 1 / mass], [0, 0], {mass: 1.0}, signals={p: q, q: 0}
+    )
+    wall = p - x - sp.sin(TIME) / 5
+    prompt = SafetyFilter(cart, wall, "hocbf:p=2,8", bounds=(-5.0, 5.0), adjustable=("mass",))
+    late = DelayedFilter(prompt, 3, DT)
+    many = DelayedFilter(prompt, 3, DT)
+    heavy = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1 / mass], [0, 0], {mass: 2.0})
+    plant, state, line = Integrator(heavy, DT, 1, "floats"), (0.0, 1.0), [(0.0,)] * 3
+    due, binding = [], 0
+    for k in range(25):
+        t = k * DT
+        if k >= 3:
+            # What was decided three periods ago is what would be decided now.
+            given = {"p": 1.0 - 0.3 * t, "q": -0.3, "mass": 2.0}
+            now = prompt.filter(state, [2.0], bounds=(-4.0, 3.0), parameters=given, t=t)
+            np.testing.assert_allclose(due.pop(0), now.action, rtol=1e-9, atol=1e-9)
+            binding += bool(now.active.any())
+        given = {p: 1.0 - 0.3 * t, q: -0.3, mass: 2.0}
+        decision = late.filter(state, [2.0], bounds=(-4.0, 3.0), parameters=given, t=t)
+        batch = {key: np.full(2, value) for key, value in given.items()}
+        both = many.filter(
+            np.tile(state, (2, 1)), [[2.0]] * 2, bounds=(-4.0, 3.0), parameters=batch, t=t
+        )
+        np.testing.assert_allclose(both.action, [decision.action] * 2, rtol=1e-12, atol=1e-12)
+        due.append(decision.action)
+        line.append(tuple(decision.action.tolist()))
+        state = plant.step(state, line.pop(0), ())
+    assert binding > 3
+    with pytest.raises(ConfigurationError, match="signals p, q have no value"):
+        late.filter(state, [2.0], t=0.0)
+
+
 def test_the_prediction_is_the_mean_of_what_is_simulated():
     inputs = [(0.5, 1.0), (-1.0, 2.0), (1.0, 0.5)]
     expected = Prediction(NOISY, DT, 2).of_one((0.3, -0.2), inputs)
@@ -131,6 +167,18 @@ def test_a_prediction_outlives_its_compiled_functions(remake):
     assert remake(prediction).of_one((0.1, 0.2), inputs) == wanted
 
 
+@pytest.mark.parametrize("remake", [copy.deepcopy, lambda f: pickle.loads(pickle.dumps(f))])
+def test_a_copied_filter_goes_on_with_what_it_sent(remake):
+    late = DelayedFilter(plain_filter(), 2, DT)
+    state, proposed = np.array([0.4, 0.3]), np.array([0.9, 1.0])
+    late.filter(state, proposed)
+    again = remake(late)
+    for _ in range(3):
+        mine, other = again.filter(state, proposed), late.filter(state, proposed)
+        np.testing.assert_array_equal(mine.action, other.action)
+        np.testing.assert_array_equal(mine.barrier, other.barrier)
+
+
 def test_errors():
     safety_filter = plain_filter()
     for arguments, message in (
@@ -155,7 +203,7 @@ def test_errors():
         late.override([1.0])
     fast = ControlAffineSDE((x,), (u,), [x**3], [1], [0], {})
     blown = DelayedFilter(
-        SafetyFilter(fast, [(Barrier(1 - x**2), HOCBF((1.0,)))], bounds=[(-1.0, 1.0)]), 3, 1.0
+        SafetyFilter(fast, [(Barrier(1 - x**2), HOCBF((1.0,)))], bounds=(-1.0, 1.0)), 3, 1.0
     )
     with pytest.raises(NumericalError, match="no finite prediction"):
         blown.filter([1e60], [0.0])

@@ -11,7 +11,7 @@ from typing import Any, get_type_hints
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
-from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS, WHOLE_OPTIONS
 from safe_envs.registry import full_id
 
 ENV_OPTIONS = ("system", *(name for name in OPTION_NAMES if name not in PARAMETER_GROUPS))
@@ -27,7 +27,7 @@ EVALUATION_DEFAULTS: dict[str, Any] = {
 
 _SECTIONS = ("fixed", "grid", "cells")
 _KINDS = get_type_hints(EvaluationSpec) | {
-    "substeps": int,
+    **dict.fromkeys(WHOLE_OPTIONS, int),
     "policy": str,
     "best": bool,
     "closed_loop": bool,
@@ -167,7 +167,7 @@ def _value(name: str, value: Any, what: str) -> Any:
             )
         return value
     if _KINDS.get(name) is int:
-        require_whole(f"{what}: {name}", value, 0 if name == "seed" else 1)
+        require_whole(f"{what}: {name}", value, WHOLE_OPTIONS.get(name, int(name != "seed")))
         return value
     if isinstance(value, list):
         return [_value(name, entry, what) for entry in value]

@@ -58,11 +58,11 @@ class DelayMemory:
             instants: not used.
         """
         self._batch.restart(envs)
-        if envs is None:
+        if envs is None or len(envs) == 1:
             self._one.restart()
 
     def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
-        """Do nothing: an env whose state is set keeps the inputs that are under way.
+        """Do nothing: what is under way goes on, as in an env whose state is set.
 
         Args:
             x: not used.
