@@ -28,6 +28,9 @@ from safe_envs.wrappers.qp.row_span import RowSpan
 
 _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
+SURELY = 1e3
+"""A constraint violated by so many times its rounding surely has a slack: one that binds beside
+others with slacks may be violated by some."""
 _CORRECTIONS = 3
 """How often a point is found: from the second time on, this takes back the rounding of a long
 way."""
@@ -112,8 +115,8 @@ class FloatQP:
         """
         rows, at = working
         u, margin, allowed, span, outside = self._settle(working)
-        missed = [i for i, value in enumerate(margin) if not value >= -allowed[i]]
-        slacks = [i for i in missed if i in rows]
+        more = [i for i, value in enumerate(margin) if not value >= -allowed[i] and i not in rows]
+        slacks = [i for i in rows if not margin[i] >= -SURELY * allowed[i]]
         way = self._way(u)
         nothing = ROUNDING * max(max(way), -min(way))
         kept, presses = rows, None
@@ -144,9 +147,10 @@ class FloatQP:
                     rest -= pressure * normal[j]
                 if force * side < -doubt or not rest * side <= nothing:
                     changed[j] = 0
-        if settled and not changed and len(kept) == len(rows) and len(slacks) == len(missed):
+        # Where all can be met, what binds is to be met as exactly as the rest.
+        met = bool(slacks) or not [i for i in rows if not margin[i] >= -allowed[i]]
+        if settled and met and not (changed or more) and len(kept) == len(rows):
             return Point(u, margin, allowed, None)
-        more = [i for i in missed if i not in rows]
         return Point(
             u,
             margin,
