@@ -29,7 +29,7 @@ from safe_envs.wrappers.qp.row_span import RowSpan
 _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
 SURELY = 1e3
-"""A constraint violated by so many times its rounding surely has a slack: one that binds beside
+"""A constraint violated by so many times its rounding surely has a slack: one that binds next to
 others with slacks may be violated by some."""
 _CORRECTIONS = 3
 """How often a point is found: from the second time on, this takes back the rounding of a long
