@@ -24,7 +24,7 @@ from operator import mul
 from typing import NamedTuple
 
 from safe_envs.wrappers.qp.rounding import ROUNDING, Floats
-from safe_envs.wrappers.qp.row_span import RowSpan
+from safe_envs.wrappers.qp.row_span import LineSpan, RowSpan
 
 _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
@@ -172,7 +172,7 @@ class FloatQP:
         return margin, allowed
 
     def _presses(
-        self, working: WorkingSet, span: RowSpan | None, way: list[float]
+        self, working: WorkingSet, span: LineSpan | RowSpan | None, way: list[float]
     ) -> list[tuple[float, list[float]]]:
         """Return the pressures of the constraints that add up to a way, and their normals."""
         rows, at = working
@@ -183,7 +183,7 @@ class FloatQP:
 
     def _settle(
         self, working: WorkingSet
-    ) -> tuple[list[float], list[float], list[float], RowSpan | None, dict[int, int]]:
+    ) -> tuple[list[float], list[float], list[float], LineSpan | RowSpan | None, dict[int, int]]:
         """Return the inputs, margins, their rounding, and on which side inputs leave the bounds."""
         rows, at = working
         lengths, roots = self.lengths, self.roots
@@ -197,7 +197,9 @@ class FloatQP:
             normals = [self.normals[i] for i in rows]
             if len(free) < len(u):
                 normals = [[n[j] for j in free] for n in normals]
-            span = RowSpan(normals, [self.sizes[i] for i in rows])
+            span = (LineSpan if len(free) == 1 or len(rows) == 1 else RowSpan)(
+                normals, [self.sizes[i] for i in rows]
+            )
         margin, allowed = self.margins(u)
         if span:
             for _ in range(_CORRECTIONS):

@@ -4,6 +4,8 @@ least-violating and flagged where not."""
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -245,3 +247,28 @@ def test_a_constraint_that_moves_the_action_is_active_however_far_the_proposal()
     assert np.count_nonzero(missed & feasible) > 50
     assert active[missed].any(axis=1).all()
     assert np.all(margin[feasible] > -1e-12)
+
+
+_LATE = """
+import sys
+import numpy as np
+from safe_envs.wrappers.qp import dispatch
+for k, m in ((1, 2), (3, 1), (3, 2), (3, 4)):
+    for solver in dispatch.SOLVERS:
+        dispatch.prepare(k, m, solver)
+        known = set(sys.modules)
+        rng = np.random.default_rng(0)
+        for shift in (0.0, 5.0):
+            a, b, v = rng.normal(size=(k, m)), rng.normal(size=k) - shift, rng.normal(size=m)
+            ends = [-1.0] * m, [1.0] * m, [1.0] * m, [1.0] * k
+            dispatch.project_floats(a.tolist(), b.tolist(), v.tolist(), *ends, solver)
+            many = [np.full(20, c) for c in v]
+            dispatch.project_arrays(a.tolist(), b.tolist(), many, *ends, solver)
+        late = set(sys.modules) - known
+        assert not late, (k, m, solver, late)
+"""
+
+
+def test_nothing_is_imported_once_a_size_is_prepared():
+    run = subprocess.run([sys.executable, "-c", _LATE], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
