@@ -75,9 +75,11 @@ def nearest_of_least_violating(a, b, v, low, high, w, priority, near):
                 held[j] = -1
             elif float(high[j]) - near[j] <= close:
                 held[j] = 1
-        found = _proved(a, b, v, low, high, w, priority, missed, binding, held)
-        if found is not None:
-            return found
+        # Where more than enough binds, the search may find no way out of all of it.
+        for bound, at in ((binding, held), (set(), held), (binding, {}), (set(), {})):
+            found = _proved(a, b, v, low, high, w, priority, set(missed), set(bound), dict(at))
+            if found is not None:
+                return found
     return None
 
 

@@ -121,7 +121,7 @@ def several_constraints() -> dict[str, Case]:
         f"three constraints, two inputs, {NUM_ENVS} states": Case(
             lambda: in_plane.filter(states, inputs), NUM_ENVS
         ),
-        f"three constraints, four inputs (ProxQP), {NUM_ENVS} states": Case(
+        f"three constraints, four inputs, {NUM_ENVS} states": Case(
             lambda: limits.filter(flying, rotors), NUM_ENVS
         ),
     }

@@ -58,7 +58,7 @@ KNOWN_QPS = (
         feasible=False,
     ),
     KnownQP(
-        "ProxQP",
+        "three inputs",
         ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
         (1.0, 0.5),
         (2.0, 2.0, 2.0),
@@ -66,7 +66,7 @@ KNOWN_QPS = (
         (1.0, 0.5, 2.0),
     ),
     KnownQP(
-        "ProxQP, contradicting constraints",
+        "contradicting constraints, three inputs",
         ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0)),
         (-10.0, 1.0),
         (0.0, 0.0, 0.0),

@@ -5,9 +5,10 @@
 Where the constraints cannot be met together, the answer is the least-violating action, flagged: it
 minimises sum_i priority_i slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the
 minimisers it is the one nearest to v. One constraint, one input and two inputs have exact methods
-of their own, and so has a single constraint that binds; the rest goes to ProxQP, which is imported
-on first use. Constraints can be met where the action that is returned meets them by the tolerance
-of `safe_envs.wrappers.qp.rounding`.
+of their own. For the rest a solver proposes which constraints and bounds hold the answer, and their
+equations prove it; what that needs is imported by `prepare`, or on first use. Constraints can be
+met where the action that is returned meets them by the tolerance of
+`safe_envs.wrappers.qp.rounding`.
 """
 
 from __future__ import annotations
@@ -27,16 +28,23 @@ from safe_envs.wrappers.qp import (
 )
 from safe_envs.wrappers.qp.rounding import ArrayAnswer, Arrays, Entries, FloatAnswer, Floats, stack
 
+SOLVERS = ("daqp", "proxqp")
+"""What proposes the constraints and bounds that hold an answer. The answer is that of their
+equations, and so the same; ProxQP is slower, and there as a second opinion."""
 
-def prepare(k: int, m: int) -> None:
+
+def prepare(k: int, m: int, solver: str = "daqp") -> None:
     """Import what the QPs of a size need, so that no decision waits for it.
 
     Args:
         k: number of constraints.
         m: number of inputs.
+        solver: one of `SOLVERS`.
     """
     if k > 1 and m > 2:
         _general("general_batch")
+        if solver != "daqp":
+            _general(solver)
 
 
 @functools.cache
@@ -53,6 +61,7 @@ def project_floats(
     high: Floats,
     w: Floats,
     priority: Floats,
+    solver: str = "daqp",
 ) -> FloatAnswer:
     """Project the proposed input of one state.
 
@@ -64,6 +73,7 @@ def project_floats(
         high: m upper bounds.
         w: m positive weights.
         priority: k positive weights of the squared slacks.
+        solver: one of `SOLVERS`, for several constraints on three and more inputs.
 
     Returns:
         Inputs (m), margins a_i . u + b_i (k), constraints that bind or cannot be met (k; none where
@@ -77,11 +87,12 @@ def project_floats(
         found = plane.project_floats(a, b, v, low, high, w)
     elif len(v) == 1:
         found = interval.project_floats([ai for (ai,) in a], b, v[0], low[0], high[0])
-    else:
+    elif solver == "daqp":
         found = _general("general").project_floats(a, b, v, low, high, w, priority)
     if found:
         return found
-    *parts, feasible = project_arrays(a, b, [np.array([c]) for c in v], low, high, w, priority)
+    proposed = [np.array([c]) for c in v]
+    *parts, feasible = project_arrays(a, b, proposed, low, high, w, priority, solver)
     inputs, margins, binding = [[entry.item() for entry in part] for part in parts]
     return inputs, margins, binding, feasible.item()
 
@@ -95,6 +106,7 @@ def project_arrays(
     high: Entries,
     w: Entries,
     priority: Floats,
+    solver: str = "daqp",
 ) -> ArrayAnswer:
     """Project the proposed inputs of a batch of B states.
 
@@ -106,6 +118,7 @@ def project_arrays(
         high: m upper bounds, likewise.
         w: m positive weights, likewise.
         priority: k positive weights of the squared slacks.
+        solver: one of `SOLVERS`, for several constraints on three and more inputs.
 
     Returns:
         As `project_floats`, with an array (B,) for every number.
@@ -124,4 +137,4 @@ def project_arrays(
     size = len(v[0])
     table = np.array([stack(ai, size) for ai in a])
     stacked = [stack(part, size) for part in (b, v, low, high, w)]
-    return _general("general_batch").project_arrays(table, *stacked, np.array(priority))
+    return _general("general_batch").project_arrays(table, *stacked, np.array(priority), solver)

@@ -7,6 +7,9 @@ sizes differ by many orders of magnitude, are solved one by one.
 
 from __future__ import annotations
 
+import functools
+import importlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,6 +33,7 @@ def project_arrays(
     high: np.ndarray,
     w: np.ndarray,
     priority: np.ndarray,
+    solver: str,
 ) -> ArrayAnswer:
     """Project the proposed inputs of a batch.
 
@@ -41,6 +45,7 @@ def project_arrays(
         high: upper bounds, shape (m, B).
         w: positive weights, shape (m, B).
         priority: positive weights of the squared slacks, shape (k,).
+        solver: what proposes working sets; "daqp" for the fast methods.
 
     Returns:
         As `dispatch.project_arrays`.
@@ -54,11 +59,11 @@ def project_arrays(
     missed: Any = (margin < 0.0).any(axis=0)
     active, feasible = np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
     left = np.flatnonzero(missed)
-    for soft, firm in _SOFTNESS:
-        if left.size <= _FEW:
+    for propose in _methods(solver):
+        if left.size <= _FEW and solver == "daqp":
             break
         part = p if left.size == len(missed) else p.take(left)
-        found = find_points(part, *parametric.propose(part, soft, firm))
+        found = find_points(part, *propose(part))
         solved = left[found.proved]
         u[:, solved] = found.u[:, found.proved]
         margin[:, solved] = found.margin[:, found.proved]
@@ -73,3 +78,12 @@ def project_arrays(
     active = np.where(flat, unmet, active)
     margin = np.where(flat, b, margin)
     return list(u), list(margin), list(active), feasible
+
+
+def _methods(solver: str) -> list[Callable[[ArrayQP], tuple[np.ndarray, np.ndarray]]]:
+    """Return what proposes working sets, one after the other."""
+    if solver == "daqp":
+        return [
+            functools.partial(parametric.propose, soft=soft, firm=firm) for soft, firm in _SOFTNESS
+        ]
+    return [importlib.import_module("safe_envs.wrappers.qp.proxqp").propose]

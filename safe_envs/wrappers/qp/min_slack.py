@@ -23,8 +23,8 @@ from safe_envs.wrappers.qp.rounding import ROUNDING, total
 
 _STEPS = 20
 _SURELY = 100.0
-"""A constraint that is missed by so many times its rounding surely has a slack: one that binds may
-be missed by a few."""
+"""A constraint violated by so many times its rounding surely has a slack: one that binds may
+be violated by a few."""
 _FAR = 1e150
 """A line further off than this meets no box. How far does not matter, and its square would
 overflow."""

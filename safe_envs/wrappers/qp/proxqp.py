@@ -1,25 +1,22 @@
-"""Several constraints and input bounds: ProxQP for a batch, each answer checked and refined.
+"""Working sets that ProxQP, an augmented-Lagrangian solver in C++, proposes for a batch.
 
-ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends
-at the iteration limit. So the settings ask for the duality gap and cap the iterations. Of its
-answer only the constraints and bounds that hold it are taken: the minimiser is the point of these
-equations nearest to the proposal, if it meets all constraints, and if what holds it presses in the
-right direction. So its precision is that of these equations, not that of the solver. States without
-such a certificate, among them all with contradicting constraints, go to
-`safe_envs.wrappers.qp.active_set` one by one.
+A second opinion: its answers have the precision of its settings, so that of these only the
+constraints and bounds that hold them are taken. Its defaults return feasible points that are not
+the minimisers, and a QP with contradicting constraints ends at the iteration limit. So the settings
+ask for the duality gap and cap the iterations.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 # It lives in a prefix of its own.
 from proxsuite import proxqp  # pyright: ignore[reportMissingImports]
 
-from safe_envs.wrappers.qp import active_set
-from safe_envs.wrappers.qp.rounding import ROUNDING, tolerances, total
+from safe_envs.wrappers.qp.rounding import total
+from safe_envs.wrappers.qp.working_set_batch import ArrayQP
 
 _PRECISION = {
     "eps_abs": 1e-9,
@@ -38,138 +35,21 @@ _REACH = 10.0
 """The unit then, in ways to the violated constraints."""
 
 
-class Projection(NamedTuple):
-    """Inputs (B, m), margins and binding constraints (B, k), and whether all can be met (B,)."""
+def propose(p: ArrayQP) -> tuple[np.ndarray, np.ndarray]:
+    """Return the constraints (k, B) that count and the bounds (m, B) that hold the inputs.
 
-    u: np.ndarray
-    margin: np.ndarray
-    active: np.ndarray
-    feasible: np.ndarray
-
-
-def project(
-    a: np.ndarray,
-    b: np.ndarray,
-    v: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    w: np.ndarray,
-    priority: np.ndarray,
-) -> Projection:
-    """Project proposed inputs, which violate a constraint, onto k constraints a u + b >= 0.
+    Where the constraints contradict each other, they are of no use.
 
     Args:
-        a: constraints, shape (B, k, m).
-        b: offsets, shape (B, k).
-        v: proposed inputs, shape (B, m).
-        low: lower bounds, shape (B, m).
-        high: upper bounds, shape (B, m).
-        w: positive weights, shape (B, m).
-        priority: positive weights of the squared slacks, shape (k,).
-
-    Returns:
-        The inputs, and how they meet the constraints.
+        p: the QPs.
     """
-    problem = _Problem(a, b, v, low, high, w)
-    u, certain = np.empty_like(v), np.zeros(len(v), dtype=bool)
-    # ProxQP takes long to say that constraints cannot be met, and its answer is of no use then.
-    left = np.flatnonzero(~problem.contradictory())
-    if left.size:
-        part = _Problem(*[numbers[left] for numbers in problem])
-        u[left], certain[left] = part.certified(*_solve(_Scaled.of(part)))
-    for i in np.flatnonzero(~certain).tolist():
-        u[i] = active_set.project(a[i], b[i], v[i], low[i], high[i], w[i], priority)
-    u = problem.tidied(u)
-    margin, allowed = problem.margin(u), problem.tolerance(u)
-    return Projection(u, margin, margin <= allowed, (margin >= -allowed).all(axis=1))
-
-
-class _Problem(NamedTuple):
-    """The arguments of `project`, over the batch."""
-
-    a: np.ndarray
-    b: np.ndarray
-    v: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    w: np.ndarray
-
-    def margin(self, u: np.ndarray) -> Any:
-        """Values (B, k) of the constraints at inputs (B, m)."""
-        return _dot(self.a, u) + self.b
-
-    def tolerance(self, u: np.ndarray) -> Any:
-        """By how much the constraints may miss there (B, k)."""
-        return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
-
-    def contradictory(self) -> np.ndarray:
-        """Return where one or two constraints miss by more than rounding at every input (B,).
-
-        It finds opposite constraints, not every set of constraints that cannot be met.
-        """
-        with np.errstate(all="ignore"):
-            lengths = np.linalg.norm(self.a, axis=2)
-            lengths = np.where(lengths > np.finfo(float).tiny, lengths, 1.0)
-            a, b = self.a / lengths[:, :, None], self.b / lengths
-            low, high = self.low[:, None, :], self.high[:, None, :]
-            allowed = tolerances(
-                np.moveaxis(a, 2, 0), b, np.moveaxis(np.maximum(np.abs(low), np.abs(high)), 2, 0)
-            )
-            first, second = np.triu_indices(a.shape[1])
-            sums = a[:, first] + a[:, second]
-            most = b[:, first] + b[:, second] + np.maximum(sums * low, sums * high).sum(axis=2)
-            return (most < -2.0 * (allowed[:, first] + allowed[:, second])).any(axis=1)
-
-    def tidied(self, u: np.ndarray) -> np.ndarray:
-        """Return the inputs without the rounding that other inputs brought in.
-
-        An input on which no constraint depends keeps its proposal. One that is nothing but rounding
-        of the way from the proposal is 0, for a constraint of this input alone may ask for that.
-        """
-        roots, start = np.sqrt(self.w), np.clip(self.v, self.low, self.high)
-        way = (np.abs(u - self.v) * roots).max(axis=1, keepdims=True)
-        u = np.where(np.abs(u) <= ROUNDING * way / roots, np.clip(0.0, self.low, self.high), u)
-        return np.where((self.a == 0.0).all(axis=1), start, u)
-
-    def certified(
-        self, rows: np.ndarray, below: np.ndarray, above: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the minimisers (B, m) that some constraints (B, k) and bounds (B, m) hold.
-
-        Returns:
-            These, and where they are those of the whole problem (B,).
-        """
-        roots, held = np.sqrt(self.w), below | above
-        normals = self.a / roots[:, None, :]
-        lengths = np.abs(normals).max(axis=2)
-        lengths = np.where(lengths > 0.0, lengths, 1.0)
-        normals = normals / lengths[:, :, None]
-        working: Any = np.where(rows[:, :, None] & ~held[:, None, :], normals, 0.0)
-        usable = np.isfinite(working).all(axis=(1, 2))
-        inverse = np.linalg.pinv(np.where(usable[:, None, None], working, 0.0))
-        u = np.where(below, self.low, np.where(above, self.high, self.v))
-        # The second time takes back the rounding of a long way.
-        for _ in range(2):
-            u = u - _dot(inverse, np.where(rows, self.margin(u) / lengths, 0.0)) / roots
-        u = self.tidied(np.clip(u, self.low, self.high))
-        way = (u - self.v) * roots
-        pressures = _dot(np.swapaxes(inverse, 1, 2), np.where(held, 0.0, way))
-        rest = way - _dot(np.swapaxes(normals, 1, 2), np.where(rows, pressures, 0.0))
-        rest = np.where(below, np.minimum(rest, 0.0), np.where(above, np.maximum(rest, 0.0), rest))
-        nothing = ROUNDING * np.abs(way).max(axis=1)
-        pressed = (np.abs(rest).max(axis=1) <= nothing) & (pressures >= -nothing[:, None]).all(
-            axis=1
-        )
-        margin, allowed = self.margin(u), self.tolerance(u)
-        met = (margin >= -allowed) & (~rows | (margin <= allowed))
-        return u, usable & pressed & met.all(axis=1)
+    of_state = [np.moveaxis(part, -1, 0) for part in (p.a, p.b, p.v, p.low, p.high, p.roots**2)]
+    rows, below, above = _solve(_Scaled.of(*of_state))
+    return rows.T, np.where(below, -1.0, np.where(above, 1.0, 0.0)).T
 
 
 def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return products (B, k) of constraints (B, k, m) and inputs (B, m).
-
-    The order of summation does not depend on the batch.
-    """
+    """Return products (B, k) of constraints (B, k, m) and inputs (B, m)."""
     return total(np.moveaxis(a * u[:, None, :], 2, 0))
 
 
@@ -202,8 +82,15 @@ class _Scaled(NamedTuple):
     high: np.ndarray
 
     @classmethod
-    def of(cls, problem: _Problem) -> _Scaled:
-        a, b, v, low, high, w = problem
+    def of(
+        cls,
+        a: np.ndarray,
+        b: np.ndarray,
+        v: np.ndarray,
+        low: np.ndarray,
+        high: np.ndarray,
+        w: np.ndarray,
+    ) -> _Scaled:
         center, half = _units(a, b, v, low, high, w)
         rows = a * half[:, None, :]
         offsets = b + _dot(a, center)

@@ -47,6 +47,50 @@ def orthonormal(
     return basis, coordinates
 
 
+class LineSpan:
+    """The span of one vector, or of numbers; as `RowSpan`.
+
+    Args:
+        vectors: one vector of n entries, or several of one.
+        weights: roots of the weights of their squares.
+
+    Attributes:
+        dependent: whether there are several.
+    """
+
+    def __init__(self, vectors: Sequence[list[float]], weights: Floats) -> None:
+        self.dependent = len(vectors) > 1
+        numbers = [vector[0] for vector in vectors] if self.dependent else vectors[0]
+        pulls = numbers
+        if self.dependent:
+            largest = max(weights)
+            pulls = [n * (w / largest) ** 2 for n, w in zip(numbers, weights, strict=True)]
+        square = sum(map(mul, pulls, numbers))
+        self._inverse = [pull / square for pull in pulls] if any(numbers) else numbers
+
+    def step(self, products: Floats) -> list[float]:
+        """Return the shortest step (n) that has given products with the vectors.
+
+        Args:
+            products: one for each vector.
+        """
+        if self.dependent:
+            return [sum(map(mul, self._inverse, products))]
+        (product,) = products
+        return [product * part for part in self._inverse]
+
+    def pressures(self, way: Floats) -> list[float]:
+        """Return the least factors with which the vectors add up to the part of a way in the span.
+
+        Args:
+            way: n entries.
+        """
+        if self.dependent:
+            (length,) = way
+            return [length * part for part in self._inverse]
+        return [sum(map(mul, self._inverse, way))]
+
+
 class RowSpan:
     """The span of vectors.
 

@@ -24,10 +24,13 @@ from operator import mul
 from typing import NamedTuple
 
 from safe_envs.wrappers.qp.rounding import ROUNDING, Floats
-from safe_envs.wrappers.qp.row_span import RowSpan
+from safe_envs.wrappers.qp.row_span import LineSpan, RowSpan
 
 _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
+SURELY = 1e3
+"""A constraint violated by so many times its rounding surely has a slack: one that binds next to
+others with slacks may be violated by some."""
 _CORRECTIONS = 3
 """How often a point is found: from the second time on, this takes back the rounding of a long
 way."""
@@ -112,8 +115,8 @@ class FloatQP:
         """
         rows, at = working
         u, margin, allowed, span, outside = self._settle(working)
-        missed = [i for i, value in enumerate(margin) if not value >= -allowed[i]]
-        slacks = [i for i in missed if i in rows]
+        more = [i for i, value in enumerate(margin) if not value >= -allowed[i] and i not in rows]
+        slacks = [i for i in rows if not margin[i] >= -SURELY * allowed[i]]
         way = self._way(u)
         nothing = ROUNDING * max(max(way), -min(way))
         kept, presses = rows, None
@@ -144,9 +147,10 @@ class FloatQP:
                     rest -= pressure * normal[j]
                 if force * side < -doubt or not rest * side <= nothing:
                     changed[j] = 0
-        if settled and not changed and len(kept) == len(rows) and len(slacks) == len(missed):
+        # Where all can be met, what binds is to be met as exactly as the rest.
+        met = bool(slacks) or not [i for i in rows if not margin[i] >= -allowed[i]]
+        if settled and met and not (changed or more) and len(kept) == len(rows):
             return Point(u, margin, allowed, None)
-        more = [i for i in missed if i not in rows]
         return Point(
             u,
             margin,
@@ -168,7 +172,7 @@ class FloatQP:
         return margin, allowed
 
     def _presses(
-        self, working: WorkingSet, span: RowSpan | None, way: list[float]
+        self, working: WorkingSet, span: LineSpan | RowSpan | None, way: list[float]
     ) -> list[tuple[float, list[float]]]:
         """Return the pressures of the constraints that add up to a way, and their normals."""
         rows, at = working
@@ -179,7 +183,7 @@ class FloatQP:
 
     def _settle(
         self, working: WorkingSet
-    ) -> tuple[list[float], list[float], list[float], RowSpan | None, dict[int, int]]:
+    ) -> tuple[list[float], list[float], list[float], LineSpan | RowSpan | None, dict[int, int]]:
         """Return the inputs, margins, their rounding, and on which side inputs leave the bounds."""
         rows, at = working
         lengths, roots = self.lengths, self.roots
@@ -193,7 +197,9 @@ class FloatQP:
             normals = [self.normals[i] for i in rows]
             if len(free) < len(u):
                 normals = [[n[j] for j in free] for n in normals]
-            span = RowSpan(normals, [self.sizes[i] for i in rows])
+            span = (LineSpan if len(free) == 1 or len(rows) == 1 else RowSpan)(
+                normals, [self.sizes[i] for i in rows]
+            )
         margin, allowed = self.margins(u)
         if span:
             for _ in range(_CORRECTIONS):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp.rounding import ROUNDING, total
+from safe_envs.wrappers.qp.working_set import SURELY
 
 _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
@@ -128,10 +129,11 @@ def find_points(p: ArrayQP, rows: np.ndarray, at: np.ndarray) -> Points:
     way = (u - p.v) * p.roots
     margin, allowed = p.margins(u)
     pressures = fit.pressures(np.where(free, way, 0.0))
-    missed = margin < -allowed
+    missed = margin < -SURELY * allowed
     proved &= np.where(
         rows, missed | ((pressures >= -nothing) & (margin <= allowed)), margin >= -allowed
     ).all(axis=0)
+    proved &= missed.any(axis=0) | (margin >= -allowed).all(axis=0)
     parts = p.a * np.where(missed, -p.priority * margin, 0.0)[:, None]
     force, doubt = total(parts), _NOTHING * total(np.abs(parts))
     rest = way - total(p.normals * pressures[:, None])

@@ -1,16 +1,18 @@
-"""The dispatcher, and three and more inputs through ProxQP: exact where the rows can be met,
+"""The dispatcher, and three and more inputs: exact where the rows can be met,
 least-violating and flagged where not."""
 
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import scipy.optimize
 
 from safe_envs.wrappers.qp import proxqp
-from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
+from safe_envs.wrappers.qp.dispatch import SOLVERS, project_arrays, project_floats
 
 
 def active_set_oracle(a, b, v, low, high, w):
@@ -41,7 +43,7 @@ def random_batch(rng, size, k, m):
     return a, b, rng.normal(size=(size, m)) * 2, low, high, rng.uniform(0.5, 2.0, (size, m))
 
 
-def solve(a, b, v, low, high, w, priority=None):
+def solve(a, b, v, low, high, w, priority=None, solver="daqp"):
     rows = [[a[:, i, j] for j in range(a.shape[2])] for i in range(a.shape[1])]
     *parts, feasible = project_arrays(
         rows,
@@ -51,6 +53,7 @@ def solve(a, b, v, low, high, w, priority=None):
         list(high.T),
         list(w.T),
         priority or [1.0] * a.shape[1],
+        solver,
     )
     u, margin, active = [np.array(part).T for part in parts]
     assert np.all((u >= low) & (u <= high))
@@ -198,19 +201,41 @@ def test_flat_rows_of_many_inputs_are_exact():
 
 
 @pytest.mark.parametrize("gap", [1e-6, 1.0, 100.0])
-def test_rows_that_contradict_are_not_handed_to_the_general_solver(gap, monkeypatch):
-    monkeypatch.setattr(proxqp, "_solve", lambda _: pytest.fail("ProxQP was asked"))
+def test_opposite_constraints_share_what_is_missing(gap):
     # s >= gap and -2 s >= 2 gap for s = u_1 + u_2, with the priorities 1 and 3/4, beside an input
     # on which no row depends.
-    a, b = np.array([[[1.0, 1.0, 0.0], [-2.0, -2.0, 0.0]]]), np.array([[-gap, -2.0 * gap]])
-    ends = np.full((1, 3), 1000.0)
-    u, margin, _, feasible = proxqp.project(
-        a, b, np.array([[0.0, 0.0, 5.0]]), -ends, ends, np.ones((1, 3)), np.array([1.0, 0.75])
+    rows, offsets = [[1.0, 1.0, 0.0], [-2.0, -2.0, 0.0]], [-gap, -2.0 * gap]
+    ends = [-1000.0] * 3, [1000.0] * 3
+    u, margin, _, feasible = project_floats(
+        rows, offsets, [0.0, 0.0, 5.0], *ends, [1.0] * 3, [1.0, 0.75]
     )
     # The sum (gap - s)^2 + 3 (gap + s)^2 is least at s = -gap/2.
-    np.testing.assert_allclose(u, [[-gap / 4, -gap / 4, 5.0]], rtol=1e-12)
-    np.testing.assert_allclose(margin, [[-1.5 * gap, -gap]], rtol=1e-12)
-    assert not feasible.any()
+    np.testing.assert_allclose(u, [-gap / 4, -gap / 4, 5.0], rtol=1e-12)
+    np.testing.assert_allclose(margin, [-1.5 * gap, -gap], rtol=1e-12)
+    assert not feasible
+
+
+@pytest.mark.parametrize(("k", "m"), [(2, 3), (3, 4), (6, 4)])
+def test_proxqp_is_of_the_same_opinion(k, m, monkeypatch):
+    problem = random_batch(np.random.default_rng(k), 60, k, m)
+    proposals = []
+    propose = proxqp.propose
+
+    def counted(qps):
+        proposals.append(qps.b.shape[1])
+        return propose(qps)
+
+    monkeypatch.setattr(proxqp, "propose", counted)
+    fast, slow = [solve(*problem, solver=solver) for solver in SOLVERS]
+    for one, other in zip(fast[:2], slow[:2], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
+    for one, other in zip(fast[2:], slow[2:], strict=True):
+        np.testing.assert_array_equal(one, other)
+    single = floats(*[part[0] for part in problem])
+    found = project_floats(*single, [1.0] * k, "proxqp")
+    np.testing.assert_allclose(found[0], fast[0][0], rtol=1e-11, atol=1e-11)
+    assert len(proposals) == 2
+    assert proposals[0] > 10
 
 
 def test_a_constraint_that_moves_the_action_is_active_however_far_the_proposal():
@@ -222,3 +247,28 @@ def test_a_constraint_that_moves_the_action_is_active_however_far_the_proposal()
     assert np.count_nonzero(missed & feasible) > 50
     assert active[missed].any(axis=1).all()
     assert np.all(margin[feasible] > -1e-12)
+
+
+_LATE = """
+import sys
+import numpy as np
+from safe_envs.wrappers.qp import dispatch
+for k, m in ((1, 2), (3, 1), (3, 2), (3, 4)):
+    for solver in dispatch.SOLVERS:
+        dispatch.prepare(k, m, solver)
+        known = set(sys.modules)
+        rng = np.random.default_rng(0)
+        for shift in (0.0, 5.0):
+            a, b, v = rng.normal(size=(k, m)), rng.normal(size=k) - shift, rng.normal(size=m)
+            ends = [-1.0] * m, [1.0] * m, [1.0] * m, [1.0] * k
+            dispatch.project_floats(a.tolist(), b.tolist(), v.tolist(), *ends, solver)
+            many = [np.full(20, c) for c in v]
+            dispatch.project_arrays(a.tolist(), b.tolist(), many, *ends, solver)
+        late = set(sys.modules) - known
+        assert not late, (k, m, solver, late)
+"""
+
+
+def test_nothing_is_imported_once_a_size_is_prepared():
+    run = subprocess.run([sys.executable, "-c", _LATE], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr

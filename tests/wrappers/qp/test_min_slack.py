@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs.wrappers.qp import proxqp
 from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
 from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
+from safe_envs.wrappers.qp.working_set import FloatQP, WorkingSet
+from safe_envs.wrappers.qp.working_set_batch import ArrayQP, find_points
 from tests.oracles.rational_oracle import nearest_of_least_violating
 
 KINDS = ["plain", "flat", "integers", "parallel", "sides", "sizes", "far", "weights", "endless"]
@@ -217,18 +218,21 @@ def test_a_wrong_guess_of_what_binds_gets_no_certificate():
     # u_1 >= .5 and u_2 >= -.5 from the origin: the first row binds, the second does not, and no
     # input is held.
     a, b = np.array([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]), np.array([[-0.5, 0.5]])
-    problem = proxqp._Problem(
-        a, b, np.zeros((1, 3)), -np.ones((1, 3)), np.ones((1, 3)), np.ones((1, 3))
+    ends, ones = (-np.ones((3, 1)), np.ones((3, 1))), np.ones((3, 1))
+    qps = ArrayQP.of(a.transpose(1, 2, 0), b.T, 0.0 * ones, *ends, ones, np.ones((2, 1)))
+    qp = FloatQP(
+        a[0].tolist(), b[0].tolist(), [0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 2
     )
-    nothing = np.zeros((1, 3), dtype=bool)
     guesses = ([True, False], -1), ([True, True], -1), ([False, False], -1), ([True, False], 1)
     for (rows, held), certain in zip(guesses, (True, False, False, False), strict=True):
-        bound = nothing.copy()
-        bound[0, held] = held >= 0
-        for below, above in ((bound, nothing), (nothing, bound)):
-            u, found = problem.certified(np.array([rows]), below, above)
-            assert found.tolist() == [certain]
-        assert not certain or u[0].tolist() == [0.5, 0.0, 0.0]
+        for side in (-1, 1) if held >= 0 else (0,):
+            at = [side if j == held else 0 for j in range(3)]
+            found = find_points(qps, np.array([rows]).T, np.array([at]).T)
+            assert found.proved.tolist() == [certain]
+            one = qp.point(WorkingSet([i for i, counts in enumerate(rows) if counts], at))
+            assert (one.change is None) is certain
+            if certain:
+                assert found.u[:, 0].tolist() == one.u == [0.5, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("steep", [1e3, 1e6, 1e9])
@@ -458,3 +462,16 @@ def test_a_proposal_of_1e16_drowns_no_row():
             assert feasible
             assert -ROUNDING <= margin[0] <= 1e-12
             np.testing.assert_allclose(u, [-0.5, 1.0, *rest], atol=1e-12)
+
+
+def test_a_row_that_binds_beside_slacks_by_rounding_does_not_fix_two_inputs():
+    # Among twelve rows, most of them parallel, one that binds is violated by some of its rounding.
+    rng = np.random.default_rng([KINDS.index("parallel"), 2, 12, 1, 77])
+    problems, priority = (
+        random_batch(rng, 8, 12, 2, "parallel", 1.8),
+        10.0 ** rng.uniform(-1, 1, 12),
+    )
+    u, _, _, feasible = solve(*problems, priority)
+    error, wrong = off([part[5] for part in problems], priority, u[5], feasible[5])
+    assert error < 1e-9
+    assert not wrong

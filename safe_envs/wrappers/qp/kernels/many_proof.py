@@ -1,4 +1,4 @@
-"""What proves that constraints and bounds hold a minimiser; see `safe_envs.wrappers.qp.proxqp`."""
+"""What proves that constraints and bounds hold a minimiser."""
 
 from __future__ import annotations
 

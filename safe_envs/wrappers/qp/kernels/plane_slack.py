@@ -29,7 +29,7 @@ ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
 NEWTON_STEPS = 20
 SURELY_MISSED = 100.0
-"""That many times its rounding: one that binds may be missed by a few, and has no slack."""
+"""That many times its rounding: one that binds may be violated by a few, and has no slack."""
 FARTHEST_LINE = 1e150
 """A line further off than this meets no box. How far does not matter, and its square would
 overflow."""

@@ -1,4 +1,4 @@
-"""`safe_envs.wrappers.qp.single_active_constraint` for one state.
+"""Several constraints of which a single one binds: its closed form, where the others allow it.
 
 A constraint that says nothing of the input is met or not whatever the input is, and has no part in
 what follows. Where the minimiser under one of the others alone meets them all, it is that under all

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import single_active_constraint
 from safe_envs.wrappers.qp.kernels import single_active as kernel
 from tests.oracles.kernel_problems import KINDS, Problems, random_problems, reference, solve
 
@@ -34,24 +33,3 @@ def test_says_what_the_dispatcher_does_where_it_can(k, m, kind):
     sizes = (np.abs(problems.a) @ np.abs(found.u)[:, :, None])[chosen, :, 0]
     sizes += np.abs(problems.b[chosen])
     assert np.all(np.abs(found.margin[chosen] - expected.margin) <= relative * sizes)
-
-
-def test_solves_all_that_the_batch_does():
-    for kind in ("plain", "flat", "integers"):
-        problems = random_problems(np.random.default_rng(3), 100, 3, 3, kind)
-        a, b, v, low, high, w, _ = problems
-        rows = list(a.transpose(1, 2, 0).copy())
-        flat = (a == 0.0).all(axis=2)
-        _, left = single_active_constraint.project_arrays(
-            rows, np.where(flat, np.maximum(b, 0.0), b).T.copy(), v.T, low.T, high.T, list(w.T)
-        )
-        buffers = np.empty(3), np.empty(3), np.empty(3)
-        work = np.full(kernel.work_of_single_active(3, 3), np.nan)
-        solved = [
-            kernel.project_single_active(
-                *[part[i] for part in problems[:6]], problems.priority, *buffers, work
-            )[0]
-            for i in range(100)
-        ]
-        assert np.flatnonzero(np.logical_not(solved)).tolist() == left.tolist()
-        assert left.size > 5
