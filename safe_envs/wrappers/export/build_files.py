@@ -124,8 +124,9 @@ cmake -B build && cmake --build build && ctest --test-dir build
 or `cc -std=c99 -O2 -ffp-contract=off filter.c selftest.c -lm && ./a.out`.
 
 Never use `-ffast-math`: then NaN goes unnoticed and rounding decides flags; `filter.c` refuses to
-be compiled with it. Keep `-ffp-contract=off`: fused products round otherwise than Python does. The
-golden cases of `selftest.c` are decisions of the filter in Python.
+be compiled with it. Keep `-ffp-contract=off`: fused products round otherwise than Python does. Do
+not let the processor flush small numbers to zero. The golden cases of `selftest.c` are decisions of
+the filter in Python.
 """
 
 
