@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 import importlib
 import inspect
 import math
@@ -30,6 +31,34 @@ class _Module(NamedTuple):
     functions: dict[str, ast.FunctionDef]
     constants: dict[str, ast.stmt]
     imports: dict[str, tuple[str, str]]
+
+
+class Definitions(NamedTuple):
+    """What a program consists of, as the kernel modules state it.
+
+    Attributes:
+        functions: by name, with docstrings and annotations.
+        constants: assignments of numbers by name.
+    """
+
+    functions: dict[str, ast.FunctionDef]
+    constants: dict[str, ast.stmt]
+
+
+def definitions(entries: Sequence[Callable[..., Any]], generated: Source) -> Definitions:
+    """Return entry points and all that they call; see `linked`.
+
+    Args:
+        entries: functions of kernel modules.
+        generated: functions of this program alone.
+
+    Raises:
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
+    """
+    link = _Link(generated)
+    for function in (*entries, *generated.uses):
+        link.need(function.__module__, function.__name__)
+    return link.definitions()
 
 
 def linked(entries: Sequence[Callable[..., Any]], generated: Source) -> str:
@@ -98,21 +127,24 @@ class _Link:
                 )
             return
         self._found[name] = module, node
-        for each in _names(node):
+        for each in _names(_bare(node) if isinstance(node, ast.FunctionDef) else node):
             self.need(module, each)
+
+    def definitions(self) -> Definitions:
+        """Return what was found."""
+        found = {name: node for name, (_, node) in self._found.items()}
+        functions = {n: d for n, d in found.items() if isinstance(d, ast.FunctionDef)}
+        constants = {n: d for n, d in found.items() if not isinstance(d, ast.FunctionDef)}
+        return Definitions(functions | self._generated, constants)
 
     def text(self, entries: set[str]) -> str:
         """Return the module."""
+        functions, constants = self.definitions()
         parts = [f"from math import {', '.join(sorted(self._math))}"] * bool(self._math)
-        constants = {
-            n: d for n, (_, d) in self._found.items() if not isinstance(d, ast.FunctionDef)
-        }
         parts += [ast.unparse(constants[name]) for name in sorted(constants)]
-        functions = {n: d for n, (_, d) in self._found.items() if isinstance(d, ast.FunctionDef)}
-        functions |= self._generated
         for name, node in sorted(functions.items()):
             mark = "entry" if name in entries else "kernel"
-            parts.append(f"@{mark}\n{ast.unparse(node)}\n")
+            parts.append(f"@{mark}\n{ast.unparse(_bare(node))}\n")
         return "\n".join(parts)
 
 
@@ -122,12 +154,12 @@ def _names(node: ast.AST) -> set[str]:
 
 @lru_cache(maxsize=64)
 def _parsed(module: str) -> _Module:
-    """Read a kernel module, without docstrings and annotations."""
+    """Read a kernel module."""
     found: ModuleType = importlib.import_module(module)
     known = _Module({}, {}, {})
     for node in ast.parse(inspect.getsource(found)).body:
         if isinstance(node, ast.FunctionDef):
-            known.functions[node.name] = _bare(node)
+            known.functions[node.name] = node
         elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
             known.constants[node.targets[0].id] = node
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -136,9 +168,11 @@ def _parsed(module: str) -> _Module:
 
 
 def _bare(node: ast.FunctionDef) -> ast.FunctionDef:
-    node.returns = None
-    for argument in node.args.args:
+    """Return a function without docstring and annotations."""
+    bare = copy.deepcopy(node)
+    bare.returns = None
+    for argument in bare.args.args:
         argument.annotation = None
-    if ast.get_docstring(node) is not None:
-        node.body = node.body[1:] or [ast.Pass()]
-    return node
+    if ast.get_docstring(bare) is not None:
+        bare.body = bare.body[1:] or [ast.Pass()]
+    return bare

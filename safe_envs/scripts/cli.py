@@ -9,6 +9,7 @@ from safe_envs.scripts.check import check
 from safe_envs.scripts.demo import demo
 from safe_envs.scripts.doctor import doctor
 from safe_envs.scripts.evaluate import evaluate
+from safe_envs.scripts.export import export
 from safe_envs.scripts.frontier import frontier
 from safe_envs.scripts.identify import identify
 from safe_envs.scripts.leaderboard import leaderboard
@@ -32,6 +33,7 @@ app = make_app(
         "certify": certify,
         "check": check,
         "frontier": frontier,
+        "export": export,
         "render": render,
         "reproduce": reproduce,
         "sweep": sweep,

@@ -40,6 +40,8 @@ class ArrayDecision:
         NotCompilableError: Learned terms have no compiled form.
     """
 
+    parameters = "x, u, data, work"
+
     def __init__(self, qp: FilterQP, data: Data) -> None:
         self._qp = qp
         self._k, self._m, self._goal = len(qp.constraints), qp.model.m, int(qp.clf is not None)
@@ -52,6 +54,7 @@ class ArrayDecision:
             self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
         self._values, self._body = Values(qp, data), Body(data)
+        self._planes = self._values.solver.planes
         self._single = self._k == 1 and qp.plain
         width = self._m + 1
         self._a = [[f"values[{i * width + j}]" for j in range(self._m)] for i in range(self._k)]
@@ -83,16 +86,25 @@ class ArrayDecision:
             self._minimise()
         self._leave_domains()
         self._answer()
-        return self._values.source + body.source()
+        return self._values.source + body.source(self.parameters)
 
     def _bounds(self) -> None:
         """Write the constants of the QP."""
-        qp, goal, weights = self._qp, self._goal, self._values.solver.weights
-        self._body.constants("low", [*qp.low, 0.0][: self._m + goal])
+        goal, weights = self._goal, self._values.solver.weights
+        self._input_bounds()
         self._body.constants("w", [*weights, weights[0]][: self._m + goal])
-        self._body.constants("priority", [*qp.priorities, 1.0][: self._k + goal])
-        if not goal:
-            self._body.constants("high", qp.high)
+        self._body.constants("priority", [*self._qp.priorities, 1.0][: self._k + goal])
+
+    def _input_bounds(self) -> None:
+        """Write the bounds of the inputs; the upper ones of a goal are written with it."""
+        self._body.constants("low", [*self._qp.low, 0.0][: self._m + self._goal])
+        if not self._goal:
+            self._body.constants("high", self._qp.high)
+
+    def _ends(self) -> tuple[list[str], list[str]]:
+        """Return the texts of the lower and of the upper bounds of the inputs."""
+        low, high = (list(map(self._body.number, ends)) for ends in (self._qp.low, self._qp.high))
+        return low, high
 
     def _wish(self) -> None:
         """Write what the constraints change: the given input, or the best one of the goal."""
@@ -102,7 +114,7 @@ class ArrayDecision:
             if self._reciprocal:
                 body.vector("aim", [f"u[{j}]" for j in range(m)])
             return
-        low, high = [list(map(body.number, bounds)) for bounds in (self._qp.low, self._qp.high)]
+        low, high = self._ends()
         unit = body.number(self._values.solver.goal_unit)
         growth, along = f"values[{goal}]", [f"values[{goal + 1 + j}]" for j in range(m)]
         self._finite.append(" + ".join([growth, *along]))
@@ -184,9 +196,8 @@ class ArrayDecision:
         self._finite.append(" + ".join(form))
         if self._second_order:
             return
-        planes = self._values.solver.planes
-        if i in planes:
-            slopes, constant = planes[i]
+        if i in self._planes:
+            slopes, constant = self._planes[i]
             slopes, constant = [body.number(s) for s in slopes], body.number(constant)
         else:
             entry = dict(zip(_pairs(m), form, strict=True))
@@ -229,11 +240,9 @@ class ArrayDecision:
         """Write how far the constraints fall while the input is held."""
         qp, body = self._qp, self._body
         dt = body.number(qp.dt)
-        held = "".join(f"action[{j}], " for j in range(self._m))
+        held = f"({''.join(f'action[{j}], ' for j in range(self._m))})"
         for i in self._sampled:
-            change = self._values.call(
-                f"filter_change_{i}", [qp.constraints[i].change], f"({held})"
-            )
+            change = self._values.call(f"filter_change_{i}", [qp.constraints[i].change], held)
             fall = f"asked[{i}] -= {dt} * max(-{change}[0], 0.0)"
             body.add(f"if inside[{i}] > 0.0:\n        {fall}" if i in self._reciprocal else fall)
 

@@ -85,10 +85,14 @@ class Body:
         self._work = 0
         self.uses: list[Callable[..., Any]] = []
 
-    def source(self) -> Source:
-        """Return the function."""
+    def source(self, parameters: str) -> Source:
+        """Return the function.
+
+        Args:
+            parameters: their names, with commas.
+        """
         text = "".join(f"    {line}\n" for line in self._lines)
-        return Source(f"def decide(x, u, data, work):\n{text}", tuple(self.uses), self._work)
+        return Source(f"def decide({parameters}):\n{text}", tuple(self.uses), self._work)
 
     def add(self, *lines: str) -> None:
         """Append statements."""

@@ -49,4 +49,4 @@ def _scalar_decision(qp: FilterQP, data: Data) -> Source:
         "return (action,), u, active, feasible, (slack,), 0, isfinite(margin)",
     )
     body.uses.append(project_scalar)
-    return values.source + body.source()
+    return values.source + body.source(ArrayDecision.parameters)

@@ -6,6 +6,9 @@ from math import sqrt
 
 import numpy as np
 
+NO_WIDTH = 1e-300
+"""A distance that can divide."""
+
 
 def work_of_majorant(m: int) -> int:
     """Return the length of the scratch array of `majorant_plane`: the corners of the bounds.
@@ -44,7 +47,8 @@ def majorant_plane(
         rise = 0.0
         for c in range(corners):
             rise += work[c] if c >> j & 1 else -work[c]
-        slopes[j] = rise / (0.5 * corners * (high[j] - low[j]))
+        # An input that is held, its two bounds being equal, has two equal faces and no slope.
+        slopes[j] = rise / (0.5 * corners * max(high[j] - low[j], NO_WIDTH))
     above = 0.0
     for c in range(corners):
         plane = 0.0

@@ -193,10 +193,14 @@ def approach_least_violating(  # noqa: PLR0913
             if a[i, j] != 0.0:
                 way[j] = (v[j] - u[j]) * roots[j]
     approach_proposal(normals, spare, way, ends, rows, at, room)
+    moves = False
     for j in range(m):
+        moves = moves or room[j] != 0.0
         moved = start[j] + room[j] / roots[j]
         u[j] = low[j] if at[j] < 0.0 else high[j] if at[j] > 0.0 else moved
-    settle_on_rows(a, offsets, roots, normals, unit, rows, at, u, room)
+    # Where there is no way to go, constraints that are nearly parallel would only add rounding.
+    if moves:
+        settle_on_rows(a, offsets, roots, normals, unit, rows, at, u, room)
     astray = False
     for j in range(m):
         u[j] = min(max(u[j], low[j]), high[j])

@@ -51,7 +51,8 @@ def check(problems, kind):
     other = (found.active != expected.active).any(axis=1)
     other = (other | (found.feasible != expected.feasible)) & near
     assert not (other & ~doubtful).any()
-    assert other.sum() <= (1 + count // 50 if kind == "touching" else 0)
+    # So it does where slopes are sixteen decades apart.
+    assert other.sum() <= (1 + count // 50 if kind in ("touching", "sizes") else 0)
     assert np.all(np.abs(found.margin - values(problems, found.u)) <= 1e-14 * terms)
 
 

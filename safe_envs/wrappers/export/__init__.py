@@ -1,0 +1,6 @@
+"""A filter as C99 for somebody's control loop, and its comparison with the filter in Python."""
+
+from safe_envs.wrappers.export.comparison import CComparison, compare
+from safe_envs.wrappers.export.export import ExportOptions, export_filter
+
+__all__ = ["CComparison", "ExportOptions", "compare", "export_filter"]
