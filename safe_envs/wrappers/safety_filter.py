@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 import sympy as sp
@@ -90,7 +90,9 @@ class SafetyFilter(ComponentFilter):
         dt: float | None = None,
         clf: CLF | None = None,
         adjustable: Sequence[str | sp.Symbol] = (),
+        **unknown: Never,
     ) -> None:
+        arguments.refuse_unknown(unknown, SafetyFilter.__init__)
         self.model = arguments.require_system(system)
         known = arguments.with_adjustable(system, adjustable)
         self.pairs = arguments.read_pairs(known, barriers, conditions)
