@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import sympy as sp
@@ -14,6 +14,11 @@ from safe_envs.number_text import finite_number
 TIME = sp.Symbol("t", nonnegative=True)
 """Time since the start of the episode or of the control loop, in s. No state or input, which may
 have any sign, is the same symbol, even if its name is t."""
+
+MOST_TERMS = 1000
+"""Of a sum or product over an index, which is written out term by term."""
+
+_INDEXED = (sp.Sum, sp.Product)
 
 _REAL = sp.Symbol("real", real=True).assumptions0
 
@@ -32,10 +37,11 @@ def formula(what: str, given: Any) -> sp.Expr:
         given: of SymPy, or a number.
 
     Raises:
-        SystemDefinitionError: it is a text, a function, an inequality or something else.
+        SystemDefinitionError: it is a text, a function, an inequality or something else, or see
+            `written_out`.
     """
     if isinstance(given, sp.Expr):
-        return given
+        return written_out(what, given)
     if isinstance(given, sp.logic.boolalg.Boolean):
         raise SystemDefinitionError(
             f"{what} is {given}, which is true or false; give the expression itself, 1 - x**2 for 1"
@@ -79,8 +85,76 @@ def read_matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Im
         )
     # To sympy 0.0 is not 0, and a channel of such entries would count as noise.
     return sp.ImmutableMatrix(
-        matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry)
+        matrix.applyfunc(
+            lambda entry: (
+                sp.Integer(0) if entry.is_Float and entry.is_zero else written_out(name, entry)
+            )
+        )
     )
+
+
+def written_out(what: str, expression: Any) -> Any:
+    """Return an expression whose sums and products over an index are written out, term by term.
+
+    The index is no quantity: code for one of its terms would not know it.
+
+    Args:
+        what: name of the argument, for errors.
+        expression: of symbols and such sums.
+
+    Raises:
+        SystemDefinitionError: An index does not run over whole numbers, `MOST_TERMS` at most.
+    """
+    if not expression.has(*_INDEXED):
+        return expression
+    if not isinstance(expression, _INDEXED):
+        return expression.func(*[written_out(what, part) for part in expression.args])
+    *inner, (index, *ends) = expression.limits  # the last one is the outermost
+    low, high = ends if len(ends) == 2 else (None, None)
+    if not (isinstance(low, sp.Integer) and isinstance(high, sp.Integer)) or not (
+        0 <= high - low < MOST_TERMS
+    ):
+        raise SystemDefinitionError(
+            f"{what} holds {expression}, which cannot be written out; let the index run over whole"
+            f" numbers, the lower one first, and at most {MOST_TERMS} of them"
+        )
+    rest = expression.func(expression.function, *inner) if inner else expression.function
+    terms: list[Any] = [rest.subs(index, k) for k in range(int(low), int(high) + 1)]
+    found = sp.Add(*terms) if isinstance(expression, sp.Sum) else sp.Mul(*terms)
+    return written_out(what, found)
+
+
+def require_mappings(parameters: Any, signals: Any) -> None:
+    """Raise SystemDefinitionError unless values of parameters and rates of signals are dicts.
+
+    Args:
+        parameters: as users give them.
+        signals: likewise.
+    """
+    for name, given, entry in (("parameters", parameters, "value"), ("signals", signals, "rate")):
+        if not isinstance(given, Mapping):
+            raise SystemDefinitionError(
+                f"{name} = {shown(given)}; give a dict, {name}={{symbol: {entry}}}"
+            )
+
+
+def signal_rate(signal: sp.Symbol, given: Any) -> sp.Expr:
+    """Return the rate of a signal as an expression.
+
+    Args:
+        signal: of which it is.
+        given: of SymPy, or a number.
+
+    Raises:
+        SystemDefinitionError: it is no expression, or not finite.
+    """
+    found = formula(f"the rate of {signal}", given)
+    if found.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+        raise SystemDefinitionError(
+            f"the rate of the signal {signal} is {found}; give a finite expression, 0 for a"
+            " quantity that does not change by itself"
+        )
+    return found
 
 
 def declared_sign(symbol: sp.Symbol) -> str | None:

@@ -13,9 +13,10 @@ from safe_envs.dynamics.declarations import (
     TIME,
     advice_on_unknown,
     fitting,
-    formula,
     read_matrix,
+    require_mappings,
     require_real,
+    signal_rate,
 )
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
@@ -65,6 +66,7 @@ class ControlAffineSDE:
     signals: Mapping[sp.Symbol, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require_mappings(self.parameters, self.signals)
         require_real(self.states, self.inputs, self.parameters, self.signals)
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
@@ -78,7 +80,7 @@ class ControlAffineSDE:
             "input_matrix": read_matrix("input_matrix", self.input_matrix, (n, m)),
             "diffusion": read_matrix("diffusion", self.diffusion, (n, None)),
             "parameters": {p: fitting(p, v) for p, v in self.parameters.items()},
-            "signals": {s: formula(f"the rate of {s}", r) for s, r in self.signals.items()},
+            "signals": {s: signal_rate(s, r) for s, r in self.signals.items()},
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -114,7 +116,9 @@ class ControlAffineSDE:
             raise SystemDefinitionError(
                 f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty"
             )
-        require_real(states, inputs, parameters or {}, signals or {})
+        parameters, signals = parameters or {}, signals or {}
+        require_mappings(parameters, signals)
+        require_real(states, inputs, parameters, signals)
         column = read_matrix("rate", rate, (len(states), 1))
         used = set(inputs)
         effect = column.jacobian(list(inputs)).applyfunc(
@@ -141,15 +145,8 @@ class ControlAffineSDE:
                     f"the rate of {state} is not affine in the inputs: next to f + g u there is"
                     f" {entry}. Give f and g themselves where a system has several pieces"
                 )
-        return cls(
-            tuple(states),
-            tuple(inputs),
-            drift,
-            effect,
-            [[0]] * len(states) if diffusion is None else diffusion,
-            parameters or {},
-            signals or {},
-        )
+        noise = [[0]] * len(states) if diffusion is None else diffusion
+        return cls(tuple(states), tuple(inputs), drift, effect, noise, parameters, signals)
 
     def __hash__(self) -> int:
         return hash(

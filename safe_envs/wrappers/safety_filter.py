@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 import sympy as sp
@@ -31,8 +31,9 @@ class SafetyFilter(ComponentFilter):
     more than the rounding of its terms; see `safe_envs.wrappers.qp.rounding`.
 
     One constraint has a closed form for any number of inputs, and any number of constraints an
-    exact solution for one and two inputs. Others go to ProxQP and an active-set method, whose
-    answers are right to rounding for coefficients up to a million apart.
+    exact solution for one and two inputs. For others DAQP proposes which constraints and bounds
+    hold the answer, and their equations are solved and prove it, so that answers are right to
+    rounding; where that fails, a slower active-set method decides.
 
     With a control Lyapunov function the filter solves its joint QP instead: min w_u |u|^2 + w_d d^2
     subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2).
@@ -89,7 +90,9 @@ class SafetyFilter(ComponentFilter):
         dt: float | None = None,
         clf: CLF | None = None,
         adjustable: Sequence[str | sp.Symbol] = (),
+        **unknown: Never,
     ) -> None:
+        arguments.refuse_unknown(unknown, SafetyFilter.__init__)
         self.model = arguments.require_system(system)
         known = arguments.with_adjustable(system, adjustable)
         self.pairs = arguments.read_pairs(known, barriers, conditions)

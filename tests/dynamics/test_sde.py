@@ -12,6 +12,8 @@ from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionErro
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.integrators import Integrator
+from safe_envs.problem.barrier import Barrier
+from safe_envs.wrappers import SafetyFilter
 
 x, y, u, k = sp.symbols("x y u k", real=True)
 
@@ -162,3 +164,50 @@ def test_the_time_is_no_part_of_an_envs_barrier():
     still = measured(drift=[0], signals={})
     with pytest.raises(SystemDefinitionError, match=r"unknown symbol t; .*a state whose rate is 1"):
         state_problem(still, 1 - x - TIME, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)
+
+
+@pytest.mark.parametrize("make", [scalar, ControlAffineSDE.from_rate])
+@pytest.mark.parametrize(("name", "entry"), [("signals", "rate"), ("parameters", "value")])
+def test_signals_and_parameters_are_dicts(make, name, entry):
+    given = {} if make is scalar else {"states": (x,), "inputs": (u,), "rate": [u]}
+    for wrong in ([y], {y}, "y", (y, 0), y):
+        with pytest.raises(SystemDefinitionError, match=f"{name}={{symbol: {entry}}}"):
+            make(**given, **{name: wrong})
+
+
+@pytest.mark.parametrize("rate", [sp.nan, sp.oo, -sp.oo, math.nan, math.inf, y + sp.zoo])
+def test_rates_of_signals_are_finite(rate):
+    with pytest.raises(SystemDefinitionError, match=r"the rate of the signal y is .*finite"):
+        scalar(signals={y: rate})
+
+
+def test_sums_and_products_over_an_index_are_written_out():
+    i, j = sp.symbols("i j", integer=True)
+    total = sp.Sum(x**i, (i, 0, 3))
+    system = scalar(
+        drift=[k * total], signals={y: sp.Product(y + i, (i, 1, 2))}, diffusion=[[total / 10]]
+    )
+    assert system == scalar(
+        drift=[k * (1 + x + x**2 + x**3)],
+        signals={y: (y + 1) * (y + 2)},
+        diffusion=[[(1 + x + x**2 + x**3) / 10]],
+    )
+    # The inner index runs as far as the outer one says, under the name of another index too.
+    for inner in (j, i):
+        nested = sp.Sum(sp.Sum(x**inner, (inner, 0, i)), (i, 0, 2))
+        assert sp.expand(Barrier(1 - nested).expression) == -2 - 2 * x - x**2
+    assert Barrier(sp.Sum(x * i + j, (i, 0, j), (j, 0, 1))).expression.expand() == x + 2
+    for wrong in ((i, 0, sp.oo), (i, 0, k), (i, 0, 5000), (i, 3, 0), (i, 0.5, 3)):
+        with pytest.raises(SystemDefinitionError, match="cannot be written out; let the index"):
+            Barrier(1 - sp.Sum(x**i, wrong))
+
+
+def test_a_filter_takes_a_barrier_with_a_sum():
+    i = sp.symbols("i", integer=True)
+    system = ControlAffineSDE.from_rate((x,), (u,), [u])
+    made, other = (
+        SafetyFilter(system, 2 - total, "cbf:alpha=1", bounds=(-1, 1))
+        for total in (sp.Sum(x**i, (i, 0, 3)), 1 + x + x**2 + x**3)
+    )
+    for one, same in zip(made.filter([0.4], [1.0]), other.filter([0.4], [1.0]), strict=True):
+        np.testing.assert_allclose(one, same, atol=1e-15)

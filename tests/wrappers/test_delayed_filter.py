@@ -16,7 +16,7 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import DelayedFilter, SafetyFilter
 from safe_envs.wrappers.conditions import HOCBF
-from safe_envs.wrappers.delayed_filter import Prediction
+from safe_envs.wrappers.prediction import Prediction
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 DT = 0.1
@@ -159,6 +159,84 @@ def test_what_was_sent_in_place_of_the_decision_counts():
         first.override([0.0, 1.0])
 
 
+@pytest.mark.parametrize("batch", [(), (3,)])
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_period_without_a_decision_is_not_forgotten(batch, at):
+    # Two filters send the same; in one period, the first one fails, and its user falls back.
+    first, second = (DelayedFilter(plain_filter(), 2, DT) for _ in range(2))
+    state, fall_back = np.full((*batch, 2), 0.3), np.full((*batch, 2), 0.9)
+    proposed = np.broadcast_to([0.5, 1.0], (*batch, 2))
+    lost = state.copy()
+    lost[..., -1] = np.nan
+    for k in range(6):
+        if k == at:
+            with pytest.raises(InvalidInputError, match="the entry nan"):
+                first.filter(lost, proposed)
+            first.override(fall_back)
+            second.filter(state, proposed)
+            second.override(fall_back)
+        else:
+            mine, other = (each.filter(state, proposed) for each in (first, second))
+            np.testing.assert_array_equal(mine.barrier, other.barrier)
+        np.testing.assert_array_equal(first.sent, second.sent)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_nothing_is_decided_while_an_input_under_way_is_unknown(batch):
+    late, state = DelayedFilter(plain_filter(), 2, DT), np.full((*batch, 2), 0.3)
+    proposed = np.broadcast_to([0.5, 1.0], (*batch, 2))
+    late.filter(state, proposed)
+    known = late.sent
+    with pytest.raises(ConfigurationError, match="parameters"):
+        late.filter(state, proposed, parameters={"mass": 1.0})
+    for count in (2, 3):
+        with pytest.raises(ConfigurationError, match=f"the last {count} control periods"):
+            late.filter(state, proposed)
+    np.testing.assert_array_equal(late.sent, known)
+    for value in (0.6, 0.7):
+        late.override(np.full((*batch, 2), value))
+    with pytest.raises(ConfigurationError, match="the last 2 control periods"):
+        late.filter(state, proposed)
+    for value in (0.8, 0.9):
+        late.override(np.full((*batch, 2), value))
+    np.testing.assert_array_equal(late.sent[..., 0], np.broadcast_to([0.8, 0.9], (*batch, 2)))
+    late.override(np.full((*batch, 2), 1.0))  # and this in place of the last one
+    np.testing.assert_array_equal(late.sent[..., 0], np.broadcast_to([0.8, 1.0], (*batch, 2)))
+    late.filter(state, proposed)
+    late.reset()
+    late.filter(state, proposed)
+
+
+def test_a_call_that_fails_says_nothing_of_how_many_plants_there_are():
+    late = DelayedFilter(plain_filter(), 2, DT)
+    with pytest.raises(InvalidInputError, match="do not fit"):
+        late.filter(np.zeros((3, 2)), REST)
+    with pytest.raises(InvalidInputError, match=r"shape \(\.\.\., 2\)"):
+        late.override([0.0])
+    late.override(REST)
+    assert late.filter([0.0, 0.0], REST).action.shape == (2,)
+
+
+def test_without_delay_nothing_is_under_way_that_could_be_unknown():
+    late = DelayedFilter(plain_filter(), 0, DT)
+    with pytest.raises(InvalidInputError, match="nan"):
+        late.filter([0.0, np.nan], REST)
+    late.override(REST)
+    late.filter([0.0, 0.0], REST)
+    assert late.sent.shape == (0, 2)
+
+
+def test_what_is_under_way_is_no_array_of_the_user():
+    one = ControlAffineSDE((x,), (u,), [0], [1], [0])
+    late = DelayedFilter(SafetyFilter(one, 1 - x**2, "cbf:alpha=1", (-1.0, 1.0)), 2, DT)
+    late.filter(np.zeros((3, 1)), np.zeros((3, 1))).action[:] = 5.0
+    sent = np.full((3, 1), 0.5)
+    np.testing.assert_array_equal(late.sent, np.zeros((3, 2, 1)))
+    late.override(sent)
+    sent[:] = 7.0
+    np.testing.assert_array_equal(late.sent[:, -1], np.full((3, 1), 0.5))
+
+
 @pytest.mark.parametrize("remake", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
 def test_a_prediction_outlives_its_compiled_functions(remake):
     prediction = Prediction(NOISY, DT, 3)
@@ -191,15 +269,22 @@ def test_errors():
             DelayedFilter(safety_filter, *arguments)
     with pytest.raises(InvalidInputError, match="rest = "):
         DelayedFilter(safety_filter, 1, DT, rest=[0.0])
+    with pytest.raises(ConfigurationError, match=r"outside the bounds of the filter, \[\(-2.0"):
+        DelayedFilter(safety_filter, 1, DT, rest=[0.0, 0.0])
+    for other in ("x", None, LINEAR):
+        with pytest.raises(ConfigurationError, match="give a SafetyFilter"):
+            DelayedFilter(other, 1, DT)
     late = DelayedFilter(safety_filter, 1, DT)
-    with pytest.raises(InvalidInputError, match="finite numbers of shape"):
+    with pytest.raises(InvalidInputError, match=r"the state has the entry nan at \[1\]"):
         late.filter([0.0, np.nan], REST)
+    late.reset()
     with pytest.raises(InvalidInputError, match=r"\(\.\.\., 2\)"):
         late.filter([0.0], REST)
+    late.reset()
     late.filter([0.0, 0.0], REST)
     with pytest.raises(InvalidInputError, match="call reset"):
         late.filter(np.zeros((3, 2)), np.zeros((3, 2)))
-    with pytest.raises(InvalidInputError, match="does not fit"):
+    with pytest.raises(InvalidInputError, match=r"does not fit.*shape \(2,\)"):
         late.override([1.0])
     fast = ControlAffineSDE((x,), (u,), [x**3], [1], [0], {})
     blown = DelayedFilter(

@@ -12,6 +12,7 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, shown
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.certificates.certificate import (
@@ -129,7 +130,8 @@ class Certified(Condition):
         return condition
 
     def require_fit(self, problem: SafetyProblem) -> None:
-        """Raise ConfigurationError for a certificate of another problem."""
+        """Raise ConfigurationError for a certificate of another problem, or late inputs."""
+        require_direct(problem, "certificates")
         against = differences(self.certificate, problem)
         if against:
             raise ConfigurationError(

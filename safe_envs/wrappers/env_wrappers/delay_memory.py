@@ -15,8 +15,8 @@ from safe_envs.errors import NotCompilableError
 from safe_envs.problem.actuators import resting_input
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import spec_of
-from safe_envs.wrappers.delayed_filter import Prediction
 from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.prediction import Prediction
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 _KEY = "filter_under_way"

@@ -202,5 +202,7 @@ def episode_filter(
         given.settings.require_fit(problem, objective)
         given.require_problem(problem)
         return PromiseMemory(given, num_envs)
+    if delay != problem.believed_delay:
+        problem = replace(problem, model_delay=delay)  # which conditions may refuse
     found = SafetyFilter.for_problem(problem, given, knowledge, objective, priorities)
     return DelayMemory(found, problem, delay, num_envs) if delay else Memoryless(found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -130,9 +130,11 @@ def read_pairs(system: ControlAffineSDE, barriers: Any, conditions: Any) -> Pair
     entries: list[Any] = [barriers] if alone else list(barriers)
     if any(map(_is_pair, entries)):
         if conditions is not None or not all(map(_is_pair, entries)):
+            numeric = numbers_in(conditions).size and conditions is not None
             raise ConfigurationError(
                 f"barriers holds (barrier, condition) pairs, and conditions = {shown(conditions)};"
-                " give pairs alone, or barriers alone and their conditions"
+                f" {'input bounds go by name, bounds=...; ' if numeric else ''}give pairs alone, or"
+                " barriers alone and their conditions"
             )
         entries, conditions = [list(part) for part in zip(*entries, strict=True)]
     named = named_barriers(entries)
@@ -190,6 +192,21 @@ def _no_condition(given: Any) -> ConfigurationError:
     else:
         advice = _FORMS
     return ConfigurationError(f"conditions = {shown(given)}; {advice}")
+
+
+def refuse_unknown(given: Iterable[str], known: Callable[..., Any]) -> None:
+    """Raise ConfigurationError for arguments that something does not have.
+
+    Args:
+        given: their names.
+        known: what has other arguments.
+    """
+    for name in given:
+        allowed = list(inspect.signature(known).parameters)[1:-1]
+        raise ConfigurationError(
+            f"a filter has no argument {name!r};"
+            f" {'input bounds are bounds=...' if name == 'box' else nearest(name, allowed)}"
+        )
 
 
 def require_goal(clf: Any, weights: Any) -> None:

@@ -23,7 +23,8 @@ class FilterDecision(NamedTuple):
         slack: by how much the action violates each constraint where they cannot be met, 0
             elsewhere, shape (..., k).
         cause: index of the active constraint that lies furthest from the proposed input, shape
-            (...); without an active one -1 in arrays, and without meaning in components.
+            (...), where one that no input changes is nearer than any; without an active one -1 in
+            arrays, and without meaning in components.
         proposed: input that the constraints changed, shape (..., m): the given one, or with a goal
             the one that is best without constraints.
         barrier: value of each barrier, shape (..., k); None in components.

@@ -88,7 +88,7 @@ def furthest_constraint(
     """Return the active constraint whose half-space is furthest from the proposed input.
 
     A reciprocal one outside its domain is further than any, and one that says nothing of the input
-    nearer than any.
+    nearer than any; of several such, the first counts.
 
     Args:
         m: number of inputs.
@@ -110,8 +110,10 @@ def furthest_constraint(
             share = a[i, j] / unit
             square += share * share / w[j]
             value += a[i, j] * u[j]
-        if active[i] > 0.0 and square > 0.0:
-            distance = -(value + b[i]) / unit / sqrt(square) if inside[i] > 0.0 else inf
-            if distance > furthest:
+        if active[i] > 0.0:
+            distance = -inf
+            if square > 0.0:
+                distance = -(value + b[i]) / unit / sqrt(square) if inside[i] > 0.0 else inf
+            if cause < 0 or distance > furthest:
                 cause, furthest = i, distance
     return cause

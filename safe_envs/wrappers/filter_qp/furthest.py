@@ -16,6 +16,8 @@ def furthest_active(
 ) -> int:
     """Return the active constraint whose half-space is furthest from the proposed input, else -1.
 
+    One that says nothing of the input is nearer than any; of several such, the first counts.
+
     Args:
         a: coefficients of k constraints on m inputs.
         b: their offsets.
@@ -23,11 +25,13 @@ def furthest_active(
         active: which constraints are active.
         weights: of the inputs.
     """
-    acting = [i for i, acts in enumerate(active) if acts and any(a[i])]
+    acting = [i for i, acts in enumerate(active) if acts]
     if len(acting) < 2:
         return acting[0] if acting else -1
-    cause, furthest = -1, -math.inf
+    cause, furthest = acting[0], -math.inf
     for i in acting:
+        if not any(a[i]):
+            continue
         unit = max(map(abs, a[i]))  # so that squares neither overflow nor vanish
         parts = [aj / unit for aj in a[i]]
         square = sum([p * p / wj for p, wj in zip(parts, weights, strict=True)])

@@ -258,7 +258,8 @@ class FilterQPSolver(CompiledQP):
     ) -> Any:
         """Return the active constraint whose half-space is furthest from the proposed input.
 
-        A reciprocal one outside its domain is further than any.
+        A reciprocal one outside its domain is further than any, and one that says nothing of the
+        input nearer than any; of several such, the first counts.
         """
         cause, furthest = -1, -math.inf
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
@@ -274,6 +275,7 @@ class FilterQPSolver(CompiledQP):
             if i in inside:
                 distance = self._choose(inside[i], distance, math.inf)
             distance = self._choose(acts & (size > 0.0), distance, -math.inf)
-            cause = self._choose(distance > furthest, i, cause)
+            first: Any = acts & (cause < 0)
+            cause = self._choose(first | (distance > furthest), i, cause)
             furthest = self._larger(furthest, distance)
         return cause

@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError
-from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from safe_envs.wrappers.conditions import parse_conditions
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.verification.guarantee import guarantee_of
@@ -116,12 +116,16 @@ def test_proofs_tables_and_rare_events_refuse_a_delay():
             lambda p: reduced(p),
             lambda p: guarantee_of(p, parse_conditions("scbf", p)),
             lambda p: SafetyFilterWrapper(SafeEnv(p), "promise:p=0.9"),
+            lambda p: SafetyFilterWrapper(SafeEnv(p), "certified"),
+            lambda p: SafetyFilter.for_problem(p, "certified"),
             lambda p: estimate_rare(p, filters="scbf"),
         ):
             with pytest.raises(ConfigurationError, match="are not for a delay or a slew limit"):
                 ask(problem)
     with pytest.raises(ConfigurationError, match="promise filters are not for a delay"):
         SafetyFilterWrapper(SafeEnv(problem_of(PENDULUM)), "promise:p=0.9", delay=1)
+    with pytest.raises(ConfigurationError, match="certificates are not for a delay"):
+        SafetyFilterWrapper(SafeEnv(problem_of(PENDULUM)), "certified", delay=1)
     with pytest.raises(ConfigurationError, match="delay = -1"):
         SafetyFilterWrapper(SafeEnv(problem_of(PENDULUM)), "scbf", delay=-1)
 

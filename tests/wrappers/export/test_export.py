@@ -31,7 +31,7 @@ NEEDS_COMPILER = pytest.mark.skipif(COMPILER is None, reason="there is no C comp
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wdouble-promotion", "-Werror")
 STRICT = ("-std=c99", "-O1", "-ffp-contract=off", *WARNINGS)
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-x, y, u, p, rate = sp.symbols("x y u p rate", real=True)
+x, y, u, w, p, rate = sp.symbols("x y u w p rate", real=True)
 mass, drag = sp.symbols("mass drag", positive=True)
 
 
@@ -104,6 +104,17 @@ def test_signals_parameters_time_and_bounds_at_run_time(bounds: Any, tmp_path: P
     assert "double mass; /* mass, positive */" in header
     assert "double t; /* t, in s, nonnegative */" in header
     assert "input->runtime.drag = 0.3;" in (tmp_path / "filter.c").read_text()
+
+
+@NEEDS_COMPILER
+def test_the_cause_where_no_input_changes_what_is_unmet(tmp_path: Path) -> None:
+    system = ControlAffineSDE((x, y), (u, w), [0, 0], [[1, 0], [0, 1]], [0, 0])
+    safety_filter = SafetyFilter(system, [9 + y, -1 - x**2, -2 - x**2], "cbf", (-1, 1))
+    options = ExportOptions(region=((-1.0, 1.0), (-9.0, 0.0)))
+    export_filter(safety_filter, tmp_path, options=options)
+    found = compare(tmp_path, safety_filter, options, states=2000)
+    assert_equal(found)
+    assert found.without_effect > 0
 
 
 @NEEDS_COMPILER

@@ -139,6 +139,12 @@ ENDLESS = (-math.inf, 1.0)
         ({"barriers": sp.Integer(1)}, "no relative degree"),
         ({"barriers": [(H, HOCBF()), H]}, "pairs alone, or barriers alone"),
         ({"barriers": [(H, HOCBF())]}, "pairs alone, or barriers alone"),
+        (
+            {"barriers": [(H, HOCBF())], "conditions": [(-5, 5)]},
+            r"bounds go by name, bounds=\.\.\.",
+        ),
+        ({"box": (-5, 5)}, r"no argument 'box'; input bounds are bounds=\.\.\."),
+        ({"weight": [1.0]}, "no argument 'weight'; did you mean 'weights'"),
         ({"conditions": "hocbff"}, "did you mean 'hocbf'"),
         ({"conditions": "hocbf:p=1,2,3"}, "relative degree 2 and needs as many rates"),
         ({"conditions": "hocbf+hocbf"}, "has 2 conditions; the filter takes one"),

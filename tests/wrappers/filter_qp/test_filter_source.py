@@ -386,3 +386,23 @@ def test_without_a_filter_every_input_passes() -> None:
     decide = Program("none", [decided], unfiltered_source(2)).plain()["decided"]
     found = decide((1.0,), (0.3, 7.0), np.empty(0), np.empty(0))
     assert found == ((0.3, 7.0), (0.3, 7.0), False, True, (0.0,), 0, True)
+
+
+def test_what_no_input_changes_is_the_cause_where_nothing_else_acts() -> None:
+    system = ControlAffineSDE((x, y), (u, v), [0, 0], np.eye(2, dtype=int), [0, 0])
+    barriers = [9 + y, -1 - x**2, -2 - x**2]
+    # Flat and met; two flat and unmet; with a steep one that acts; all of them steep.
+    states = np.array([[0.0, 0.0], [0.0, 1.0], [0.0, -8.5], [0.5, 0.0]])
+    inputs = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, -1.0], [0.0, 0.0]])
+    for conditions in ("cbf", ["srcbf" if i == 0 else "cbf" for i in range(3)]):
+        safety_filter = SafetyFilter(system, barriers, conditions, (-1, 1))
+        found = safety_filter.filter(states, inputs)
+        assert found.active[:, 1:].all()
+        wanted = [1, 1, 0 if found.active[2, 0] else 1, 2]
+        assert found.cause.tolist() == wanted
+        assert isinstance(conditions, list) or found.active[2, 0]
+        ones = zip(states, inputs, strict=True)
+        assert [safety_filter.filter(*one).cause for one in ones] == wanted
+        decide = Decided(safety_filter)
+        ones = zip(states.tolist(), inputs.tolist(), strict=True)
+        assert [decide(*one)[5] for one in ones] == wanted

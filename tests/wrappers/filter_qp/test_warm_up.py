@@ -12,7 +12,7 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, NumericalError
 from safe_envs.dynamics import codegen
-from safe_envs.wrappers import SRCBF, SafetyFilter
+from safe_envs.wrappers import SRCBF, DelayedFilter, SafetyFilter
 from safe_envs.wrappers.filter_qp import compiled
 
 _SCRIPT = """
@@ -21,6 +21,7 @@ import numpy as np
 import sympy as sp
 from safe_envs import ControlAffineSDE, NumericalError, SafetyFilter
 from safe_envs.dynamics import codegen
+from safe_envs.wrappers import DelayedFilter
 
 m = {m}
 x, u = sp.symbols(f"x:{{m}}", real=True), sp.symbols(f"u:{{m}}", real=True)
@@ -30,6 +31,7 @@ filters = [
     SafetyFilter(system, h, "cbf", (-1, 1)),
     SafetyFilter(system, h[2], "cbf:sampling_margin=first-order", (-1, 1), dt=0.1),
 ]
+filters += [DelayedFilter(made, 2, 0.01) for made in filters]
 known = set(sys.modules)
 
 
@@ -44,10 +46,13 @@ for made in filters:
     states, inputs = 1.5 * rng.normal(size=(60, m)), 3 * rng.normal(size=(60, m))
     states[:, -1] = np.minimum(states[:, -1], 3.0)
     found = made.filter(states, inputs, bounds=(-1, 0.5))
+    restart = getattr(made, "reset", int)
+    restart()
     for state, proposal in zip(states, inputs, strict=True):
         one = made.filter(state, proposal)
         kinds.add((bool(one.feasible), bool(one.active.any())))
     for bad in (states + 9, states[0] + 9):
+        restart()
         try:
             made.filter(bad, np.zeros_like(bad))
         except NumericalError:
@@ -69,9 +74,12 @@ def test_nothing_is_imported_or_compiled_after_construction(inputs: int) -> None
 
 _READER = """
 import pickle, sys
+import sympy
+
 made, states, inputs = pickle.load(sys.stdin.buffer)
-known = set(sys.modules)
+known, sympy.lambdify = set(sys.modules), None
 found = [made.filter(x, u) for x, u in zip(states, inputs)]
+getattr(made, "reset", int)()
 made.filter(states, inputs)
 assert not all(one.feasible for one in found)
 late = sorted(set(sys.modules) - known)
@@ -79,11 +87,13 @@ assert not late, late
 """
 
 
-def test_nor_after_it_is_unpickled() -> None:
+@pytest.mark.parametrize("late", [False, True], ids=["prompt", "late"])
+def test_nor_after_it_is_unpickled(late: bool) -> None:
     x = sp.symbols("x:4", real=True)
     system = ControlAffineSDE(x, sp.symbols("u:4", real=True), [0] * 4, np.eye(4), [0] * 4)
     made = SafetyFilter(system, [1 - x[0], x[0] + x[3] + 2, 3 - x[1] ** 2], "cbf", (-1, 1))
     rng = np.random.default_rng(0)
+    made = DelayedFilter(made, 2, 0.01) if late else made
     given = pickle.dumps((made, 2 * rng.normal(size=(30, 4)), 3 * rng.normal(size=(30, 4))))
     done = subprocess.run([sys.executable, "-c", _READER], input=given, capture_output=True)
     assert not done.returncode, done.stderr.decode()
