@@ -2,8 +2,9 @@
 
 A solver proposes which constraints and bounds hold the answer, and the point that these hold is
 returned if it proves to be the answer; else what contradicts the proof changes them. So the
-precision is that of the equations, not that of the solver. Where nothing is proved, the slower
-method of `safe_envs.wrappers.qp.active_set` decides.
+precision is that of the equations, not that of the solver. Where nothing is proved, a slower method
+decides: for two inputs that of `safe_envs.wrappers.qp.plane_batch`, else that of
+`safe_envs.wrappers.qp.active_set`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safe_envs.wrappers.qp import active_set
+from safe_envs.wrappers.qp import active_set, plane_batch
 from safe_envs.wrappers.qp.dual_active_set import propose
 from safe_envs.wrappers.qp.rounding import FloatAnswer, Floats
 from safe_envs.wrappers.qp.working_set import FloatQP, Point
@@ -40,7 +41,7 @@ def project_floats(
         found = _proved(qp)
     except ArithmeticError:  # too large, or too small, for the way to a proof
         found = None
-    u, margin, allowed = found[:3] if found else _by_active_set(qp)
+    u, margin, allowed = found[:3] if found else _unproved(qp)
     active = [value <= doubt for value, doubt in zip(margin, allowed, strict=True)]
     met = [value >= -doubt for value, doubt in zip(margin, allowed, strict=True)]
     return u, margin, active, all(met)
@@ -86,9 +87,10 @@ def _proved(qp: FloatQP) -> Point | None:
     return None
 
 
-def _by_active_set(qp: FloatQP) -> tuple[list[float], list[float], list[float]]:
+def _unproved(qp: FloatQP) -> tuple[list[float], list[float], list[float]]:
     p = qp
     numbers = [np.array(part) for part in (p.a, p.b, p.v, p.low, p.high, p.w, p.priority)]
+    slow = plane_batch.project_single if len(p.v) == 2 else active_set.project
     with np.errstate(all="ignore"):
-        u = active_set.project(*numbers).tolist()
+        u = slow(*numbers).tolist()
     return u, *p.margins(u)

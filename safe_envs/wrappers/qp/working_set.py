@@ -127,7 +127,9 @@ class FloatQP:
                 for i, (pressure, _) in zip(rows, presses, strict=True)
                 if i in slacks or (pressure >= -nothing and margin[i] <= allowed[i])
             ]
-        pulls = [(self.priority[i] * -margin[i], self.a[i]) for i in slacks]
+        # Over the steepest, so that small forces do not vanish.
+        unit = max([self.lengths[i] for i in slacks], default=1.0)
+        pulls = [(self.priority[i] * (-margin[i] / unit), self.a[i]) for i in slacks]
         changed, settled = dict(outside), True
         for j, side in enumerate(at):
             force, doubt = 0.0, 0.0
