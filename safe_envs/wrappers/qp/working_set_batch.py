@@ -139,11 +139,12 @@ def find_points(p: ArrayQP, rows: np.ndarray, at: np.ndarray) -> Points:
     unit = np.where(unit > 0.0, unit, 1.0)
     parts = p.a * np.where(missed, p.priority * (-margin / unit), 0.0)[:, None]
     force, doubt = total(parts), _NOTHING * total(np.abs(parts))
+    unsure = np.abs(p.a) * np.where(missed, p.priority * (allowed / unit), 0.0)[:, None]
     rest = way - total(p.normals * pressures[:, None])
     outwards = force * at
     proved &= np.where(
         free,
-        np.abs(force) <= doubt,
+        np.abs(force) <= doubt + total(unsure),
         (outwards > doubt) | ((outwards >= -doubt) & (rest * at <= nothing)),
     ).all(axis=0)
     return Points(u, margin, allowed, proved)
