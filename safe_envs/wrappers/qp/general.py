@@ -13,10 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safe_envs.wrappers.qp import active_set, plane_batch
+from safe_envs.wrappers.qp import active_set, one_constraint, plane_batch
 from safe_envs.wrappers.qp.dual_active_set import propose
 from safe_envs.wrappers.qp.rounding import FloatAnswer, Floats
-from safe_envs.wrappers.qp.working_set import FloatQP, Point
+from safe_envs.wrappers.qp.working_set import FloatQP, Point, margins
 
 _PIVOTS = 12
 """How often a working set is changed: more do not help where these do not."""
@@ -35,16 +35,31 @@ def project_floats(
     if not all(map(any, a)):
         return _beside_flat(a, b, v, low, high, w, priority)
     qp = FloatQP(a, b, v, low, high, w, priority)
-    if min(qp.margin) >= 0.0:
+    missed = [i for i, value in enumerate(qp.margin) if not value >= 0.0]
+    if not missed:
         return qp.start, qp.margin, [False] * len(b), True
-    try:
-        found = _proved(qp)
-    except ArithmeticError:  # too large, or too small, for the way to a proof
-        found = None
-    u, margin, allowed = found[:3] if found else _unproved(qp)
+    found = _of_one(missed[0], qp) if len(missed) == 1 else None
+    if not found:
+        try:
+            found = _proved(qp.scaled())
+        except ArithmeticError:  # too large, or too small, for the way to a proof
+            found = None
+        found = found or _unproved(qp)
+    u, margin, allowed = found[:3]
     active = [value <= doubt for value, doubt in zip(margin, allowed, strict=True)]
     met = [value >= -doubt for value, doubt in zip(margin, allowed, strict=True)]
     return u, margin, active, all(met)
+
+
+def _of_one(i: int, qp: FloatQP) -> tuple[list[float], list[float], list[float]] | None:
+    """Return the answer where one constraint counts: that for it alone, if it meets the others."""
+    p = qp
+    u = one_constraint.project_floats(p.a[i], p.b[i], p.v, p.low, p.high, p.w)[0]
+    margin, allowed = margins(p.a, p.b, u)
+    for c, value in enumerate(margin):
+        if c != i and not value >= -allowed[c]:
+            return None
+    return u, margin, allowed
 
 
 def _beside_flat(
@@ -74,6 +89,10 @@ def _beside_flat(
 def _proved(qp: FloatQP) -> Point | None:
     """Return the answer if a working set proves it."""
     working = qp.first()
+    if len(working.rows) > 1 and qp.meets_each(working.rows):
+        found = qp.point(working)
+        if found.change is None:
+            return found
     for proposed in propose(qp):
         found = qp.point(proposed)
         if found.change is None:
@@ -93,4 +112,4 @@ def _unproved(qp: FloatQP) -> tuple[list[float], list[float], list[float]]:
     slow = plane_batch.project_single if len(p.v) == 2 else active_set.project
     with np.errstate(all="ignore"):
         u = slow(*numbers).tolist()
-    return u, *p.margins(u)
+    return u, *margins(p.a, p.b, u)

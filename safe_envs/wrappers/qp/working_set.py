@@ -55,6 +55,22 @@ class Point(NamedTuple):
     change: WorkingSet | None
 
 
+def margins(a: Sequence[Floats], b: Floats, u: Floats) -> tuple[list[float], list[float]]:
+    """Return the margins (k) at inputs, and their rounding.
+
+    Args:
+        a: k constraints of m coefficients.
+        b: k offsets.
+        u: m inputs.
+    """
+    margin, allowed = [], []
+    for row, offset in zip(a, b, strict=True):
+        terms = [*map(mul, row, u), offset]
+        margin.append(sum(terms))
+        allowed.append(ROUNDING * sum(map(abs, terms)))
+    return margin, allowed
+
+
 class FloatQP:
     """A QP whose constraints all depend on the input.
 
@@ -80,23 +96,31 @@ class FloatQP:
         """Take a QP; see `dispatch.project_floats`."""
         self.a, self.b, self.v, self.low, self.high = a, b, v, low, high
         self.w, self.priority = w, priority
-        self.roots = [math.sqrt(wj) for wj in w]
-        self._rows = [(*row, offset) for row, offset in zip(a, b, strict=True)]
         self.start = [
             lo if vj < lo else hi if vj > hi else vj
             for vj, lo, hi in zip(v, low, high, strict=True)
         ]
-        self.margin = self._values(self.start)
+        self.margin = [
+            sum(map(mul, row, self.start)) + offset for row, offset in zip(a, b, strict=True)
+        ]
+        self.roots: list[float] = []
         self.normals: list[list[float]] = []
         self.lengths: list[float] = []
-        for row in a:
+        self.sizes: list[float] = []
+
+    def scaled(self) -> FloatQP:
+        """Return this with the roots, normals, lengths and sizes that working sets need."""
+        self.roots = [math.sqrt(wj) for wj in self.w]
+        self._rows = [(*row, offset) for row, offset in zip(self.a, self.b, strict=True)]
+        for row in self.a:
             scaled = [*map(truediv, row, self.roots)]
             length = math.hypot(*scaled)
             self.normals.append([s / length for s in scaled])
             self.lengths.append(length)
         self.sizes = [
-            math.sqrt(q) * length for q, length in zip(priority, self.lengths, strict=True)
+            math.sqrt(q) * length for q, length in zip(self.priority, self.lengths, strict=True)
         ]
+        return self
 
     def first(self) -> WorkingSet:
         """Return the working set of the clipped proposal."""
@@ -168,23 +192,19 @@ class FloatQP:
             WorkingSet([*kept, *more], [changed.get(j, side) for j, side in enumerate(at)]),
         )
 
-    def margins(self, u: Floats) -> tuple[list[float], list[float]]:
-        """Return the margins (k) at inputs, and their rounding.
+    def meets_each(self, rows: list[int]) -> bool:
+        """Return whether the input bounds allow to meet each of some constraints by itself.
 
         Args:
-            u: m inputs.
+            rows: the constraints.
         """
-        margin, allowed = [], []
-        ends = [*u, 1.0]
-        for row in self._rows:
-            terms = [*map(mul, row, ends)]
-            margin.append(sum(terms))
-            allowed.append(ROUNDING * sum(map(abs, terms)))
-        return margin, allowed
-
-    def _values(self, u: Floats) -> list[float]:
-        ends = [*u, 1.0]
-        return [sum(map(mul, row, ends)) for row in self._rows]
+        for i in rows:
+            most = self.b[i]
+            for aj, lo, hi in zip(self.a[i], self.low, self.high, strict=True):
+                most += aj * (hi if aj > 0.0 else lo)
+            if not most >= 0.0:
+                return False
+        return True
 
     def _presses(
         self, working: WorkingSet, span: LineSpan | RowSpan | None, way: list[float]
@@ -206,7 +226,7 @@ class FloatQP:
         ]
         free = [j for j, side in enumerate(at) if not side]
         if not free:
-            return u, *self.margins(u), None, {}
+            return u, *margins(self.a, self.b, u), None, {}
         span, known = None, None
         if rows:
             normals = [self.normals[i] for i in rows]
@@ -218,7 +238,7 @@ class FloatQP:
             known = self._move(u, free, rows, span)
         outside, moved = self._clip(u, free)
         if moved or not known:
-            known = self.margins(u)
+            known = margins(self.a, self.b, u)
         return u, *known, span, outside
 
     def _move(
@@ -239,7 +259,7 @@ class FloatQP:
             if not far:
                 break
             if not span.dependent:
-                known = every, allowed = self.margins(u)
+                known = every, allowed = margins(self.a, self.b, u)
                 margin = [every[i] for i in rows]
                 met = [abs(every[i]) <= allowed[i] for i in rows]
                 if all(met):
