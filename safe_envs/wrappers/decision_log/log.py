@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.errors import ConfigurationError, InvalidInputError, shown
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.number_text import finite_number
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.decision_log.columns import LogColumns
@@ -20,7 +21,7 @@ from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
-class DecisionLog:
+class DecisionLog(IndependentCopies):
     """States, inputs, barriers and slacks of a control loop over time.
 
     Adding a decision takes a few microseconds and 8 bytes for each column. The log grows with every
