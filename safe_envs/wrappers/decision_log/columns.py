@@ -115,16 +115,16 @@ class LogColumns:
         ]
         return ["t [s]", *named, *_FLAGS]
 
-    def misfit(self, row: Sequence[float]) -> str | None:
-        """Return why numbers cannot be a row; None if they can.
+    def misfit(self, numbers: Sequence[float]) -> str | None:
+        """Return why numbers cannot be those of a period; None if they can.
 
         Args:
-            row: the numbers of one period.
+            numbers: of one period.
         """
-        if len(row) != len(self.headings):
-            return f"{len(row)} numbers for {len(self.headings)} columns"
-        *_, intervened, feasible, cause = row
-        if not math.isfinite(row[0]) or not {intervened, feasible} <= {0.0, 1.0}:
+        if len(numbers) != len(self.headings):
+            return f"{len(numbers)} numbers for {len(self.headings)} columns"
+        *_, intervened, feasible, cause = numbers
+        if not math.isfinite(numbers[0]) or not {intervened, feasible} <= {0.0, 1.0}:
             return "t must be finite, and the two flags near the end 0 or 1"
         last = len(self.barriers) - 1
         if cause not in range(-1, last + 1):
