@@ -10,17 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, shown
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, shown
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.number_text import finite_number
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.decision_log.columns import LogColumns
-from safe_envs.wrappers.decision_log.files import read_log, write_csv, write_parquet
+from safe_envs.wrappers.decision_log.files import path_of, read_log, write_csv, write_parquet
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
-class DecisionLog:
+class DecisionLog(IndependentCopies):
     """States, inputs, barriers and slacks of a control loop over time.
 
     Adding a decision takes a few microseconds and 8 bytes for each column. The log grows with every
@@ -32,9 +33,16 @@ class DecisionLog:
 
     Attributes:
         columns: as given.
+
+    Raises:
+        ConfigurationError: they are no `LogColumns`.
     """
 
     def __init__(self, columns: LogColumns) -> None:
+        if not isinstance(columns, LogColumns):
+            raise ConfigurationError(
+                f"columns = {shown(columns)}; make a log by DecisionLog.for_filter(safety_filter)"
+            )
         self.columns = columns
         self._width = len(columns.headings)
         self._values = array("d")
@@ -78,14 +86,15 @@ class DecisionLog:
         """Add the decision of one period.
 
         Args:
-            t: time in s.
+            t: time in s, of a clock that never goes back, such as `time.monotonic`.
             x: state, shape (n,).
             decision: what the filter returned for that one state.
             bounds: as given to the filter; those of its construction by default.
             parameters: as given to the filter.
 
         Raises:
-            InvalidInputError: Something is missing or does not fit the log.
+            InvalidInputError: Something is missing or does not fit the log, or the time lies before
+                the last one.
         """
         try:
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
@@ -108,7 +117,7 @@ class DecisionLog:
                     decision.cause if intervened else -1,
                 ],
             )
-        except (AttributeError, TypeError, ValueError) as error:
+        except (AttributeError, OverflowError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the log takes one state and its decision at a time ({error}); give t in s, x of"
                 f" shape ({len(self.columns.states)},) and what the filter returned for it"
@@ -119,7 +128,7 @@ class DecisionLog:
                 f" takes {self._width}: a finite t, {len(self.columns.states)} states, and the"
                 " decision of the filter that the log was made for"
             )
-        self._values.extend(values)
+        self._extend(values)
 
     def _given(self, parameters: Mapping[Any, float]) -> list[float]:
         """Return what was given at run time, in order."""
@@ -137,11 +146,26 @@ class DecisionLog:
         """Add the numbers of one period in the order of `LogColumns.headings`.
 
         Raises:
-            InvalidInputError: Their number does not fit.
+            InvalidInputError: They do not fit, or the time lies before the last one.
         """
-        if len(values) != self._width:
-            raise InvalidInputError(f"{len(values)} numbers for {self._width} columns of the log")
-        self._values.extend(array("d", values))
+        try:
+            row = array("d", values)
+        except (OverflowError, TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"the log takes {self._width} numbers, not {shown(values)}: {error}"
+            ) from error
+        if (reason := self.columns.misfit(row)) is not None:
+            raise InvalidInputError(f"{shown(row.tolist())} does not fit the log: {reason}")
+        self._extend(row)
+
+    def _extend(self, row: array[float]) -> None:
+        if self._values and row[0] < self._values[-self._width]:
+            raise InvalidInputError(
+                f"t = {row[0]} s lies before the last time of the log,"
+                f" {self._values[-self._width]} s; take a clock that never goes back, such as"
+                " time.monotonic, and another log for another run"
+            )
+        self._values.extend(row)
 
     def __len__(self) -> int:
         return len(self._values) // self._width
@@ -152,7 +176,15 @@ class DecisionLog:
         return np.array(self._values).reshape(-1, self._width)
 
     def section(self, name: str) -> np.ndarray:
-        """Return the columns of a section of `LogColumns`, shape (periods, columns)."""
+        """Return the columns of a section of `LogColumns`, shape (periods, columns).
+
+        Raises:
+            ConfigurationError: There is no such section.
+        """
+        if name not in self.columns.sections:
+            raise ConfigurationError(
+                f"unknown section {shown(name)}; {nearest(str(name), self.columns.sections)}"
+            )
         table = np.frombuffer(self._values).reshape(-1, self._width)
         return table[:, self.columns.sections[name]].copy()
 
@@ -228,7 +260,7 @@ class DecisionLog:
         Raises:
             ConfigurationError: The file cannot be written.
         """
-        write_csv(Path(path), self.columns, self.table())
+        write_csv(path_of(path, "FILE.csv"), self.columns, self.table())
 
     def to_parquet(self, path: Path | str) -> None:
         """Write a Parquet file, whole or not at all; needs pyarrow.
@@ -239,7 +271,7 @@ class DecisionLog:
         Raises:
             ConfigurationError: pyarrow is not installed, or the file cannot be written.
         """
-        write_parquet(Path(path), self.columns, self.table())
+        write_parquet(path_of(path, "FILE.parquet"), self.columns, self.table())
 
     @classmethod
     def read(cls, path: Path | str) -> DecisionLog:
@@ -251,9 +283,7 @@ class DecisionLog:
         Raises:
             ConfigurationError: The file cannot be read, is too large, or holds no log.
         """
-        if not isinstance(path, str | Path):
-            raise ConfigurationError(f"{shown(path)} is no path; give FILE.csv or FILE.parquet")
-        columns, table = read_log(Path(path))
+        columns, table = read_log(path_of(path, "FILE.csv or FILE.parquet"))
         log = cls(columns)
         log._values.frombytes(np.ascontiguousarray(table, dtype=np.float64).tobytes())
         return log
