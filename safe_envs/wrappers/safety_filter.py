@@ -258,7 +258,14 @@ class SafetyFilter(ComponentFilter):
         cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
         cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
         return FilterDecision(
-            action, margin, active > 0.0, feasible, slack, cause, goal[0] if goal else u, barrier
+            action,
+            margin,
+            active > 0.0,
+            feasible,
+            slack,
+            cause,
+            goal[0] if goal else np.array(u),
+            barrier,
         )
 
     def _filter_one(
@@ -289,7 +296,7 @@ class SafetyFilter(ComponentFilter):
             feasible,
             np.array(slack),
             cause if True in active else -1,
-            u if proposed is inputs else np.array(proposed),
+            u.copy() if proposed is inputs else np.array(proposed),
             np.array(barrier),
         )
 
