@@ -39,7 +39,9 @@ class DecisionLog:
         self._width = len(columns.headings)
         self._values = array("d")
         self._bounds: tuple[Sequence[float], Sequence[float]] = ((), ())
-        self._defaults: dict[Any, float | None] = {}
+        self._defaults: list[tuple[Any, str, float | None]] = []
+        # The columns of the time, the state and the parameters come first.
+        self._inputs = 1 + len(columns.states)
 
     @classmethod
     def for_filter(
@@ -63,7 +65,8 @@ class DecisionLog:
         names = [barrier.name for barrier, _ in safety_filter.pairs]
         log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
         log._bounds = _endless(qp.low), _endless(qp.high)
-        log._defaults = {symbol: model.parameters.get(symbol) for symbol in runtime}
+        log._defaults = [(s, s.name, model.parameters.get(s)) for s in runtime]
+        log._inputs += len(runtime)
         return log
 
     def add(
@@ -85,7 +88,7 @@ class DecisionLog:
             parameters: as given to the filter.
 
         Raises:
-            InvalidInputError: Something is missing or does not fit the log.
+            InvalidInputError: Something is missing, not finite or does not fit the log.
         """
         try:
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
@@ -96,7 +99,7 @@ class DecisionLog:
                 [
                     t,
                     *x,
-                    *(self._given(parameters or {}) if self._defaults else ()),
+                    *(self._given(parameters or {}) if self._defaults or parameters else ()),
                     *proposed,
                     *action,
                     *low,
@@ -108,6 +111,8 @@ class DecisionLog:
                     decision.cause if intervened else -1,
                 ],
             )
+        except InvalidInputError:
+            raise
         except (AttributeError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the log takes one state and its decision at a time ({error}); give t in s, x of"
@@ -119,18 +124,40 @@ class DecisionLog:
                 f" takes {self._width}: a finite t, {len(self.columns.states)} states, and the"
                 " decision of the filter that the log was made for"
             )
+        if not math.isfinite(sum(values[: self._inputs])):
+            self._require_finite(values[: self._inputs])
         self._values.extend(values)
+
+    def _require_finite(self, values: Sequence[float]) -> None:
+        """Raise InvalidInputError unless the state and the parameters of a period are finite."""
+        for heading, value in zip(self.columns.headings, values, strict=False):
+            if not math.isfinite(value):
+                raise InvalidInputError(
+                    f"{heading} is {value}, of which a filter decides nothing; give what it decided"
+                    " about"
+                )
 
     def _given(self, parameters: Mapping[Any, float]) -> list[float]:
         """Return what was given at run time, in order."""
-        found = []
-        for symbol, default in self._defaults.items():
-            value = parameters.get(symbol, parameters.get(symbol.name, default))
+        found, used = [], 0
+        for symbol, name, default in self._defaults:
+            value = parameters.get(name)
             if value is None:
+                value = parameters.get(symbol)
+            if value is not None:
+                used += 1
+            elif default is not None:
+                value = default
+            else:
                 raise InvalidInputError(
                     f"parameters lacks {symbol}; give what the filter was given"
                 )
             found.append(value)
+        if used < len(parameters):
+            raise InvalidInputError(
+                f"parameters has {', '.join(map(str, parameters))}; the log takes each of"
+                f" {', '.join([name for _, name, _ in self._defaults]) or 'none'} once"
+            )
         return found
 
     def append(self, values: Sequence[float]) -> None:
