@@ -20,6 +20,7 @@ from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import SystemSpec
 from safe_envs.errors import InvalidInputError, NumericalError
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.validators import real_array
@@ -28,7 +29,7 @@ _UNKNOWN = -1
 """Gymnasium's seed of a generator that was set."""
 
 
-class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
+class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
     """Any `SafetyProblem` as a Gymnasium env.
 
     Actions are in [-1, 1] for every input and are scaled to the input bounds; what lies beyond is
@@ -114,15 +115,16 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def state(self) -> np.ndarray:
         """The exact state, shape (n,), in the units of the problem's states.
 
-        It can be set within an episode. Its clock, its noise, its counters and the inputs that are
-        under way go on, and nothing is counted before the next step. A filter with a memory forgets
-        what it kept, and keeps from there on what it can keep from the new state.
+        It can be set within an episode, as a whole: the array is read-only. Its clock, its noise,
+        its counters and the inputs that are under way go on, and nothing is counted before the next
+        step. A filter with a memory forgets what it kept, and keeps from there on what it can keep
+        from the new state.
 
         Raises:
             InvalidInputError: the state has another shape, is not finite, or outside the workspace.
             ResetNeeded: there is no episode yet.
         """
-        return np.array(self.components)
+        return _read_only(self.components)
 
     @state.setter
     def state(self, given: Any) -> None:
@@ -290,3 +292,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if self._actuators is not None:
             info |= self._actuators.report()
         return observation, reward, left or goal >= 0.0, info
+
+
+def _read_only(x: Sequence[float]) -> np.ndarray:
+    found = np.array(x)
+    found.flags.writeable = False
+    return found

@@ -159,7 +159,7 @@ class ResetOptions:
         return start
 
     def _steps(self, given: Any, wanted: np.ndarray | None) -> np.ndarray:
-        times, dt, count = real_array("time", given), self._problem.dt, self._num_envs
+        times, dt, count = _times(given), self._problem.dt, self._num_envs
         if times.shape != () and times.shape != (count,):
             raise InvalidInputError(
                 f"t has shape {times.shape}; give a number in s"
@@ -186,9 +186,20 @@ def refuse_time(options: Mapping[str, Any] | None, judge: str) -> None:
     Args:
         options: of `reset`.
         judge: what judges it.
+
+    Raises:
+        InvalidInputError: The time is no number.
     """
     time = options.get("t") if isinstance(options, Mapping) else None
-    if time is not None and np.any(np.asarray(time) != 0):
+    if time is not None and np.any(_times(time) != 0):
         raise ConfigurationError(
             f"t = {shown(time)}: {judge} is of whole episodes, from time 0 on; leave t out"
         )
+
+
+def _times(given: Any) -> np.ndarray:
+    """Return times as an array of floats; raises InvalidInputError for what is no time."""
+    times = real_array("time", given)
+    if np.asarray(given).dtype.kind == "b":
+        raise InvalidInputError(f"t = {shown(given)}; give a number in s")
+    return times

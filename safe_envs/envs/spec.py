@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import sys
 from typing import Any
 
@@ -22,23 +23,20 @@ _MAKERS = (
 _NOT_OF_PROBLEMS = {
     "autoreset_mode",
     "engine",
-    "max_episode_steps",
-    "num_envs",
     "render_mode",
-    "vector_kwargs",
-    "vectorization_mode",
-    "wrappers",
+    *inspect.signature(registration.make).parameters,
+    *inspect.signature(registration.make_vec).parameters,
 }
-"""Arguments of `gym.make_vec` and of envs that their problems do not have."""
+"""Arguments of envs, `gym.make` and `gym.make_vec` that problems do not have."""
 
 
 class SystemSpec(EnvSpec):
     """The spec of an env that ends its episodes itself, after the horizon of its problem.
 
-    `max_episode_steps` is what was given, by Gymnasium's TimeLimit for one, or else the length of
-    the env's own episodes. What makes envs and further specs of a spec reads only what was given:
-    by the length, `gym.make` would limit the episodes of an env whatever `dt` and `horizon` it is
-    made with.
+    `max_episode_steps` is the length of the env's own episodes, or what was given, by Gymnasium's
+    TimeLimit for one, where that is less. What makes envs and further specs of a spec reads only
+    what was given: by the length, `gym.make` would limit the episodes of an env whatever `dt` and
+    `horizon` it is made with.
 
     Attributes:
         own_steps: control periods until the env itself truncates an episode; None for those of the
@@ -62,9 +60,10 @@ class SystemSpec(EnvSpec):
     @property
     def max_episode_steps(self) -> int | None:
         """Control periods until an episode is truncated; None where that is not known."""
-        if self.given_steps is not None or sys._getframe(1).f_code in _MAKERS:
+        if sys._getframe(1).f_code in _MAKERS:
             return self.given_steps
-        return self._default_steps() if self.own_steps is None else self.own_steps
+        own = self._default_steps() if self.own_steps is None else self.own_steps
+        return min(filter(None, (self.given_steps, own)), default=None)
 
     @max_episode_steps.setter
     def max_episode_steps(self, steps: int | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]

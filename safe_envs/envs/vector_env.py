@@ -100,7 +100,10 @@ class SafeVectorEnv(VectorInterface):
 
         They can be set within episodes, by an array (n,) for all envs too; see `SafeEnv.state`.
         """
-        return np.stack(self.components, axis=-1)
+        found = np.stack(self.components, axis=-1)
+        # Writing to a copy would do nothing, and nobody would notice.
+        found.flags.writeable = False
+        return found
 
     @state.setter
     def state(self, given: Any) -> None:
@@ -133,7 +136,7 @@ class SafeVectorEnv(VectorInterface):
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
-        return {"state": self.state, **self.episodes.snapshot(), **self._batch.snapshot()}
+        return {"state": self.state.copy(), **self.episodes.snapshot(), **self._batch.snapshot()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray], seed: Seeds = None) -> None:
         """Put each episode where a snapshot has it.

@@ -17,11 +17,12 @@ from safe_envs.envs.simulation import steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
 from safe_envs.envs.spec import SystemSpec
 from safe_envs.errors import ConfigurationError
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second
 
 
-class VectorInterface(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Spaces, metadata, spec and seeds of a batch of envs; base of `SafeVectorEnv`.
 
     Attributes:

@@ -66,6 +66,8 @@ def require_pygame() -> None:
         gymnasium.error.DependencyNotInstalled: it is missing, or the other pygame is in its place.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    # Else it takes the signals of the whole program, and processes forked from it cannot be ended.
+    os.environ.setdefault("SDL_NO_SIGNAL_HANDLERS", "1")
     try:
         import pygame
     except ImportError as error:

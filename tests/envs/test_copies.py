@@ -127,3 +127,9 @@ def test_pictures_are_drawn_again(copied):
     played(other, 5, 5)
     assert not np.array_equal(other.render(), first)
     np.testing.assert_array_equal(env.render(), first)
+
+
+def test_shallow_copies_share_nothing_either():
+    options = {"delay": 2, "horizon": 0.5}
+    assert_goes_on_alone(gym.make(DUBINS, **options).unwrapped, copy.copy)
+    assert_goes_on_alone(gym.make_vec(DUBINS, 3, autoreset_mode="SameStep", **options), copy.copy)

@@ -183,6 +183,8 @@ def test_what_follows_a_late_start_begins_at_time_0(engine, mode, plain):
         ({"t": np.nan}, InvalidInputError, r"t = nan s"),
         ({"t": [0.0, 0.1]}, InvalidInputError, r"t has shape \(2,\); give a number in s"),
         ({"t": "late"}, InvalidInputError, "give an array of real numbers"),
+        ({"t": [[0.1], [0.1, 0.2]]}, InvalidInputError, "give an array of real numbers"),
+        ({"t": True}, InvalidInputError, "t = True; give a number in s"),
     ],
 )
 def test_what_is_not_allowed_is_refused_and_changes_nothing(options, error, message):
@@ -241,7 +243,7 @@ def test_states_of_a_batch_can_be_set(engine, plain):
         envs.step(action)
         single.step(action[1])
     counters = {name: v for name, v in envs.unwrapped.snapshot().items() if name != "state"}
-    states = envs.unwrapped.state
+    states = envs.unwrapped.state.copy()
     states[1] = single.unwrapped.state = UNSAFE
     envs.unwrapped.state = states
     for name, value in counters.items():
@@ -254,6 +256,15 @@ def test_states_of_a_batch_can_be_set(engine, plain):
         assert infos["h_min"][1] == pytest.approx(theirs[4]["h_min"], rel=1e-12)
     envs.unwrapped.state = UNSAFE
     np.testing.assert_array_equal(envs.unwrapped.state, np.tile(UNSAFE, (3, 1)))
+
+
+def test_a_part_of_a_state_cannot_be_written_to():
+    """It would be written to a copy, and do nothing."""
+    for env in (gym.make(DUBINS), batch()):
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match="read-only"):
+            env.unwrapped.state[0] = 2.0
+        env.unwrapped.state = 0.5 * env.unwrapped.state
 
 
 def test_a_state_that_cannot_be_is_not_set():

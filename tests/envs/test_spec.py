@@ -66,7 +66,8 @@ def test_no_limit_but_the_envs_own(options, steps):
         assert again.spec.max_episode_steps == steps
         assert TimeLimit not in layers(again)
     for mode in ("sync", "vector_entry_point"):
-        envs = gym.make_vec(ACC, 2, mode, **options)
+        checked = {"disable_env_checker": True} if mode == "sync" else {}
+        envs = gym.make_vec(ACC, 2, mode, **options, **checked)
         assert envs.spec.max_episode_steps == steps
         assert all(env.spec.max_episode_steps == steps for env in getattr(envs, "envs", []))
     if steps < 100:
@@ -81,6 +82,11 @@ def test_a_limit_that_is_given_is_gymnasiums():
         assert each.spec.max_episode_steps == 3
         assert each.unwrapped.spec.max_episode_steps == 5000
         assert steps_played(each) == 3
+    # The horizon ends them before.
+    short = gym.make(ACC, max_episode_steps=30, horizon=1.0)
+    for each in (short, gym.make(short.spec)):
+        assert each.spec.max_episode_steps == steps_played(each) == 20
+        assert each._max_episode_steps == 30
     envs = gym.make_vec(ACC, 2, max_episode_steps=3)
     assert envs.spec.max_episode_steps == gym.make_vec(envs.spec).spec.max_episode_steps == 3
     envs = gym.make_vec(ACC, 2, "sync", max_episode_steps=3)

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 
+from safe_envs.wrappers.qp import plane
 from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
 
 EPS = float(np.finfo(float).eps)
@@ -18,7 +19,9 @@ def one(a, b, v, low=LOW, high=HIGH, w=(1.0, 1.0), priority=None):
 
 def many(a, b, v, low, high, w, priority):
     """Solve a (N, k, 2), b (N, k), and v, low, high, w (N, 2) in one batch, and check that the
-    floats give the same bits."""
+    floats give the same: the same bits where the batch meets the rows at once, else the same flags
+    and the same inputs up to 1e-12 of themselves and of the half-width of their bounds, where that
+    is at most 1."""
     k = b.shape[1]
     rows = [[a[:, i, j] for j in (0, 1)] for i in range(k)]
     *parts, feasible = project_arrays(
@@ -26,8 +29,13 @@ def many(a, b, v, low, high, w, priority):
     )
     u, margin, active = [np.array(part).T for part in parts]
     for i in range(len(b)):
-        found = project_floats(*[part[i].tolist() for part in (a, b, v, low, high, w)], priority)
-        assert (u[i].tolist(), margin[i].tolist(), active[i].tolist(), bool(feasible[i])) == found
+        of_one = [part[i].tolist() for part in (a, b, v, low, high, w)]
+        found = project_floats(*of_one, priority)
+        assert (active[i].tolist(), bool(feasible[i])) == found[2:]
+        if plane.project_floats(*of_one):
+            assert (u[i].tolist(), margin[i].tolist()) == found[:2]
+        reach = 1e-12 * (np.abs(found[0]) + np.minimum((high[i] - low[i]) / 2, 1.0))
+        assert np.all(np.abs(u[i] - found[0]) <= reach)
     assert np.all((u >= low) & (u <= high))
     np.testing.assert_allclose(margin, dot(a, u) + b, rtol=0, atol=4 * EPS * terms(a, b, u).max())
     return u, margin, active, feasible

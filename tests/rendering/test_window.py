@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import sys
 import warnings
 from copy import deepcopy
@@ -54,6 +57,23 @@ def test_the_window_follows_the_steps():
     env.close()
     assert not pygame.display.get_init()
     env.close()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are ended otherwise there")
+def test_a_window_leaves_the_signals_of_the_program_alone():
+    code = (
+        "import gymnasium as gym, os, signal, time, safe_envs\n"
+        f"gym.make({DUBINS!r}, render_mode='human').reset()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\n"
+        "time.sleep(1)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "SDL_VIDEODRIVER": "dummy"},
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGTERM
 
 
 @pytest.mark.usefixtures("no_display")

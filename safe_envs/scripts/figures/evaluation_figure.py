@@ -10,7 +10,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
@@ -19,7 +18,7 @@ from safe_envs.agents.policies.base import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.log_panels import LogColors, LogPanels
+from safe_envs.scripts.figures.log_panels import LogColors, LogPanels, plain
 from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE, WARM, add_legend
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
@@ -52,9 +51,9 @@ def draw(evaluation: Evaluation, path: Path) -> None:
         _draw_curve(figure.add_subplot(grid[1, 0], sharex=barrier), evaluation, colors)
         if problem.plane:
             _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
-        _draw_episodes(lower.subgridspec(count, len(episodes)), episodes)
+        panels = _draw_episodes(lower.subgridspec(count, len(episodes)), episodes)
         handles = barrier.get_legend_handles_labels()[0]
-        add_legend(figure, [*handles, *_handles_of(evaluation, episodes)])
+        add_legend(figure, [*handles, *_handles_of(evaluation, episodes, panels)])
         title = f"{evaluation.title}, {_policy_name(Path(config['policy']['name']))} policy"
         figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
@@ -68,8 +67,16 @@ def _first_episodes(evaluation: Evaluation, colors: dict[str, str]) -> dict[str,
     }
 
 
-def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> None:
-    """Draw the first episode under each filter in a column of its own, with common scales."""
+def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> dict[str, list[Axes]]:
+    """Draw the first episode under each filter in a column of its own, with common scales.
+
+    Args:
+        grid: for the panels.
+        episodes: by filter.
+
+    Returns:
+        The panels, by filter.
+    """
     shape, h_at = grid.get_geometry(), next(iter(episodes.values())).barrier_panel
     panels = np.array([grid.figure.add_subplot(cell) for cell in grid]).reshape(shape)
     for (name, drawn), column in zip(episodes.items(), panels.T, strict=True):
@@ -82,15 +89,31 @@ def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> None:
         for panel in row:
             panel.set_ylim(bottom, high.max())
             panel.label_outer()
+    found = {name: list(column) for name, column in zip(episodes, panels.T, strict=True)}
+    for name, drawn in episodes.items():
+        drawn.note_cuts(found[name])
+    return found
 
 
-def _handles_of(evaluation: Evaluation, episodes: dict[str, LogPanels]) -> list[Any]:
-    """Return the entries of the legend that the first episodes add to those of the filters."""
-    marks = max((each.handles() for each in episodes.values()), key=len)
+def _handles_of(
+    evaluation: Evaluation, episodes: dict[str, LogPanels], panels: dict[str, list[Axes]]
+) -> list[Any]:
+    """Return the entries of the legend that the first episodes add to those of the filters.
+
+    Args:
+        evaluation: with the barriers.
+        episodes: by filter.
+        panels: of each.
+    """
+    marks: dict[str, Any] = {}
+    seen: set[int] = set()
+    for name, drawn in episodes.items():
+        marks |= {mark.get_label(): mark for mark in drawn.handles(panels[name])}
+        seen |= set(drawn.seen(panels[name]))
     barriers, grey = evaluation.problem.barriers, LogColors(barriers=(QUIET,))
-    several = range(len(barriers)) if len(barriers) > 1 else ()
-    lines = [Line2D([], [], **grey.barrier(i), label=f"{barriers[i].name}") for i in several]
-    return [*(mark for mark in marks if "executed" not in mark.get_label()), *lines]
+    several = sorted(seen) if len(barriers) > 1 else []
+    lines = grey.legend({i: plain(barriers[i].name) for i in several})
+    return [*(mark for label, mark in marks.items() if "executed" not in label), *lines]
 
 
 def _policy_name(path: Path) -> str:

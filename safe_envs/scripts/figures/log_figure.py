@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.errors import ConfigurationError, shortened
-from safe_envs.scripts.figures.log_panels import LogPanels, plain
+from safe_envs.scripts.figures.log_panels import LogPanels, note, plain
 from safe_envs.scripts.figures.style import STYLE, add_legend
 from safe_envs.wrappers.decision_log import DecisionLog
+from safe_envs.wrappers.decision_log.files import path_of
 
 _WIDTH = 5.6
 """In inches: text of 10 points can be read on the screen of a phone."""
@@ -20,6 +21,8 @@ _WIDTH = 5.6
 _HEIGHT = 1.35
 _LINE = 0.21
 """In inches, of a panel and of a line of the legend."""
+
+_COLUMN = 8
 
 
 def plot_log(
@@ -33,8 +36,8 @@ def plot_log(
     """Draw the nominal and the executed inputs, h and slacks of a log over time.
 
     Periods in which a constraint changed the input are shaded, infeasible ones hatched. The
-    smallest h is always within its panel; others may leave it at the top. Slacks have a panel where
-    there are some.
+    smallest h is always within its panel; others may leave it at the top, where the panel says so.
+    The legend has what can be seen. Slacks have a panel where there are some.
 
     Args:
         log: the log, or its file as `DecisionLog.read` takes it.
@@ -58,18 +61,22 @@ def plot_log(
         )
     drawn = LogPanels(log)
     with mpl.rc_context(STYLE):
-        left, right = drawn.handles(), drawn.barrier_handles()
-        height = 0.9 + _HEIGHT * drawn.count + _LINE * max(len(left), len(right))
-        figure = Figure(figsize=(_WIDTH, height))
-        panels = figure.subplots(drawn.count, 1, sharex=True, squeeze=False)[:, 0]
-        drawn.draw(list(panels))
+        figure = Figure()
+        panels = list(figure.subplots(drawn.count, 1, sharex=True, squeeze=False)[:, 0])
+        drawn.draw(panels)
+        drawn.note_cuts(panels)
         figure.align_ylabels(panels)
-        nothing = [Line2D([], [], linewidth=0, label=" ")]
-        add_legend(figure, [*left, *nothing * (len(right) - len(left)), *right], 2)
-        said = str(log).replace("; ", "\n", 1) if title is None else title
-        figure.suptitle(plain(said, 200), fontsize=10)
+        left, right = drawn.handles(panels), drawn.barrier_handles(panels)
+        # A few barriers have a column of their own.
+        if len(right) <= _COLUMN:
+            left += [note(" ")] * (len(right) - len(left))
+        lines = max(len(left), math.ceil((len(left) + len(right)) / 2))
+        figure.set_size_inches(_WIDTH, 0.9 + _HEIGHT * drawn.count + _LINE * lines)
+        add_legend(figure, [*left, *right], 2)
+        said = str(log).partition("; ")[::2] if title is None else str(title).splitlines()
+        figure.suptitle("\n".join([plain(each, 200) for each in said if each]), fontsize=10)
         if out is not None:
-            _write(figure, Path(out))
+            _write(figure, path_of(out, "FILE.png, FILE.pdf or FILE.svg"))
     return figure
 
 

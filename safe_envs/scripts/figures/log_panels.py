@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,10 +15,15 @@ from matplotlib.patches import Patch
 from safe_envs.errors import shortened
 from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, WARM
 from safe_envs.wrappers.decision_log import DecisionLog
+from safe_envs.wrappers.decision_log.columns import printable
 
 _DASHES = ("solid", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
+_WIDTHS = (1.6, 0.8)
 _LONG = 15
 """Characters that the label of a panel has no room for."""
+
+_MOST = 1e100
+"""Larger numbers are drawn as this one: Matplotlib computes with their squares."""
 
 _PROPOSED: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (4, 1))}
 _BOUNDS: dict[str, Any] = {"color": QUIET, "linewidth": 0.9, "linestyle": ":"}
@@ -34,7 +39,7 @@ _INFEASIBLE: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class LogColors:
-    """Colours of the lines; those of the barriers take turns.
+    """Colours of the lines; those of the barriers take turns, and then dashes and widths.
 
     Attributes:
         nominal: of proposed inputs.
@@ -46,10 +51,31 @@ class LogColors:
     executed: str = COLORS[0]
     barriers: tuple[str, ...] = (COLORS[1], COLORS[2], COLORS[3], COLORS[5])
 
+    @property
+    def distinct(self) -> int:
+        """Number of barriers whose lines all differ."""
+        return len(self.barriers) * len(_DASHES) * len(_WIDTHS)
+
     def barrier(self, i: int) -> dict[str, Any]:
-        """Return colour and dashes of a barrier; both differ, for print in grey."""
+        """Return colour, dashes and width of a barrier; the first few differ in print, too."""
         turn, place = divmod(i, len(self.barriers))
-        return {"color": self.barriers[place], "linestyle": _DASHES[(place + turn) % len(_DASHES)]}
+        width = _WIDTHS[turn // len(_DASHES) % len(_WIDTHS)]
+        return {
+            "color": self.barriers[place],
+            "linestyle": _DASHES[(place + turn) % len(_DASHES)],
+            "linewidth": width,
+        }
+
+    def legend(self, labels: Mapping[int, str]) -> list[Any]:
+        """Return entries of a legend for barriers.
+
+        Args:
+            labels: by index.
+        """
+        found = [Line2D([], [], **self.barrier(i), label=text) for i, text in labels.items()]
+        if any(i >= self.distinct for i in labels):
+            found.append(note(f"lines repeat after {self.distinct}"))
+        return found
 
 
 class LogPanels:
@@ -67,10 +93,11 @@ class LogPanels:
 
     def __init__(self, log: DecisionLog, colors: LogColors | None = None) -> None:
         self._log, self._colors = log, colors or LogColors()
-        t = self._t = log.t
+        t = self._t = np.clip(log.t, -_MOST, _MOST)
         # The last period is taken to be as long as usual.
-        last = t[-1] + (np.median(np.diff(t)) if len(t) > 1 else 1.0)
-        self._ends = np.append(t[1:], last)
+        usual = float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+        self._ends = np.append(t[1:], t[-1] + max(usual or 1.0, 1e-9 * abs(t[-1])))
+        self._h = self._numbers("h")
         self.slack = bool(log.section("slack").any())
         self.barrier_panel = len(log.columns.inputs)
         self.count = self.barrier_panel + 1 + self.slack
@@ -91,59 +118,104 @@ class LogPanels:
             self._draw_slacks(panel)
         panels[-1].set_xlabel("time (s)")
 
-    def handles(self) -> list[Any]:
-        """Return entries of a legend: the inputs, and what is marked."""
+    def handles(self, panels: Sequence[Axes]) -> list[Any]:
+        """Return entries of a legend: the inputs, and what is marked, as far as it can be seen.
+
+        Args:
+            panels: that were drawn, with their limits.
+        """
+        log, colors = self._log, self._colors
         found: list[Any] = [
-            Line2D([], [], color=self._colors.nominal, **_PROPOSED, label="nominal input"),
-            Line2D([], [], color=self._colors.executed, linewidth=1.6, label="executed input"),
-            Line2D([], [], **_BOUNDS, label="input bounds"),
-            Patch(**_INTERVENTION, label="intervention"),
+            Line2D([], [], color=colors.executed, linewidth=1.6, label="executed input")
         ]
-        if not self._log.feasible.all():
+        if (log.section("nominal") != log.section("action")).any():
+            found.insert(
+                0, Line2D([], [], color=colors.nominal, **_PROPOSED, label="nominal input")
+            )
+        limits = np.array([panel.get_ylim() for panel in panels[: self.barrier_panel]])
+        bounds = np.stack([log.section("low"), log.section("high")])
+        if ((bounds >= limits[:, 0]) & (bounds <= limits[:, 1])).any():
+            found.append(Line2D([], [], **_BOUNDS, label="input bounds"))
+        if (log.intervention & log.feasible).any():
+            found.append(Patch(**_INTERVENTION, label="intervention"))
+        if not log.feasible.all():
             found.append(Patch(**_INFEASIBLE, label="infeasible"))
         return found
 
-    def barrier_handles(self) -> list[Any]:
-        """Return entries of a legend for the barriers, with the smallest value of each."""
-        h, names = self._log.section("h"), self._log.columns.barriers
-        return [
-            Line2D(
-                [],
-                [],
-                **self._colors.barrier(i),
-                linewidth=1.6,
-                label=f"{name if name.startswith('h') else f'h {name}'}, min {low:.3g}",
-            )
-            for i, (name, low) in enumerate(zip(map(plain, names), h.min(axis=0), strict=True))
+    def seen(self, panels: Sequence[Axes]) -> list[int]:
+        """Return the barriers of which something can be seen.
+
+        Args:
+            panels: that were drawn, with their limits.
+        """
+        low, high = panels[self.barrier_panel].get_ylim()
+        found = ((self._h >= low) & (self._h <= high)).any(axis=0)
+        slacks = self._log.section("slack").any(axis=0)
+        return np.flatnonzero(found | slacks).tolist()
+
+    def barrier_handles(self, panels: Sequence[Axes]) -> list[Any]:
+        """Return entries of a legend for the barriers, with the smallest value of each.
+
+        Args:
+            panels: that were drawn, with their limits.
+        """
+        names, seen = self._log.columns.barriers, self.seen(panels)
+        lowest = self._log.section("h").min(axis=0)
+        labels = {
+            i: f"{name if name.startswith('h') else f'h {name}'}, min {lowest[i]:.3g}"
+            for i, name in ((i, plain(names[i])) for i in seen)
+        }
+        found = self._colors.legend(labels)
+        if len(seen) < len(names):
+            found.append(note(f"outside the panel: {len(names) - len(seen)} more"))
+        return found
+
+    def note_cuts(self, panels: Sequence[Axes]) -> None:
+        """Say in the panel of h where it is cut off, if anything lies beyond.
+
+        Args:
+            panels: that were drawn, with their limits.
+        """
+        panel = panels[self.barrier_panel]
+        low, high = panel.get_ylim()
+        cuts = [
+            f"{end:.2g}" for end, cut in ((low, self._h < low), (high, self._h > high)) if cut.any()
         ]
+        if cuts:
+            text = f"h cut off at {' and '.join(cuts)}"
+            panel.set_title(text, loc="right", fontsize=8, color=QUIET, pad=2)
+
+    def _numbers(self, section: str) -> np.ndarray:
+        """Return the columns of a section, without what cannot be drawn."""
+        values = self._log.section(section)
+        return np.where(np.isfinite(values), np.clip(values, -_MOST, _MOST), np.nan)
 
     def _draw_input(self, panel: Axes, j: int) -> None:
         nominal, action, low, high = (
-            self._log.section(name)[:, j] for name in ("nominal", "action", "low", "high")
+            self._numbers(name)[:, j] for name in ("nominal", "action", "low", "high")
         )
         steps: Any = {"drawstyle": "steps-post"}
         panel.plot(self._t, nominal, color=self._colors.nominal, **_PROPOSED, **steps)
         panel.plot(self._t, action, color=self._colors.executed, linewidth=1.6, **steps)
         for bound in (low, high):
             panel.plot(self._t, bound, **_BOUNDS, **steps)
-        smallest, largest = min(nominal.min(), action.min()), max(nominal.max(), action.max())
-        span = (high - low).max()
-        width = largest - smallest or (span if np.isfinite(span) else 1.0)
+        smallest, largest = _range(nominal, action)
+        down, up = _range(high - low)
+        width = largest - smallest or max(-down, up) or 1.0
         # Bounds far away would squeeze the inputs into a line.
         bottom = min([smallest, *low[low > smallest - width]])
         top = max([largest, *high[high < largest + width]])
-        room = 0.08 * (top - bottom or width)
+        room = _room(0.08 * (top - bottom or width), bottom, top)
         panel.set(ylim=(bottom - room, top + room), ylabel=self._label(j))
 
     def _draw_barriers(self, panel: Axes) -> None:
-        h = self._log.section("h")
-        for i in range(h.shape[1]):
-            panel.plot(self._t, h[:, i], **self._colors.barrier(i), linewidth=1.6)
-        smallest = min(h.min(), 0.0)
+        for i, values in enumerate(self._h.T):
+            panel.plot(self._t, values, **self._colors.barrier(i))
+        bottom, _ = _range(self._h, [0.0])
         # The smallest h is always seen; others, of another scale perhaps, leave the panel.
-        top = max(h.min(axis=1).max(), 0.0)
-        room = 0.06 * max(top - smallest, 1e-12)
-        bottom = smallest - 2.0 * room
+        _, top = _range(np.fmin.reduce(self._h, axis=1), [0.0])
+        room = _room(0.06 * (top - bottom), bottom, top)
+        bottom -= 2.0 * room
         # Whoever compares panels may move their lower end.
         panel.axhspan(
             bottom - 1e3 * (top - bottom), 0.0, color=UNSAFE, alpha=0.5, linewidth=0, zorder=0
@@ -154,10 +226,10 @@ class LogPanels:
         panel.set(ylim=(bottom, top + room), ylabel=f"h{unit}")
 
     def _draw_slacks(self, panel: Axes) -> None:
-        slack = self._log.section("slack")
-        for i in range(slack.shape[1]):
-            panel.plot(self._t, slack[:, i], **self._colors.barrier(i), drawstyle="steps-post")
-        panel.set(ylim=(0.0, 1.08 * slack.max() or 1.0), ylabel="slack")
+        slack = self._numbers("slack")
+        for i, values in enumerate(slack.T):
+            panel.plot(self._t, values, **self._colors.barrier(i), drawstyle="steps-post")
+        panel.set(ylim=(0.0, 1.08 * _range(slack, [0.0])[1] or 1.0), ylabel="slack")
 
     def _mark(self, panel: Axes) -> None:
         """Shade the periods with interventions, and hatch the infeasible ones."""
@@ -188,7 +260,28 @@ def plain(text: str, most: int = 40) -> str:
         text: a name, say.
         most: characters, about.
     """
-    return shortened(text, most).replace("$", r"\$")
+    return shortened(printable(text), most).replace("$", r"\$")
+
+
+def note(text: str) -> Any:
+    """Return a line of text for a legend.
+
+    Args:
+        text: to say.
+    """
+    return Line2D([], [], linewidth=0, label=text)
+
+
+def _range(*values: Any) -> tuple[float, float]:
+    """Return the smallest and the largest number, without nan; zeros where there is none."""
+    found = np.concatenate([np.ravel(each) for each in values])
+    found = found[~np.isnan(found)]
+    return (float(found.min()), float(found.max())) if found.size else (0.0, 0.0)
+
+
+def _room(wanted: float, bottom: float, top: float) -> float:
+    """Return room below and above a range, as much as floats need at least."""
+    return max(wanted, 1e-6 * max(abs(bottom), abs(top)), 1e-12)
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:

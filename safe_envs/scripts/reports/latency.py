@@ -23,7 +23,7 @@ _STATES = 64
 """That take turns, so that no case lives in the caches of one state."""
 
 
-class Decisions(NamedTuple):
+class TimedCalls(NamedTuple):
     """Calls of a filter.
 
     Attributes:
@@ -40,7 +40,7 @@ class Decisions(NamedTuple):
         """Return what is decided, as a batch."""
         return self.safety_filter.filter(self.states, self.inputs)
 
-    def where(self, chosen: np.ndarray) -> Decisions:
+    def where(self, chosen: np.ndarray) -> TimedCalls:
         """Return the first of the calls that are chosen.
 
         Args:
@@ -50,20 +50,20 @@ class Decisions(NamedTuple):
         return self._replace(states=self.states[places], inputs=self.inputs[places])
 
 
-def cases() -> dict[str, Decisions]:
+def cases() -> dict[str, TimedCalls]:
     """Return the calls to time, by name: those that are free, or bind and can be met, or cannot."""
     found = {}
     for count, title in ((1, "one constraint"), (3, "three constraints")):
-        calls = Decisions(*obstacle_course(count, _DRAWN))
+        calls = TimedCalls(*obstacle_course(count, _DRAWN))
         decision = calls.decisions()
         binding = decision.active.any(axis=1)
         found[f"{title}, two inputs, free"] = calls.where(~binding)
         found[f"{title}, two inputs, binding"] = calls.where(binding & decision.feasible)
-    calls = Decisions(*flights_within_limits(0.3, _DRAWN))
+    calls = TimedCalls(*flights_within_limits(0.3, _DRAWN))
     decision = calls.decisions()
     binding = decision.active.any(axis=1)
     found["QuadrotorLimits, feasible, binding"] = calls.where(binding & decision.feasible)
-    calls = Decisions(*flights_within_limits(0.7, _DRAWN))
+    calls = TimedCalls(*flights_within_limits(0.7, _DRAWN))
     found["QuadrotorLimits, infeasible"] = calls.where(~calls.decisions().feasible)
     return found
 
@@ -101,7 +101,7 @@ def is_latency(name: str) -> bool:
     return name.startswith(_PREFIX)
 
 
-def _times(calls: Decisions) -> np.ndarray:
+def _times(calls: TimedCalls) -> np.ndarray:
     """Return the processor time of single calls in microseconds, less that of the clock itself."""
     clock, decide = time.process_time_ns, calls.safety_filter.filter
     pairs = list(zip(calls.states, calls.inputs, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,6 +13,7 @@ from functools import cached_property
 from safe_envs.errors import ConfigurationError, nearest, shown
 
 _FLAGS = ("intervention", "feasible", "cause")
+_BRACKETED_END = re.compile(r" \[([^][]*)\]$")
 _HEADING = re.compile(r"(\w+):(.*?)(?: \[([^][]*)\])?", re.DOTALL)
 _SECTIONS = ("state", "parameter", "nominal", "action", "low", "high", "h", "slack")
 
@@ -50,6 +52,9 @@ class LogColumns:
     ) -> LogColumns:
         """Return the columns of symbols or names; barriers of the same name are numbered.
 
+        In names and units characters that cannot be printed are replaced by spaces, and brackets at
+        the end of a name by parentheses: there they would be read as a unit.
+
         Args:
             states: n symbols.
             inputs: m symbols.
@@ -59,19 +64,22 @@ class LogColumns:
 
         Raises:
             ConfigurationError: The units are no mapping, or one is of nothing that is logged or
-                holds a bracket.
+                holds a bracket; or states, inputs or parameters have a name twice.
         """
         if not isinstance(units, Mapping | None):
             raise ConfigurationError(
                 f"units = {shown(units)}; give a dict of texts, such as {{'x': 'm'}}"
             )
-        count, number = Counter(barriers), Counter()
-        names = []
-        for name in barriers:
-            number[name] += 1
-            names.append(f"{name} {number[name]}" if count[name] > 1 else name)
-        parts = [tuple(map(str, part)) for part in (states, inputs, names, parameters)]
-        given = {str(name): str(unit) for name, unit in (units or {}).items() if unit}
+        names = _numbered([_name(barrier) for barrier in barriers])
+        parts = [tuple(map(_name, part)) for part in (states, inputs, names, parameters)]
+        for part in parts:
+            for name, count in Counter(part).items():
+                if count > 1:
+                    raise ConfigurationError(
+                        f"{shown(name)} names {count} columns of the log; give each its own name"
+                    )
+        given = {_name(k): printable(str(unit)).strip() for k, unit in (units or {}).items()}
+        given = {name: unit for name, unit in given.items() if unit}
         known = list(itertools.chain(*parts))
         for name, unit in given.items():
             if name not in known:
@@ -107,6 +115,22 @@ class LogColumns:
         ]
         return ["t [s]", *named, *_FLAGS]
 
+    def misfit(self, numbers: Sequence[float]) -> str | None:
+        """Return why numbers cannot be those of a period; None if they can.
+
+        Args:
+            numbers: of one period.
+        """
+        if len(numbers) != len(self.headings):
+            return f"{len(numbers)} numbers for {len(self.headings)} columns"
+        *_, intervened, feasible, cause = numbers
+        if not math.isfinite(numbers[0]) or not {intervened, feasible} <= {0.0, 1.0}:
+            return "t must be finite, and the two flags near the end 0 or 1"
+        last = len(self.barriers) - 1
+        if cause not in range(-1, last + 1):
+            return f"the cause at the end must be a whole number from -1 to {last}"
+        return None
+
     def _bracketed(self, name: str) -> str:
         return f" [{self.units[name]}]" if name in self.units else ""
 
@@ -117,6 +141,9 @@ class LogColumns:
         Raises:
             ValueError: They are not those of a log.
         """
+        twice = [heading for heading, count in Counter(headings).items() if count > 1]
+        if twice:
+            raise ValueError(f"it has the column {shown(twice[0])} twice")
         found: dict[str, list[str]] = {section: [] for section in _SECTIONS}
         units = {}
         for heading in headings[1 : -len(_FLAGS)]:
@@ -132,3 +159,29 @@ class LogColumns:
         if columns.headings != list(headings) or not (columns.inputs and columns.barriers):
             raise ValueError("its columns are not those of a log, in their order")
         return columns
+
+
+def printable(text: str) -> str:
+    """Return a text with spaces in the place of characters that cannot be printed.
+
+    Args:
+        text: of anybody; it may hold control characters and halves of surrogate pairs.
+    """
+    return "".join([c if c.isprintable() else " " for c in text])
+
+
+def _name(given: object) -> str:
+    return _BRACKETED_END.sub(r" (\1)", printable(str(given)))
+
+
+def _numbered(names: Sequence[str]) -> list[str]:
+    """Return names, each once: those that come twice get numbers that no other name has."""
+    count, found = Counter(names), []
+    taken = {name for name in names if count[name] == 1}
+    for name in names:
+        if count[name] > 1:
+            numbers = itertools.count(1)
+            name = next(new for i in numbers if (new := f"{name} {i}") not in taken)
+            taken.add(name)
+        found.append(name)
+    return found

@@ -13,7 +13,7 @@ import numpy as np
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.bounded_reading import MOST_BYTES, read_bytes
-from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.errors import ConfigurationError, shortened, shown
 from safe_envs.wrappers.decision_log.columns import LogColumns
 
 _ADVICE = "give what `DecisionLog.to_csv` or `to_parquet` wrote"
@@ -139,10 +139,28 @@ def _require_log(columns: LogColumns, table: np.ndarray) -> None:
         )
     if not np.isfinite(table[:, 0]).all():
         raise ValueError("a time in it is not finite")
+    back = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
+    if back.size:
+        raise ValueError(f"time goes back in it, after {table[back[0], 0]:g} s")
     flags, cause = table[:, -3:-1], table[:, -1]
     causes = range(-1, len(columns.barriers))
     if not (np.isin(flags, (0.0, 1.0)).all() and np.isin(cause, causes).all()):
         raise ValueError("a flag in it is neither 0 nor 1, or a cause is none of its barriers")
+
+
+def path_of(given: Path | str, allowed: str) -> Path:
+    """Return the path of a file.
+
+    Args:
+        given: by the user.
+        allowed: what may be given, for the error.
+
+    Raises:
+        ConfigurationError: It is no path.
+    """
+    if not isinstance(given, str | Path):
+        raise ConfigurationError(f"{shown(given)} is no path; give {allowed}")
+    return Path(given)
 
 
 def _require_pyarrow() -> None:

@@ -10,17 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, shown
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, shown
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.number_text import finite_number
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.decision_log.columns import LogColumns
-from safe_envs.wrappers.decision_log.files import read_log, write_csv, write_parquet
+from safe_envs.wrappers.decision_log.files import path_of, read_log, write_csv, write_parquet
+from safe_envs.wrappers.decision_log.given import (
+    Defaults,
+    endless,
+    pairs_of,
+    require_finite,
+    runtime_values,
+)
 from safe_envs.wrappers.filter_qp import FilterDecision
-from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
-class DecisionLog:
+class DecisionLog(IndependentCopies):
     """States, inputs, barriers and slacks of a control loop over time.
 
     Adding a decision takes a few microseconds and 8 bytes for each column. The log grows with every
@@ -32,14 +39,21 @@ class DecisionLog:
 
     Attributes:
         columns: as given.
+
+    Raises:
+        ConfigurationError: they are no `LogColumns`.
     """
 
     def __init__(self, columns: LogColumns) -> None:
+        if not isinstance(columns, LogColumns):
+            raise ConfigurationError(
+                f"columns = {shown(columns)}; make a log by DecisionLog.for_filter(safety_filter)"
+            )
         self.columns = columns
         self._width = len(columns.headings)
         self._values = array("d")
         self._bounds: tuple[Sequence[float], Sequence[float]] = ((), ())
-        self._defaults: list[tuple[Any, str, float | None]] = []
+        self._defaults: Defaults = []
         # The columns of the time, the state and the parameters come first.
         self._inputs = 1 + len(columns.states)
 
@@ -64,7 +78,7 @@ class DecisionLog:
         runtime = [symbol for symbol in qp.runtime if symbol != TIME]
         names = [barrier.name for barrier, _ in safety_filter.pairs]
         log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
-        log._bounds = _endless(qp.low), _endless(qp.high)
+        log._bounds = endless(qp.low), endless(qp.high)
         log._defaults = [(s, s.name, model.parameters.get(s)) for s in runtime]
         log._inputs += len(runtime)
         return log
@@ -81,25 +95,27 @@ class DecisionLog:
         """Add the decision of one period.
 
         Args:
-            t: time in s.
+            t: time in s, of a clock that never goes back, such as `time.monotonic`.
             x: state, shape (n,).
             decision: what the filter returned for that one state.
             bounds: as given to the filter; those of its construction by default.
             parameters: as given to the filter.
 
         Raises:
-            InvalidInputError: Something is missing, not finite or does not fit the log.
+            InvalidInputError: Something is missing, not finite or does not fit the log, or the time
+                lies before the last one.
         """
         try:
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
             intervened = decision.cause >= 0 and action != proposed
-            low, high = self._bounds if bounds is None else _pairs(bounds, len(action))
+            low, high = self._bounds if bounds is None else pairs_of(bounds, len(action))
+            known = self._defaults
             values = array(
                 "d",
                 [
                     t,
                     *x,
-                    *(self._given(parameters or {}) if self._defaults or parameters else ()),
+                    *(runtime_values(known, parameters or {}) if known or parameters else ()),
                     *proposed,
                     *action,
                     *low,
@@ -113,7 +129,7 @@ class DecisionLog:
             )
         except InvalidInputError:
             raise
-        except (AttributeError, TypeError, ValueError) as error:
+        except (AttributeError, OverflowError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the log takes one state and its decision at a time ({error}); give t in s, x of"
                 f" shape ({len(self.columns.states)},) and what the filter returned for it"
@@ -125,50 +141,33 @@ class DecisionLog:
                 " decision of the filter that the log was made for"
             )
         if not math.isfinite(sum(values[: self._inputs])):
-            self._require_finite(values[: self._inputs])
-        self._values.extend(values)
-
-    def _require_finite(self, values: Sequence[float]) -> None:
-        """Raise InvalidInputError unless the state and the parameters of a period are finite."""
-        for heading, value in zip(self.columns.headings, values, strict=False):
-            if not math.isfinite(value):
-                raise InvalidInputError(
-                    f"{heading} is {value}, of which a filter decides nothing; give what it decided"
-                    " about"
-                )
-
-    def _given(self, parameters: Mapping[Any, float]) -> list[float]:
-        """Return what was given at run time, in order."""
-        found, used = [], 0
-        for symbol, name, default in self._defaults:
-            value = parameters.get(name)
-            if value is None:
-                value = parameters.get(symbol)
-            if value is not None:
-                used += 1
-            elif default is not None:
-                value = default
-            else:
-                raise InvalidInputError(
-                    f"parameters lacks {symbol}; give what the filter was given"
-                )
-            found.append(value)
-        if used < len(parameters):
-            raise InvalidInputError(
-                f"parameters has {', '.join(map(str, parameters))}; the log takes each of"
-                f" {', '.join([name for _, name, _ in self._defaults]) or 'none'} once"
-            )
-        return found
+            require_finite(self.columns.headings, values[: self._inputs])
+        self._extend(values)
 
     def append(self, values: Sequence[float]) -> None:
         """Add the numbers of one period in the order of `LogColumns.headings`.
 
         Raises:
-            InvalidInputError: Their number does not fit.
+            InvalidInputError: They do not fit, or the time lies before the last one.
         """
-        if len(values) != self._width:
-            raise InvalidInputError(f"{len(values)} numbers for {self._width} columns of the log")
-        self._values.extend(array("d", values))
+        try:
+            row = array("d", values)
+        except (OverflowError, TypeError, ValueError) as error:
+            raise InvalidInputError(
+                f"the log takes {self._width} numbers, not {shown(values)}: {error}"
+            ) from error
+        if (reason := self.columns.misfit(row)) is not None:
+            raise InvalidInputError(f"{shown(row.tolist())} does not fit the log: {reason}")
+        self._extend(row)
+
+    def _extend(self, row: array[float]) -> None:
+        if self._values and row[0] < self._values[-self._width]:
+            raise InvalidInputError(
+                f"t = {row[0]} s lies before the last time of the log,"
+                f" {self._values[-self._width]} s; take a clock that never goes back, such as"
+                " time.monotonic, and another log for another run"
+            )
+        self._values.extend(row)
 
     def __len__(self) -> int:
         return len(self._values) // self._width
@@ -179,7 +178,15 @@ class DecisionLog:
         return np.array(self._values).reshape(-1, self._width)
 
     def section(self, name: str) -> np.ndarray:
-        """Return the columns of a section of `LogColumns`, shape (periods, columns)."""
+        """Return the columns of a section of `LogColumns`, shape (periods, columns).
+
+        Raises:
+            ConfigurationError: There is no such section.
+        """
+        if name not in self.columns.sections:
+            raise ConfigurationError(
+                f"unknown section {shown(name)}; {nearest(str(name), self.columns.sections)}"
+            )
         table = np.frombuffer(self._values).reshape(-1, self._width)
         return table[:, self.columns.sections[name]].copy()
 
@@ -255,7 +262,7 @@ class DecisionLog:
         Raises:
             ConfigurationError: The file cannot be written.
         """
-        write_csv(Path(path), self.columns, self.table())
+        write_csv(path_of(path, "FILE.csv"), self.columns, self.table())
 
     def to_parquet(self, path: Path | str) -> None:
         """Write a Parquet file, whole or not at all; needs pyarrow.
@@ -266,7 +273,7 @@ class DecisionLog:
         Raises:
             ConfigurationError: pyarrow is not installed, or the file cannot be written.
         """
-        write_parquet(Path(path), self.columns, self.table())
+        write_parquet(path_of(path, "FILE.parquet"), self.columns, self.table())
 
     @classmethod
     def read(cls, path: Path | str) -> DecisionLog:
@@ -278,20 +285,7 @@ class DecisionLog:
         Raises:
             ConfigurationError: The file cannot be read, is too large, or holds no log.
         """
-        if not isinstance(path, str | Path):
-            raise ConfigurationError(f"{shown(path)} is no path; give FILE.csv or FILE.parquet")
-        columns, table = read_log(Path(path))
+        columns, table = read_log(path_of(path, "FILE.csv or FILE.parquet"))
         log = cls(columns)
         log._values.frombytes(np.ascontiguousarray(table, dtype=np.float64).tobytes())
         return log
-
-
-def _pairs(bounds: Any, m: int) -> tuple[Sequence[float], Sequence[float]]:
-    """Return lower and upper bounds, given as one pair or as one for each of m inputs."""
-    pairs = np.broadcast_to(np.asarray(bounds, dtype=float), (m, 2))
-    return pairs[:, 0].tolist(), pairs[:, 1].tolist()
-
-
-def _endless(bounds: Sequence[float]) -> list[float]:
-    """Return bounds with infinities where a filter has `WIDEST`."""
-    return [math.copysign(math.inf, b) if abs(b) == WIDEST else b for b in bounds]

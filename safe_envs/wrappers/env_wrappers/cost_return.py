@@ -9,11 +9,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.independent_copies import IndependentCopies
 
 SixTuple = tuple[Any, Any, Any, Any, Any, dict[str, Any]]
 
 
-class CostReturnWrapper:
+class CostReturnWrapper(IndependentCopies):
     """Gives a `step` of six values to an env of this project, scalar or vector, filtered or not.
 
     It is no `gymnasium.Wrapper`, since Gymnasium's checkers and wrappers take five values: put it

@@ -13,6 +13,7 @@ from safe_envs.envs.episode import Episode, Episodes
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.envs.reset_options import refuse_time
 from safe_envs.errors import ConfigurationError
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.actuators import resting_input
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice, episode_filter
@@ -20,7 +21,7 @@ from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.value.promise_memory import PromiseMemory
 
 
-class FilterLayer:
+class FilterLayer(IndependentCopies):
     """The part of a filter's wrapper that does not depend on the number of envs."""
 
     def attach(

@@ -14,6 +14,7 @@ from safe_envs.dynamics.codegen import Components, Flavour, compile_function, st
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
 from safe_envs.errors import InvalidInputError, NumericalError, SystemDefinitionWarning
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
@@ -26,7 +27,7 @@ _CHANGE_SIGHT = (
 """Wrappers that change observations."""
 
 
-class MonitorLayer:
+class MonitorLayer(IndependentCopies):
     """The part of a monitor that does not depend on the number of envs."""
 
     env: Any

@@ -14,6 +14,7 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info
 from safe_envs.envs.reset_options import refuse_time
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.layers import state_layer
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
@@ -21,7 +22,9 @@ from safe_envs.wrappers.value.specification_tracker import SpecificationTracker
 
 
 class SpecificationMonitor(
-    gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs
+    IndependentCopies,
+    gym.Wrapper[np.ndarray, Any, np.ndarray, Any],
+    gym.utils.RecordConstructorArgs,
 ):
     """Adds robustness, satisfied, verdict and automaton_state to `info`.
 

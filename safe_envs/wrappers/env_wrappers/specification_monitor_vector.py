@@ -12,12 +12,13 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.reset_options import refuse_time
+from safe_envs.independent_copies import IndependentCopies
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
 from safe_envs.wrappers.env_wrappers.specification_monitor import with_regions
 from safe_envs.wrappers.value.specification_tracker import SpecificationTracker
 
 
-class SpecificationMonitorVector(gym.vector.VectorWrapper):
+class SpecificationMonitorVector(IndependentCopies, gym.vector.VectorWrapper):
     """`SpecificationMonitor` over a whole batch: arrays with the batch in front, and masks.
 
     A step that only resets an env (next-step autoreset) begins its trace. With same-step autoreset

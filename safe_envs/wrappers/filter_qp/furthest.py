@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import mul, truediv
 from typing import Any
 
 
@@ -34,8 +35,8 @@ def furthest_active(
             continue
         unit = max(map(abs, a[i]))  # so that squares neither overflow nor vanish
         parts = [aj / unit for aj in a[i]]
-        square = sum([p * p / wj for p, wj in zip(parts, weights, strict=True)])
-        distance = -(dot(a[i], u) + b[i]) / unit / square**0.5
+        square = sum(map(truediv, map(mul, parts, parts), weights))
+        distance = -(sum(map(mul, a[i], u)) + b[i]) / unit / square**0.5
         if distance > furthest:
             cause, furthest = i, distance
     return cause

@@ -4,11 +4,11 @@
 
 Where the constraints cannot be met together, the answer is the least-violating action, flagged: it
 minimises sum_i priority_i slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the
-minimisers it is the one nearest to v. One constraint, one input and two inputs have exact methods
-of their own. For the rest a solver proposes which constraints and bounds hold the answer, and their
-equations prove it; what that needs is imported by `prepare`, or on first use. Constraints can be
-met where the action that is returned meets them by the tolerance of
-`safe_envs.wrappers.qp.rounding`.
+minimisers it is the one nearest to v. One constraint and one input have exact methods of their own,
+and so have constraints on two inputs that can be met. For the rest a solver proposes which
+constraints and bounds hold the answer, and their equations prove it; what that needs is imported by
+`prepare`, or on first use. Constraints can be met where the action that is returned meets them by
+the tolerance of `safe_envs.wrappers.qp.rounding`.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def prepare(k: int, m: int, solver: str = "daqp") -> None:
         m: number of inputs.
         solver: one of `SOLVERS`.
     """
-    if k > 1 and m > 2:
+    if k > 1 and m > 1:
         _general("general_batch")
         if solver != "daqp":
             _general(solver)
@@ -85,6 +85,9 @@ def project_floats(
     found = None
     if len(v) == 2:
         found = plane.project_floats(a, b, v, low, high, w)
+        if not found and solver == "daqp":
+            u, margin, _, met = _general("general").project_floats(a, b, v, low, high, w, priority)
+            return u, margin, plane.binding(a, b, u, margin, low, high, w), met
     elif len(v) == 1:
         found = interval.project_floats([ai for (ai,) in a], b, v[0], low[0], high[0])
     elif solver == "daqp":
@@ -131,10 +134,14 @@ def project_arrays(
             [ai for (ai,) in a], b, v[0], low[0], high[0], priority
         )
         return [u], list(margin), list(active), feasible
+    weights = np.array(priority)
+
+    def by_proof(parts: Sequence[np.ndarray]) -> ArrayAnswer:
+        return _general("general_batch").project_arrays(*parts, weights, solver)
+
     if len(v) == 2:
-        u, margin, active, feasible = plane_batch.project_arrays(a, b, v, low, high, w, priority)
+        u, margin, active, feasible = plane_batch.project_arrays(a, b, v, low, high, w, by_proof)
         return list(u), list(margin), list(active), feasible
     size = len(v[0])
     table = np.array([stack(ai, size) for ai in a])
-    stacked = [stack(part, size) for part in (b, v, low, high, w)]
-    return _general("general_batch").project_arrays(table, *stacked, np.array(priority), solver)
+    return by_proof([table, *[stack(part, size) for part in (b, v, low, high, w)]])

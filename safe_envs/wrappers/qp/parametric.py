@@ -26,6 +26,8 @@ from safe_envs.wrappers.qp.working_set_batch import ArrayQP
 
 _STILL = 1e-13
 """Change of a variable that is rounding."""
+_SMALLEST = 1e-50
+"""Of the lengths of constraints, over the largest: the squares of smaller ones would vanish."""
 _MANY = 200
 """States of which arrays with all their variables are too long for one operation."""
 _PIVOTS = 5
@@ -86,7 +88,8 @@ class _Path:
         unit = -offsets.min(axis=0)
         unit[unit <= 0.0] = 1.0
         scale = p.roots / unit
-        weights = p.priority * p.lengths * p.lengths
+        sizes = np.maximum(p.lengths / p.lengths.max(axis=0), _SMALLEST)
+        weights = p.priority * sizes * sizes
         free = start == p.v
         table = np.zeros((n, n + 2, size))
         table[range(m), range(m)] = -1.0

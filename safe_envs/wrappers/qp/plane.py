@@ -6,7 +6,7 @@ Seidel's incremental scheme. The proposal clipped into the input bounds is the m
 constraints. Where it violates the next constraint, the new minimiser lies on that constraint's
 line: the input bounds and the constraints before leave an interval of the line, and the point of
 the line nearest to v is clipped into it. Where the interval is empty, be it by rounding or because
-no action meets the constraints, `safe_envs.wrappers.qp.plane_batch` finds the answer.
+no action meets the constraints, `safe_envs.wrappers.qp.general` finds the answer.
 
 A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the
 constraint, given how far each input can go: to the end of the input bounds, or as far in the metric
@@ -81,13 +81,37 @@ def project_floats(
         ]
     ):
         return None
-    reach = r1 * abs(u1) + r2 * abs(u2)
-    s1, s2 = min(e1, reach / r1), min(e2, reach / r2)
-    active = [
+    return [u1, u2], margin, binding(a, b, u, margin, low, high, w), True
+
+
+def binding(
+    a: Sequence[Floats],
+    b: Floats,
+    u: Floats,
+    margin: Floats,
+    low: Floats,
+    high: Floats,
+    w: Floats,
+) -> list[bool]:
+    """Return which margins (k) exceed zero by no more than rounding.
+
+    Args:
+        a: k constraints of two coefficients.
+        b: k offsets.
+        u: two inputs.
+        margin: k margins there.
+        low: two lower bounds.
+        high: two upper bounds.
+        w: two positive weights.
+    """
+    r1, r2 = math.sqrt(w[0]), math.sqrt(w[1])
+    reach = r1 * abs(u[0]) + r2 * abs(u[1])
+    s1 = min(max(-low[0], high[0]), reach / r1)
+    s2 = min(max(-low[1], high[1]), reach / r2)
+    return [
         g <= 0.0 or g <= ROUNDING * (abs(bi) + abs(a1) * s1 + abs(a2) * s2)
-        for (a1, a2, bi), g in zip(rows, margin, strict=True)
+        for (a1, a2), bi, g in zip(a, b, margin, strict=True)
     ]
-    return [u1, u2], margin, active, True
 
 
 def _onto_line(

@@ -7,13 +7,13 @@ comes from the same operations in the same order as for one state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from safe_envs.wrappers.qp.min_slack import is_unique, least_violating
-from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, stack, tolerances
+from safe_envs.wrappers.qp.rounding import ROUNDING, ArrayAnswer, Arrays, Entries, stack, tolerances
 
 
 class Plane(NamedTuple):
@@ -90,9 +90,19 @@ def project_arrays(
     low: Entries,
     high: Entries,
     w: Entries,
-    priority: Floats,
+    otherwise: Callable[[Sequence[np.ndarray]], ArrayAnswer],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Project the inputs of B states; see `dispatch.project_arrays`.
+    """Project the inputs of B states.
+
+    Args:
+        a: k constraints of two coefficients, each a float or an array (B,).
+        b: k offsets, likewise.
+        v: two arrays (B,) of proposed inputs.
+        low: two lower bounds, each a float or an array (B,).
+        high: two upper bounds, likewise.
+        w: two positive weights, likewise.
+        otherwise: finds inputs, margins and whether constraints can be met, from all of these in
+            arrays, where the constraints cannot be met, or by rounding only.
 
     Returns:
         Inputs (2, B), margins (k, B), constraints that bind or cannot be met (k, B), and whether
@@ -112,13 +122,39 @@ def project_arrays(
         met &= part.met(moved, reached)
         unmet = np.flatnonzero(~met)
         if unmet.size:
-            lost = part.take(unmet)
-            moved[:, unmet] = least = _nearest_of_least_violating(lost, np.asarray(priority))
-            reached[:, unmet] = lost.margin(least)
-            met[unmet] = lost.met(least, lost.margin(least))
+            rows, *others = part.take(unmet)
+            least, missed, _, met[unmet] = otherwise([np.swapaxes(rows, 0, 1), *others])
+            moved[:, unmet], reached[:, unmet] = least, missed
         u[:, acting], margin[:, acting], feasible[acting] = moved, reached, met
         active[:, acting] = part.binds(moved, reached)
     return u, margin, active, feasible
+
+
+def project_single(
+    a: np.ndarray,
+    b: np.ndarray,
+    v: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    w: np.ndarray,
+    priority: np.ndarray,
+) -> np.ndarray:
+    """Return the nearest inputs (2,) of those that violate the constraints of one state least.
+
+    Args:
+        a: constraints, shape (k, 2).
+        b: offsets, shape (k,).
+        v: proposed inputs, shape (2,).
+        low: lower bounds, shape (2,).
+        high: upper bounds, shape (2,).
+        w: positive weights, shape (2,).
+        priority: positive weights of the squared slacks, shape (k,).
+    """
+    plane = Plane(a.T[:, :, None], *[part[:, None] for part in (b, v, low, high, w)])
+    u, met = _nearest(plane)
+    if not (met & plane.met(u, plane.margin(u))).all():
+        u = _nearest_of_least_violating(plane, priority)
+    return u[:, 0]
 
 
 def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarray:

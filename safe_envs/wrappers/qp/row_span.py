@@ -14,6 +14,8 @@ from safe_envs.wrappers.qp.rounding import Floats
 
 _DEPENDENT = 1e-14
 """Part of a unit vector that the rounding of others leaves of it."""
+_ENOUGH = 0.5
+"""Part of a vector next to which the rounding of what the others take from it is none."""
 _INDEPENDENT = 1e-8
 """Part of the entries of weighted vectors that surely is more than rounding."""
 
@@ -35,11 +37,13 @@ def orthonormal(
             share = sum(map(mul, e, rest))
             rest = [x - share * y for x, y in zip(rest, e, strict=True)]
             shares.append(share)
-        for c, e in enumerate(basis):  # takes back the rounding of the first time
-            share = sum(map(mul, e, rest))
-            rest = [x - share * y for x, y in zip(rest, e, strict=True)]
-            shares[c] += share
         left = math.hypot(*rest)
+        if basis and not left > _ENOUGH * math.hypot(*vector):
+            for c, e in enumerate(basis):  # takes back the rounding of the first time
+                share = sum(map(mul, e, rest))
+                rest = [x - share * y for x, y in zip(rest, e, strict=True)]
+                shares[c] += share
+            left = math.hypot(*rest)
         if left > least:
             basis.append([x / left for x in rest])
             shares.append(left)

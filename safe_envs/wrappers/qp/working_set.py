@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import mul
+from operator import mul, truediv
 from typing import NamedTuple
 
 from safe_envs.wrappers.qp.rounding import ROUNDING, Floats
@@ -55,6 +55,22 @@ class Point(NamedTuple):
     change: WorkingSet | None
 
 
+def margins(a: Sequence[Floats], b: Floats, u: Floats) -> tuple[list[float], list[float]]:
+    """Return the margins (k) at inputs, and their rounding.
+
+    Args:
+        a: k constraints of m coefficients.
+        b: k offsets.
+        u: m inputs.
+    """
+    margin, allowed = [], []
+    for row, offset in zip(a, b, strict=True):
+        terms = [*map(mul, row, u), offset]
+        margin.append(sum(terms))
+        allowed.append(ROUNDING * sum(map(abs, terms)))
+    return margin, allowed
+
+
 class FloatQP:
     """A QP whose constraints all depend on the input.
 
@@ -80,7 +96,6 @@ class FloatQP:
         """Take a QP; see `dispatch.project_floats`."""
         self.a, self.b, self.v, self.low, self.high = a, b, v, low, high
         self.w, self.priority = w, priority
-        self.roots = [math.sqrt(wj) for wj in w]
         self.start = [
             lo if vj < lo else hi if vj > hi else vj
             for vj, lo, hi in zip(v, low, high, strict=True)
@@ -88,16 +103,24 @@ class FloatQP:
         self.margin = [
             sum(map(mul, row, self.start)) + offset for row, offset in zip(a, b, strict=True)
         ]
+        self.roots: list[float] = []
         self.normals: list[list[float]] = []
         self.lengths: list[float] = []
-        for row in a:
-            scaled = [aj / root for aj, root in zip(row, self.roots, strict=True)]
+        self.sizes: list[float] = []
+
+    def scaled(self) -> FloatQP:
+        """Return this with the roots, normals, lengths and sizes that working sets need."""
+        self.roots = [math.sqrt(wj) for wj in self.w]
+        self._rows = [(*row, offset) for row, offset in zip(self.a, self.b, strict=True)]
+        for row in self.a:
+            scaled = [*map(truediv, row, self.roots)]
             length = math.hypot(*scaled)
             self.normals.append([s / length for s in scaled])
             self.lengths.append(length)
         self.sizes = [
-            math.sqrt(q) * length for q, length in zip(priority, self.lengths, strict=True)
+            math.sqrt(q) * length for q, length in zip(self.priority, self.lengths, strict=True)
         ]
+        return self
 
     def first(self) -> WorkingSet:
         """Return the working set of the clipped proposal."""
@@ -114,11 +137,16 @@ class FloatQP:
             working: constraints and bounds.
         """
         rows, at = working
-        u, margin, allowed, span, outside = self._settle(working)
-        more = [i for i, value in enumerate(margin) if not value >= -allowed[i] and i not in rows]
-        slacks = [i for i in rows if not margin[i] >= -SURELY * allowed[i]]
+        u, margin, allowed, span, outside = self._settle(rows, at)
         way = self._way(u)
         nothing = ROUNDING * max(max(way), -min(way))
+        more, slacks = [], []
+        for i, value in enumerate(margin):
+            if i in rows:
+                if not value >= -SURELY * allowed[i]:
+                    slacks.append(i)
+            elif not value >= -allowed[i]:
+                more.append(i)
         kept, presses = rows, None
         if len(slacks) < len(rows):
             presses = self._presses(working, span, way)
@@ -127,17 +155,23 @@ class FloatQP:
                 for i, (pressure, _) in zip(rows, presses, strict=True)
                 if i in slacks or (pressure >= -nothing and margin[i] <= allowed[i])
             ]
-        pulls = [(self.priority[i] * -margin[i], self.a[i]) for i in slacks]
-        changed, settled = dict(outside), True
+        # Over the steepest, so that small forces do not vanish.
+        unit = max([self.lengths[i] for i in slacks]) if slacks else 1.0
+        pulls = [
+            (self.priority[i] * (-margin[i] / unit), self.a[i], allowed[i] / -margin[i])
+            for i in slacks
+        ]
+        changed, settled = outside, True
         for j, side in enumerate(at):
-            force, doubt = 0.0, 0.0
-            for pull, row in pulls:
+            force, doubt, unsure = 0.0, 0.0, 0.0
+            for pull, row, error in pulls:
                 part = pull * row[j]
                 force += part
                 doubt += abs(part)
+                unsure += error * abs(part)
             doubt *= _NOTHING
             if not side:
-                settled = settled and -doubt <= force <= doubt
+                settled = settled and abs(force) <= doubt + unsure
             elif not force * side > doubt:
                 # The slacks do not press it against its bound; the way from the proposal may.
                 if presses is None:
@@ -158,18 +192,19 @@ class FloatQP:
             WorkingSet([*kept, *more], [changed.get(j, side) for j, side in enumerate(at)]),
         )
 
-    def margins(self, u: Floats) -> tuple[list[float], list[float]]:
-        """Return the margins (k) at inputs, and their rounding.
+    def meets_each(self, rows: list[int]) -> bool:
+        """Return whether the input bounds allow to meet each of some constraints by itself.
 
         Args:
-            u: m inputs.
+            rows: the constraints.
         """
-        margin, allowed = [], []
-        for row, offset in zip(self.a, self.b, strict=True):
-            terms = [*map(mul, row, u), offset]
-            margin.append(sum(terms))
-            allowed.append(ROUNDING * sum(map(abs, terms)))
-        return margin, allowed
+        for i in rows:
+            most = self.b[i]
+            for aj, lo, hi in zip(self.a[i], self.low, self.high, strict=True):
+                most += aj * (hi if aj > 0.0 else lo)
+            if not most >= 0.0:
+                return False
+        return True
 
     def _presses(
         self, working: WorkingSet, span: LineSpan | RowSpan | None, way: list[float]
@@ -182,45 +217,57 @@ class FloatQP:
         return [(pressure, self.normals[i]) for pressure, i in zip(pressures, rows, strict=True)]
 
     def _settle(
-        self, working: WorkingSet
+        self, rows: list[int], at: list[int]
     ) -> tuple[list[float], list[float], list[float], LineSpan | RowSpan | None, dict[int, int]]:
         """Return the inputs, margins, their rounding, and on which side inputs leave the bounds."""
-        rows, at = working
-        lengths, roots = self.lengths, self.roots
         u = [
             vj if not side else lo if side < 0 else hi
             for side, vj, lo, hi in zip(at, self.v, self.low, self.high, strict=True)
         ]
         free = [j for j, side in enumerate(at) if not side]
-        span = None
-        if rows and free:
+        if not free:
+            return u, *margins(self.a, self.b, u), None, {}
+        span, known = None, None
+        if rows:
             normals = [self.normals[i] for i in rows]
             if len(free) < len(u):
                 normals = [[n[j] for j in free] for n in normals]
             span = (LineSpan if len(free) == 1 or len(rows) == 1 else RowSpan)(
                 normals, [self.sizes[i] for i in rows]
             )
-        margin, allowed = self.margins(u)
-        if span:
-            for _ in range(_CORRECTIONS):
-                gaps = [margin[i] / lengths[i] for i in rows]
-                steps = span.step(gaps)
-                far = False
-                for j, step in zip(free, steps, strict=True):
-                    step /= roots[j]
-                    new = u[j] - step
-                    far = far or abs(step) > ROUNDING * abs(new)
-                    u[j] = new
-                if not far:
-                    break
-                margin, allowed = self.margins(u)
-                met = [abs(margin[i]) <= allowed[i] for i in rows]
-                if not span.dependent and all(met):
-                    break
+            known = self._move(u, free, rows, span)
         outside, moved = self._clip(u, free)
-        if moved:
-            margin, allowed = self.margins(u)
-        return u, margin, allowed, span, outside
+        if moved or not known:
+            known = margins(self.a, self.b, u)
+        return u, *known, span, outside
+
+    def _move(
+        self, u: list[float], free: list[int], rows: list[int], span: LineSpan | RowSpan
+    ) -> tuple[list[float], list[float]] | None:
+        """Move free inputs to where rows fit best; return the margins there, if known."""
+        lengths, roots = self.lengths, self.roots
+        of_rows = [self._rows[i] for i in rows]
+        margin = [sum(map(mul, row, [*u, 1.0])) for row in of_rows]
+        for _ in range(_CORRECTIONS):
+            steps = span.step([value / lengths[i] for i, value in zip(rows, margin, strict=True)])
+            far = False
+            for j, step in zip(free, steps, strict=True):
+                step /= roots[j]
+                new = u[j] - step
+                far = far or abs(step) > ROUNDING * abs(new)
+                u[j] = new
+            if not far:
+                break
+            if not span.dependent:
+                known = every, allowed = margins(self.a, self.b, u)
+                margin = [every[i] for i in rows]
+                met = [abs(every[i]) <= allowed[i] for i in rows]
+                if all(met):
+                    return known
+            else:
+                ends = [*u, 1.0]
+                margin = [sum(map(mul, row, ends)) for row in of_rows]
+        return None
 
     def _way(self, u: Floats) -> list[float]:
         return [(uj - vj) * root for uj, vj, root in zip(u, self.v, self.roots, strict=True)]
@@ -228,8 +275,6 @@ class FloatQP:
     def _clip(self, u: list[float], free: list[int]) -> tuple[dict[int, int], bool]:
         """Clip inputs; return on which side those were that left their bounds, and if any moved."""
         outside, moved = {}, False
-        if not free:
-            return outside, moved
         way = self._way(u)
         nothing = ROUNDING * max(max(way), -min(way))
         for j in free:

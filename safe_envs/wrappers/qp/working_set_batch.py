@@ -134,13 +134,17 @@ def find_points(p: ArrayQP, rows: np.ndarray, at: np.ndarray) -> Points:
         rows, missed | ((pressures >= -nothing) & (margin <= allowed)), margin >= -allowed
     ).all(axis=0)
     proved &= missed.any(axis=0) | (margin >= -allowed).all(axis=0)
-    parts = p.a * np.where(missed, -p.priority * margin, 0.0)[:, None]
+    # Over the steepest, so that small forces do not vanish.
+    unit = np.where(missed, p.lengths, 0.0).max(axis=0)
+    unit = np.where(unit > 0.0, unit, 1.0)
+    parts = p.a * np.where(missed, p.priority * (-margin / unit), 0.0)[:, None]
     force, doubt = total(parts), _NOTHING * total(np.abs(parts))
+    unsure = np.abs(p.a) * np.where(missed, p.priority * (allowed / unit), 0.0)[:, None]
     rest = way - total(p.normals * pressures[:, None])
     outwards = force * at
     proved &= np.where(
         free,
-        np.abs(force) <= doubt,
+        np.abs(force) <= doubt + total(unsure),
         (outwards > doubt) | ((outwards >= -doubt) & (rest * at <= nothing)),
     ).all(axis=0)
     return Points(u, margin, allowed, proved)

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from safe_envs import ConfigurationError, DecisionLog, plot_log
+from safe_envs.scripts.figures.log_panels import LogColors
 from safe_envs.wrappers.decision_log import LogColumns
 
 COLUMNS = LogColumns.of(("x",), ("u", "rotor_speed"), ("wall",), units={"u": "m/s^2"})
@@ -113,3 +114,82 @@ def test_what_cannot_be_drawn_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="0 periods"):
         plot_log(DecisionLog(COLUMNS))
     assert not list(tmp_path.iterdir())
+
+
+def texts_of(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def with_barriers(rows, names=None, bounds=(-1.0, 1.0), proposed=0.0):
+    """A log of one input with these values of barriers in each period."""
+    names = names or [f"b{i}" for i in range(len(rows[0]))]
+    log = DecisionLog(LogColumns.of(("x",), ("u",), names))
+    for k, h in enumerate(rows):
+        log.append([k, 0, proposed, 0, *bounds, *h, *[0] * len(h), 0, 1, -1])
+    return log
+
+
+def test_the_legend_has_what_can_be_seen():
+    rows = [[0.1 * k, 1e6, 2e6] for k in range(3)]
+    figure = plot_log(with_barriers(rows, bounds=(-1e6, np.inf)))
+    assert [t for t in texts_of(figure) if t.strip()] == [
+        "executed input",
+        "h b0, min 0",
+        "outside the panel: 2 more",
+    ]
+    figure = plot_log(with_barriers(rows, proposed=0.8))
+    assert {"nominal input", "input bounds"} <= set(texts_of(figure))
+    assert "intervention" not in texts_of(figure)
+
+
+def test_the_panel_says_where_it_is_cut_off():
+    cut = plot_log(with_barriers([[1.0, 7.0], [2.0, 1e6]]))
+    assert cut.axes[1].get_title("right") == "h cut off at 2.1"
+    whole = plot_log(with_barriers([[1.0, 1.0], [2.0, 2.0]]))
+    assert whole.axes[1].get_title("right") == ""
+
+
+def test_lines_differ_as_long_as_they_can():
+    for colors, count in ((LogColors(), 32), (LogColors(barriers=("black",)), 8)):
+        styles = {str(sorted(colors.barrier(i).items())) for i in range(40)}
+        assert len(styles) == colors.distinct == count
+        assert len(colors.legend(dict.fromkeys(range(count), "h"))) == count
+        last = colors.legend(dict.fromkeys(range(count + 1), "h"))[-1]
+        assert last.get_label() == f"lines repeat after {count}"
+
+
+@pytest.mark.parametrize(
+    ("h", "u"),
+    [
+        *(([np.nan, 1.0], 0.0), ([np.nan, np.nan], 1e308), ([np.inf, -np.inf], -1e30)),
+        *(([1e308, -1e308], 1e308), ([1e-320, 0.0], 1e-320), ([1e30, 1e30], 0.0)),
+    ],
+)
+def test_numbers_that_cannot_be_drawn(h, u, tmp_path):
+    bounds = (0.0, 0.0) if u == 0.0 else (-1e308, 1e308)
+    log = with_barriers([h, h[::-1]], proposed=u, bounds=bounds)
+    plot_log(log, tmp_path / "log.pdf")
+    assert (tmp_path / "log.pdf").stat().st_size > 1000
+
+
+def test_times_that_cannot_be_drawn(tmp_path):
+    for times in ((-1e308, 1e308), (3.0, 3.0), (1e17, 1e17)):
+        log = DecisionLog(LogColumns.of(("x",), ("u",), ("h",)))
+        for t in times:
+            log.append([t, 0, 0, 0, -1, 1, 1, 0, 0, 1, -1])
+        plot_log(log, tmp_path / "log.pdf")
+
+
+def test_names_that_no_font_has(tmp_path):
+    for name in ("a\rb", "\ufeffa", "\u202e", "a\x00"):
+        columns = LogColumns((name,), (name,), (name,), units={name: name})
+        log = DecisionLog(columns)
+        log.append([0, 0, 0, 0, -1, 1, 1, 0, 0, 1, -1])
+        plot_log(log, tmp_path / "log.pdf")
+
+
+def test_what_is_no_path_or_log_is_refused():
+    log = log_of(SAFE)
+    for path in (3, b"x.png"):
+        with pytest.raises(ConfigurationError, match="no path; give FILE"):
+            plot_log(log, path)

@@ -96,7 +96,7 @@ def test_an_empty_log_is_written_too(log, tmp_path, suffix):
 
 
 def test_names_with_commas_and_quotes_are_kept(tmp_path):
-    columns = LogColumns.of(("a,b",), ('"u"',), ("h\n2",), units={"a,b": "%, $"})
+    columns = LogColumns.of(("a,b",), ('"u"',), ("h 'é",), units={"a,b": "%, $"})
     log = DecisionLog(columns)
     log.append([0.0, 1.5, 2.0, 1 / 3, -np.inf, np.inf, 0.1, 0.0, 1, 1, 0])
     for path in (tmp_path / "a.csv", tmp_path / "a.parquet"):
@@ -104,6 +104,74 @@ def test_names_with_commas_and_quotes_are_kept(tmp_path):
         found = DecisionLog.read(path)
         assert found.columns == columns
         np.testing.assert_array_equal(found.table(), log.table())
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize(
+    ("given", "kept"),
+    [
+        (["a [m]"], ["a (m)"]),
+        (["x[1]", "[m] b"], ["x[1]", "[m] b"]),
+        (["a\rb", "a\nb", "\ud800", "\ufeffa"], ["a b 1", "a b 2", " ", " a"]),
+        (["a", "a", "a 1", "a 3"], ["a 2", "a 4", "a 1", "a 3"]),
+    ],
+)
+def test_names_are_written_so_that_they_are_read_again(tmp_path, given, kept, suffix):
+    columns = LogColumns.of(("x",), ("u",), given, units={"u": "m\r/s"})
+    assert columns.barriers == tuple(kept)
+    assert columns.units == {"u": "m /s"}
+    log = DecisionLog(columns)
+    path = tmp_path / f"log.{suffix}"
+    getattr(log, f"to_{suffix}")(path)
+    assert DecisionLog.read(path).columns == columns
+
+
+def test_a_name_stands_for_one_column():
+    with pytest.raises(ConfigurationError, match="'x' names 2 columns"):
+        LogColumns.of(("x", "x"), ("u",), ("h",))
+
+
+def test_time_never_goes_back(log, safety_filter):
+    decision = safety_filter.filter(np.zeros(2), np.zeros(2))
+    log.add(0.2, [0.0, 0.0], decision)
+    with pytest.raises(InvalidInputError, match=r"t = 0.1 s lies before .* 0.2 s; take a clock"):
+        log.add(0.1, [0.0, 0.0], decision)
+    with pytest.raises(InvalidInputError, match="lies before"):
+        log.append(log.table()[0])
+    assert log.t.tolist() == [0.0, 0.1, 0.2, 0.2]
+    assert len(log.between(0.2, 0.2)) == 2
+
+
+ROW = [0.0, 0.0, 0.0, 0.0, -3.0, 3.0, 1.0, 0.0, 0, 1, -1]
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        *([np.nan, *ROW[1:]], [*ROW[:-3], 0.5, 1, -1], [*ROW[:-1], 1], [*ROW[:-1], 0.5]),
+        *([*ROW[:-1], np.nan], [*ROW, 0.0], [10**400, *ROW[1:]], ["a", *ROW[1:]], "a", None, 3),
+    ],
+)
+def test_rows_that_could_not_be_written_are_refused(row):
+    log = DecisionLog(LogColumns.of(("x",), ("u",), ("h",)))
+    log.append(ROW)
+    with pytest.raises(InvalidInputError, match="the log"):
+        log.append(row)
+    assert len(log) == 1
+
+
+def test_arguments_of_another_kind_are_refused(log, safety_filter, tmp_path):
+    for path in (3, None, b"x.csv"):
+        for call in (log.to_csv, log.to_parquet, log.read):
+            with pytest.raises(ConfigurationError, match="no path; give FILE"):
+                call(path)
+    with pytest.raises(ConfigurationError, match="unknown section 'zz'"):
+        log.section("zz")
+    with pytest.raises(ConfigurationError, match="columns = 3; make a log by"):
+        DecisionLog(3)
+    decision = safety_filter.filter(np.zeros(2), np.zeros(2))
+    with pytest.raises(InvalidInputError, match="the log takes one state"):
+        log.add(0.5, [10**400, 0.0], decision)
 
 
 def test_a_part_between_two_times(log):
@@ -184,9 +252,11 @@ def test_units_of_what_is_not_logged_are_refused(safety_filter):
 
 
 def test_a_log_can_be_copied_and_sent(log):
-    for found in (copy.deepcopy(log), pickle.loads(pickle.dumps(log))):
+    for found in (copy.deepcopy(log), copy.copy(log), pickle.loads(pickle.dumps(log))):
         assert found.columns == log.columns
         np.testing.assert_array_equal(found.table(), log.table())
+        found.append(log.table()[-1])
+        assert (len(found), len(log)) == (4, 3)
 
 
 def test_what_a_filter_does_not_take_is_not_logged():

@@ -28,6 +28,8 @@ LINE = "0.0,1,1,1,-2,2,0.5,0,0,1,-1"
         (f"{TOP}\n{LINE.replace('0,1,-1', '0,2,-1')}\n", "neither 0 nor 1"),
         (f"{TOP}\n{LINE.replace('0,1,-1', '0,1,1')}\n", "none of its barriers"),
         (f"{TOP}\n\n{LINE}\n", "empty line"),
+        (f"{TOP}\n{LINE}\n{LINE.replace('0.0', '-1.0', 1)}\n", "time goes back in it, after 0 s"),
+        (f"{TOP.replace('h:h', 'h:h,h:h')}\n", "'h:h' twice"),
         (",".join(["t [s]"] * 2000), "1000 are the most"),
         ("x" * 200_000, "field limit"),
         ("\x00\xff", "holds no log"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 
 import gymnasium as gym
@@ -157,3 +158,17 @@ def test_gymnasiums_processes_step_pickled_envs():
         env.reset(seed=seed, options={"state": [0.1, 0.2, 0.3]})
         np.testing.assert_array_equal(env.step(np.full(1, 0.5, dtype=np.float32))[0], first[i])
     envs.close()
+
+
+def test_shallow_copies_share_nothing_either():
+    envs = [gym.make(SCALAR), gym.make_vec(SCALAR, 3)]
+    view = {**CAR, "state_fn": as_it_is}
+    for env in (
+        SafetyFilterWrapper(envs[0], guess()),
+        SafetyFilterVectorWrapper(envs[1], guess()),
+        CostReturnWrapper(envs[0]),
+        SpecificationMonitor(envs[0], "always safe"),
+        SpecificationMonitorVector(envs[1], "always safe"),
+        SafetyFilterWrapper(gym.make("MountainCarContinuous-v0"), "cbf:alpha=0.05", **view),
+    ):
+        assert_goes_on_alone(env, copy.copy)

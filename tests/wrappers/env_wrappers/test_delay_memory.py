@@ -138,3 +138,27 @@ def test_an_evaluation_says_why_there_is_no_bound_and_counts_what_is_executed():
         assert row.effort_mean == 0.0
     assert "not for a delay" in str(found.rows[1].held_note)
     assert found.config["problem"]["actuators"] == "delay 2, model_delay 2"
+
+
+def test_a_state_that_is_set_leaves_what_is_under_way_to_filter_and_env():
+    problem = problem_of(PENDULUM, delay=3)
+    one = SafetyFilterWrapper(SafeEnv(problem), "hocbf")
+    batch = SafetyFilterVectorWrapper(SafeVectorEnv(problem, 2), "hocbf")
+    one.reset(seed=0)
+    batch.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for k in range(8):
+        if k == 4:
+            one.unwrapped.state = [0.3, -0.2]
+            batch.unwrapped.state = [0.3, -0.2]
+        action = rng.uniform(-1.0, 1.0, 1)
+        one.step(action)
+        batch.step(np.tile(action, (2, 1)))
+        executed = np.array(one.unwrapped._actuators._line.under_way)
+        np.testing.assert_array_equal(one._filter._one.under_way, executed)
+        # One env and the first of a batch have the same seed.
+        believed = batch._filter.snapshot()["filter_under_way"]
+        inner = batch.unwrapped.snapshot()["inputs_under_way"]
+        np.testing.assert_array_equal(believed, inner)
+        np.testing.assert_allclose(inner[0], executed, rtol=1e-12)
+    assert len(executed) == 3

@@ -244,7 +244,7 @@ def test_envs_whose_states_stay_keep_what_they_kept(mode):
     for each in (env, other):
         each.reset(seed=0)
         followed(each, 3)
-    states, kept = env.unwrapped.state, env._filter.levels.copy()
+    states, kept = env.unwrapped.state.copy(), env._filter.levels.copy()
     states[2] = 0.9
     env.unwrapped.state = states
     levels = env._filter.safety_filter.start((np.array([0.9]),), np.array([3]))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError
+from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers import (
@@ -220,6 +220,10 @@ def test_specifications_judge_whole_episodes() -> None:
     state = near().starts[near().start].proposals(1)[0]
     env = SpecificationMonitor(SafeEnv(near()), "eventually[2,4] goal")
     envs = SpecificationMonitorVector(SafeVectorEnv(near(), 2), "eventually[2,4] goal")
+    for each in (env, envs):
+        for wrong in (True, [[1.0], [1.0, 2.0]], "late"):
+            with pytest.raises(InvalidInputError, match="give a"):
+                each.reset(options={"t": wrong})
     for each, late in ((env, 0.2), (envs, 0.2), (envs, [0.0, 0.2])):
         each.reset(seed=0, options={"state": state, "t": 0.0})
         before = each.unwrapped.state
@@ -231,7 +235,7 @@ def test_specifications_judge_whole_episodes() -> None:
 def test_a_state_that_is_set_is_not_in_the_trace() -> None:
     env = SpecificationMonitor(SafeEnv(near()), "eventually goal")
     env.reset(seed=0)
-    in_goal = env.unwrapped.state
+    in_goal = env.unwrapped.state.copy()
     in_goal[:2] = 1.4, 1.0
     start = env.unwrapped.state
     env.unwrapped.state = in_goal

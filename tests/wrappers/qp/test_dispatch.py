@@ -269,6 +269,22 @@ for k, m in ((1, 2), (3, 1), (3, 2), (3, 4)):
 """
 
 
+@pytest.mark.parametrize("exponent", [100, 170, 200, 290])
+def test_rows_whose_squares_vanish_are_exact_for_one_state_and_for_a_batch(exponent):
+    rows = [[0.9, 0.4, 1.2, 1.2], [-0.14, 1.16, -2.58, 0.67]]
+    v, ends = [2.5, -1.7, -1.5, -1.3], ([-1.0] * 4, [1.0] * 4)
+    plain = project_floats(rows, [0.0, 0.15], v, *ends, [1.0] * 4, [1.0, 1.0])
+    rows[0] = [aj * 10.0**-exponent for aj in rows[0]]
+    found = project_floats(rows, [0.0, 0.15], v, *ends, [1.0] * 4, [1.0, 1.0])
+    proposed = [np.full(12, vj) for vj in v]
+    u, _, _, feasible = project_arrays(rows, [0.0, 0.15], proposed, *ends, [1.0] * 4, [1.0, 1.0])
+    assert plain[3]
+    assert found[3]
+    assert feasible.all()
+    np.testing.assert_allclose(found[0], plain[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.array(u).T, [plain[0]] * 12, rtol=0, atol=1e-12)
+
+
 def test_nothing_is_imported_once_a_size_is_prepared():
     run = subprocess.run([sys.executable, "-c", _LATE], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr

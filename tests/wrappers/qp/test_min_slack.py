@@ -222,7 +222,7 @@ def test_a_wrong_guess_of_what_binds_gets_no_certificate():
     qps = ArrayQP.of(a.transpose(1, 2, 0), b.T, 0.0 * ones, *ends, ones, np.ones((2, 1)))
     qp = FloatQP(
         a[0].tolist(), b[0].tolist(), [0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 2
-    )
+    ).scaled()
     guesses = ([True, False], -1), ([True, True], -1), ([False, False], -1), ([True, False], 1)
     for (rows, held), certain in zip(guesses, (True, False, False, False), strict=True):
         for side in (-1, 1) if held >= 0 else (0,):

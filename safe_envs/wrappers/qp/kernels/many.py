@@ -8,8 +8,6 @@ least-violating actions.
 
 from __future__ import annotations
 
-from math import sqrt
-
 import numpy as np
 
 from safe_envs.compiled.plain_natives import table_view, vector_view
@@ -27,6 +25,7 @@ from safe_envs.wrappers.qp.kernels.single_active import (
     project_single_active,
     work_of_single_active,
 )
+from safe_envs.wrappers.qp.kernels.span import normals_of_rows
 
 LOST = 4.0
 """How many tolerances of a constraint the way to the nearest action may cost."""
@@ -108,35 +107,6 @@ def project_many(  # noqa: PLR0913
             active[i] = 1.0 if margin[i] <= allowed else 0.0
             feasible = feasible and margin[i] >= -allowed
     return feasible
-
-
-def normals_of_rows(
-    a: np.ndarray, w: np.ndarray, normals: np.ndarray, unit: np.ndarray, roots: np.ndarray
-) -> None:
-    """Write the constraints in inputs times the roots of their weights, with unit length.
-
-    Args:
-        a: constraints, shape (k, m).
-        w: positive weights, shape (m,).
-        normals: receives the constraints, shape (k, m).
-        unit: receives their lengths, 0 for those that say nothing of the input, shape (k,).
-        roots: receives the roots, shape (m,).
-    """
-    k, m = a.shape
-    for j in range(m):
-        roots[j] = sqrt(w[j])
-    for i in range(k):
-        size, square = 0.0, 0.0
-        for j in range(m):
-            normals[i, j] = a[i, j] / roots[j]
-            size = max(size, abs(normals[i, j]))
-        if size > 0.0:
-            for j in range(m):
-                normals[i, j] /= size  # so that squares neither overflow nor vanish
-                square += normals[i, j] * normals[i, j]
-            for j in range(m):
-                normals[i, j] /= sqrt(square)
-        unit[i] = size * sqrt(square)
 
 
 def approach_least_violating(  # noqa: PLR0913

@@ -129,3 +129,32 @@ def least_step_in_span(
         values[c] /= triangle[c, c]
         for j in range(len(step)):
             step[j] += values[c] * basis[c, j]
+
+
+def normals_of_rows(
+    a: np.ndarray, w: np.ndarray, normals: np.ndarray, unit: np.ndarray, roots: np.ndarray
+) -> None:
+    """Write the constraints in inputs times the roots of their weights, with unit length.
+
+    Args:
+        a: constraints, shape (k, m).
+        w: positive weights, shape (m,).
+        normals: receives the constraints, shape (k, m).
+        unit: receives their lengths, 0 for those that say nothing of the input, shape (k,).
+        roots: receives the roots, shape (m,).
+    """
+    k, m = a.shape
+    for j in range(m):
+        roots[j] = sqrt(w[j])
+    for i in range(k):
+        size, square = 0.0, 0.0
+        for j in range(m):
+            normals[i, j] = a[i, j] / roots[j]
+            size = max(size, abs(normals[i, j]))
+        if size > 0.0:
+            for j in range(m):
+                normals[i, j] /= size  # so that squares neither overflow nor vanish
+                square += normals[i, j] * normals[i, j]
+            for j in range(m):
+                normals[i, j] /= sqrt(square)
+        unit[i] = size * sqrt(square)
