@@ -18,6 +18,7 @@ from safe_envs.dynamics.declarations import (
     require_real,
     signal_rate,
 )
+from safe_envs.dynamics.fixed_dict import FixedDict
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 
@@ -79,8 +80,8 @@ class ControlAffineSDE:
             "drift": read_matrix("drift", self.drift, (n, 1)),
             "input_matrix": read_matrix("input_matrix", self.input_matrix, (n, m)),
             "diffusion": read_matrix("diffusion", self.diffusion, (n, None)),
-            "parameters": {p: fitting(p, v) for p, v in self.parameters.items()},
-            "signals": {s: signal_rate(s, r) for s, r in self.signals.items()},
+            "parameters": FixedDict({p: fitting(p, v) for p, v in self.parameters.items()}),
+            "signals": FixedDict({s: signal_rate(s, r) for s, r in self.signals.items()}),
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)

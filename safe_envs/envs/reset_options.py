@@ -11,12 +11,16 @@ from safe_envs.envs.simulation import start_sampler
 from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, shown
 from safe_envs.problem.initial_distribution import StartSampler
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.rate_limits import input_ranges
 from safe_envs.validators import real_array
 
 _NAMES = ("state", "start", "t")
 
 _WHOLE = 1e-6
 """By how much of a control period a time may miss a whole number of them."""
+
+_ROUNDING = 1e-12
+"""By how much of its bounds' width an input that is a state may be beyond them, as simulated."""
 
 
 class RequestedStart(NamedTuple):
@@ -113,7 +117,7 @@ class ResetOptions:
 
         Raises:
             InvalidInputError: The states have another shape, are not finite, or outside the
-                workspace.
+                workspace, or an input that is a state is beyond its bounds by more than rounding.
         """
         found, problem = real_array("state", given), self._problem
         n, count = problem.plant.n, self._num_envs
@@ -126,12 +130,16 @@ class ResetOptions:
             )
         states = np.array(np.broadcast_to(found, (count or 1, n)), dtype=float)
         checked = states if wanted is None else states[wanted]
+        inputs = input_ranges(problem)
         for v, values in zip(problem.states, checked.T, strict=True):
-            bad = ~(np.isfinite(values) & (values >= v.low) & (values <= v.high))
+            low, high = inputs.get(v.symbol, (v.low, v.high))
+            doubt = _ROUNDING * (high - low) if v.symbol in inputs else 0.0
+            bad = ~(np.isfinite(values) & (values >= low - doubt) & (values <= high + doubt))
             if bad.any():
+                where = "its bounds" if v.symbol in inputs else "the workspace"
                 raise InvalidInputError(
-                    f"the state has {v.symbol} = {values[bad][0]}; give a number in the workspace"
-                    f" [{v.low}, {v.high}]"
+                    f"the state has {v.symbol} = {values[bad][0]}; give a number in {where}"
+                    f" [{low}, {high}]"
                 )
         return states
 

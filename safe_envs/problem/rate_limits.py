@@ -120,6 +120,16 @@ def with_resting_inputs(start: Any, problem: Any) -> Any:
     return [*numbers_in(start).tolist(), *resting_input(problem.box)]
 
 
+def input_ranges(problem: Any) -> dict[sp.Symbol, tuple[float, float]]:
+    """Return the bounds of the inputs that are states; their ranges as states are wider.
+
+    Args:
+        problem: a `SafetyProblem`.
+    """
+    count = len(problem.rates)
+    return {f.symbol: (f.low, f.high) for f in problem.features[len(problem.features) - count :]}
+
+
 def require_apart(given: ProblemOptions, problem: Any) -> None:
     """Check that options leave alone what the rates of a problem's inputs have been derived from.
 

@@ -30,10 +30,9 @@ class SafetyFilter(ComponentFilter):
     by the priorities, is as small as can be. A constraint counts as met where it is violated by no
     more than the rounding of its terms; see `safe_envs.wrappers.qp.rounding`.
 
-    One constraint has a closed form for any number of inputs, and any number of constraints an
-    exact solution for one and two inputs. For others DAQP proposes which constraints and bounds
-    hold the answer, and their equations are solved and prove it, so that answers are right to
-    rounding; where that fails, a slower active-set method decides.
+    One constraint has a closed form, and any number an exact solution for one and two inputs. For
+    others DAQP proposes which constraints and bounds hold the answer, and their equations prove it,
+    so that answers are right to rounding; else a slower active-set method decides.
 
     With a control Lyapunov function the filter solves its joint QP instead: min w_u |u|^2 + w_d d^2
     subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2).
@@ -43,11 +42,9 @@ class SafetyFilter(ComponentFilter):
 
     Conditions that are named without rates get ones, as many as each barrier's relative degree.
 
-    In a control loop, what is measured just now comes in at each call; see `filter`: input bounds,
-    the values of the system's `signals` and of the adjustable parameters, and the time. Their rates
-    are part of the derivatives along the system; see `ControlAffineSDE`.
-
-    All that a decision may need is imported and compiled here; see `warm_up`.
+    What is measured just now comes in at each call; see `filter`: input bounds, the values of the
+    system's `signals` and of the adjustable parameters, and the time. Their rates are part of the
+    derivatives; see `ControlAffineSDE`. All else is imported and compiled here; see `warm_up`.
 
     Args:
         system: that the filter knows.
@@ -173,10 +170,7 @@ class SafetyFilter(ComponentFilter):
         )
 
     def warm_up(self) -> SafetyFilter:
-        """Import and compile all that any decision may need; making a filter has done that.
-
-        Returns the filter itself.
-        """
+        """Import and compile all that any decision may need, as making one did; return itself."""
         self.compile()
         _ = self._barriers_floats, self._barriers_arrays
         return self
@@ -190,11 +184,8 @@ class SafetyFilter(ComponentFilter):
         return self._compile_barriers("arrays")
 
     def _compile_barriers(self, flavour: Flavour) -> Any:
-        return compile_function(
-            self.qp.symbols,
-            [self.qp.model.numeric(barrier.expression) for barrier, _ in self.pairs],
-            flavour,
-        )
+        expressions = [self.qp.model.numeric(barrier.expression) for barrier, _ in self.pairs]
+        return compile_function(self.qp.symbols, expressions, flavour)
 
     def filter(
         self,
@@ -258,7 +249,14 @@ class SafetyFilter(ComponentFilter):
         cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
         cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
         return FilterDecision(
-            action, margin, active > 0.0, feasible, slack, cause, goal[0] if goal else u, barrier
+            action,
+            margin,
+            active > 0.0,
+            feasible,
+            slack,
+            cause,
+            goal[0] if goal else np.array(u),
+            barrier,
         )
 
     def _filter_one(
@@ -289,7 +287,7 @@ class SafetyFilter(ComponentFilter):
             feasible,
             np.array(slack),
             cause if True in active else -1,
-            u if proposed is inputs else np.array(proposed),
+            u.copy() if proposed is inputs else np.array(proposed),
             np.array(barrier),
         )
 

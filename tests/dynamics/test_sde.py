@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -211,3 +213,32 @@ def test_a_filter_takes_a_barrier_with_a_sum():
     )
     for one, same in zip(made.filter([0.4], [1.0]), other.filter([0.4], [1.0]), strict=True):
         np.testing.assert_allclose(one, same, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["parameters", "signals"])
+def test_a_system_does_not_change_from_outside(name):
+    symbol = k if name == "parameters" else y
+    given = {symbol: 2.0}
+    system = scalar(**{name: given})
+    before, kept = hash(system), getattr(system, name)
+    given[symbol] = 3.0
+    for change in (
+        lambda: kept.__setitem__(symbol, 3.0),
+        lambda: kept.__delitem__(symbol),
+        lambda: kept.update({symbol: 3.0}),
+        lambda: kept.setdefault(u, 3.0),
+        lambda: kept.pop(symbol),
+        kept.popitem,
+        kept.clear,
+        lambda: kept.__ior__({symbol: 3.0}),
+    ):
+        with pytest.raises(TypeError, match="does not change"):
+            change()
+    assert kept == {symbol: 2.0}
+    assert hash(system) == before
+    for other in (pickle.loads(pickle.dumps(system)), copy.deepcopy(system), copy.copy(system)):
+        assert (other, hash(other)) == (system, before)
+        with pytest.raises(TypeError, match="does not change"):
+            getattr(other, name)[symbol] = 3.0
+    assert copy.copy(kept) is kept
+    assert type(kept | {u: 1.0}) is dict

@@ -10,7 +10,7 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, SafeEnv, SafeVectorEnv
 from safe_envs.compiled.program import Program
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.errors import ConfigurationError, SystemDefinitionError
+from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import state_problem
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper
@@ -185,3 +185,14 @@ def test_names_that_are_taken_are_refused():
     problem = state_problem(system, 1 - x**2, box=(-1, 1), start=[0, 0], dt=0.1, horizon=1.0)
     with pytest.raises(SystemDefinitionError, match=r"u_rate: with limited rates"):
         problem.configured(rate_limit=(-1.0, 1.0))
+
+
+@pytest.mark.parametrize("make", [SafeEnv, lambda problem: SafeVectorEnv(problem, num_envs=2)])
+def test_episodes_begin_with_inputs_within_their_bounds(make):
+    env = make(oscillator().configured(rate_limit=(-1.0, 1.0)))
+    for given in (3.0 + 1e-6, -2.0 - 1e-6, 4.0):
+        with pytest.raises(InvalidInputError, match=r"give a number in its bounds \[-2.0, 3.0\]"):
+            env.reset(options={"state": [0.1, 0.2, given]})
+    for given in (3.0, -2.0, np.nextafter(3.0, 4.0)):  # as a simulation may have rounded it
+        state = np.ravel(env.reset(options={"state": [0.1, 0.2, given]})[0])[:3]
+        np.testing.assert_allclose(state, [0.1, 0.2, given])

@@ -254,3 +254,18 @@ def test_the_states_of_a_batch_of_envs_cannot_be_written_to():
             envs.state[:] = 7.0
         envs.step(np.zeros((3, 1)))
     assert abs(envs.state).max() < 7.0
+
+
+def test_decisions_share_no_memory_with_what_was_given():
+    x, u = sp.symbols("x u", real=True)
+    system = ControlAffineSDE.from_rate((x,), (u,), [u])
+    for barriers in (1 - x, [1 - x, 2 + x]):
+        safety_filter = SafetyFilter(system, barriers, "cbf", bounds=(-1.0, 1.0))
+        for shape in ((1,), (3, 1), (1, 1), (2, 3, 1)):
+            states, inputs = np.zeros(shape), np.full(shape, 0.5)
+            decision = safety_filter.filter(states, inputs)
+            for part in decision:
+                assert not np.shares_memory(part, states)
+                assert not np.shares_memory(part, inputs)
+            inputs[:] = 7.0
+            np.testing.assert_array_equal(decision.proposed, np.full(shape, 0.5))

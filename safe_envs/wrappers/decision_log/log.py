@@ -16,8 +16,14 @@ from safe_envs.number_text import finite_number
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.decision_log.columns import LogColumns
 from safe_envs.wrappers.decision_log.files import path_of, read_log, write_csv, write_parquet
+from safe_envs.wrappers.decision_log.given import (
+    Defaults,
+    endless,
+    pairs_of,
+    require_finite,
+    runtime_values,
+)
 from safe_envs.wrappers.filter_qp import FilterDecision
-from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
@@ -47,7 +53,9 @@ class DecisionLog(IndependentCopies):
         self._width = len(columns.headings)
         self._values = array("d")
         self._bounds: tuple[Sequence[float], Sequence[float]] = ((), ())
-        self._defaults: dict[Any, float | None] = {}
+        self._defaults: Defaults = []
+        # The columns of the time, the state and the parameters come first.
+        self._inputs = 1 + len(columns.states)
 
     @classmethod
     def for_filter(
@@ -70,8 +78,9 @@ class DecisionLog(IndependentCopies):
         runtime = [symbol for symbol in qp.runtime if symbol != TIME]
         names = [barrier.name for barrier, _ in safety_filter.pairs]
         log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
-        log._bounds = _endless(qp.low), _endless(qp.high)
-        log._defaults = {symbol: model.parameters.get(symbol) for symbol in runtime}
+        log._bounds = endless(qp.low), endless(qp.high)
+        log._defaults = [(s, s.name, model.parameters.get(s)) for s in runtime]
+        log._inputs += len(runtime)
         return log
 
     def add(
@@ -93,19 +102,20 @@ class DecisionLog(IndependentCopies):
             parameters: as given to the filter.
 
         Raises:
-            InvalidInputError: Something is missing or does not fit the log, or the time lies before
-                the last one.
+            InvalidInputError: Something is missing, not finite or does not fit the log, or the time
+                lies before the last one.
         """
         try:
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
             intervened = decision.cause >= 0 and action != proposed
-            low, high = self._bounds if bounds is None else _pairs(bounds, len(action))
+            low, high = self._bounds if bounds is None else pairs_of(bounds, len(action))
+            known = self._defaults
             values = array(
                 "d",
                 [
                     t,
                     *x,
-                    *(self._given(parameters or {}) if self._defaults else ()),
+                    *(runtime_values(known, parameters or {}) if known or parameters else ()),
                     *proposed,
                     *action,
                     *low,
@@ -117,6 +127,8 @@ class DecisionLog(IndependentCopies):
                     decision.cause if intervened else -1,
                 ],
             )
+        except InvalidInputError:
+            raise
         except (AttributeError, OverflowError, TypeError, ValueError) as error:
             raise InvalidInputError(
                 f"the log takes one state and its decision at a time ({error}); give t in s, x of"
@@ -128,19 +140,9 @@ class DecisionLog(IndependentCopies):
                 f" takes {self._width}: a finite t, {len(self.columns.states)} states, and the"
                 " decision of the filter that the log was made for"
             )
+        if not math.isfinite(sum(values[: self._inputs])):
+            require_finite(self.columns.headings, values[: self._inputs])
         self._extend(values)
-
-    def _given(self, parameters: Mapping[Any, float]) -> list[float]:
-        """Return what was given at run time, in order."""
-        found = []
-        for symbol, default in self._defaults.items():
-            value = parameters.get(symbol, parameters.get(symbol.name, default))
-            if value is None:
-                raise InvalidInputError(
-                    f"parameters lacks {symbol}; give what the filter was given"
-                )
-            found.append(value)
-        return found
 
     def append(self, values: Sequence[float]) -> None:
         """Add the numbers of one period in the order of `LogColumns.headings`.
@@ -287,14 +289,3 @@ class DecisionLog(IndependentCopies):
         log = cls(columns)
         log._values.frombytes(np.ascontiguousarray(table, dtype=np.float64).tobytes())
         return log
-
-
-def _pairs(bounds: Any, m: int) -> tuple[Sequence[float], Sequence[float]]:
-    """Return lower and upper bounds, given as one pair or as one for each of m inputs."""
-    pairs = np.broadcast_to(np.asarray(bounds, dtype=float), (m, 2))
-    return pairs[:, 0].tolist(), pairs[:, 1].tolist()
-
-
-def _endless(bounds: Sequence[float]) -> list[float]:
-    """Return bounds with infinities where a filter has `WIDEST`."""
-    return [math.copysign(math.inf, b) if abs(b) == WIDEST else b for b in bounds]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import sympy as sp
@@ -31,13 +32,18 @@ class FilterQP:
 
     model: ControlAffineSDE
     constraints: tuple[AffineConstraint, ...]
-    low: list[float]
-    high: list[float]
-    weights: list[float]
-    priorities: list[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    weights: Sequence[float]
+    priorities: Sequence[float]
     dt: float
     clf: CLF | None
     runtime: tuple[sp.Symbol, ...] = ()
+
+    def __post_init__(self) -> None:
+        # What is compiled into solvers does not change from outside.
+        for name in ("low", "high", "weights", "priorities"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:

@@ -257,3 +257,32 @@ def test_a_log_can_be_copied_and_sent(log):
         np.testing.assert_array_equal(found.table(), log.table())
         found.append(log.table()[-1])
         assert (len(found), len(log)) == (4, 3)
+
+
+def test_what_a_filter_does_not_take_is_not_logged():
+    p, q, mass = sp.symbols("p q mass", real=True)
+    system = ControlAffineSDE.from_rate((x,), (u,), [u], None, {mass: 2.0}, {p: q, q: 0})
+    made = SafetyFilter(system, p - x, "cbf", (-1.0, 1.0), adjustable=("mass",))
+    plain = SafetyFilter(ControlAffineSDE.from_rate((x,), (u,), [u]), 1 - x, "cbf", (-1.0, 1.0))
+    given = {"p": 1.0, q: -0.5}
+    decision = made.filter([0.0], [0.5], parameters=given)
+    log = DecisionLog.for_filter(made)
+    for changes, message in (
+        ({"z": 1.0}, "parameters has p, q, z; the log takes each of p, q, mass once"),
+        ({p: 1.0}, "each of p, q, mass once"),
+        ({"t": 1.0}, "each of p, q, mass once"),
+        ({"p": np.nan}, "parameter:p is nan"),
+        ({"mass": np.inf}, "parameter:mass is inf"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            log.add(0.0, [0.0], decision, parameters={**given, **changes})
+    for state in (np.nan, np.inf, -np.inf):
+        with pytest.raises(InvalidInputError, match=f"state:x is {state}"):
+            log.add(0.0, [state], decision, parameters=given)
+    with pytest.raises(InvalidInputError, match="takes each of none once"):
+        DecisionLog.for_filter(plain).add(
+            0.0, [0.0], plain.filter([0.0], [0.5]), parameters={"z": 1.0}
+        )
+    assert len(log) == 0
+    log.add(0.0, [1e308], decision, parameters={**given, "mass": 1e308})  # whose sum is infinite
+    assert log.section("parameter").tolist() == [[1.0, -0.5, 1e308]]

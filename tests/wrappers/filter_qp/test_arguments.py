@@ -97,7 +97,8 @@ def test_the_filter_is_a_name_of_the_package():
 )
 def test_bounds_are_one_pair_for_all_inputs_or_one_for_each(bounds, low, high):
     qp = SafetyFilter(plane(), 1 - x - y, "cbf", bounds).qp
-    assert (qp.low, qp.high) == (low, high)
+    assert (qp.low, qp.high) == (tuple(low), tuple(high))
+    assert {type(each) for each in (qp.weights, qp.priorities)} == {tuple}
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
