@@ -33,8 +33,10 @@ assert not loaded(*HEAVY), "the packages"
 from safe_envs.wrappers.qp import dispatch
 
 box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
+assert dispatch.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.9], *box)[3]
+assert not loaded("scipy", "daqp", *HEAVY), "QPs of two inputs that can be met"
 assert not dispatch.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
-assert not loaded("scipy", "daqp", *HEAVY), "QPs of two inputs"
+assert not loaded("scipy", *HEAVY), "QPs of two inputs"
 box = ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0, 1.0])
 rows = [[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]]
 assert dispatch.project_floats(rows, [-0.5, -0.5], *box)[2] == [True, True]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from array import array
 from collections.abc import Iterator
+from operator import mul, sub
 from typing import Any
 
 import daqp
@@ -33,26 +34,25 @@ def propose(qp: FloatQP) -> Iterator[WorkingSet]:
     k, m = len(qp.b), len(qp.v)
     gaps = [-value / length for value, length in zip(qp.margin, qp.lengths, strict=True)]
     unit = max(gaps)
-    scales = [root / unit for root in qp.roots]
-    ends = list(zip(qp.low, qp.high, qp.v, qp.start, scales, strict=True))
-    lower = array("d", [*[(lo - s) * c for lo, _, _, s, c in ends], *[gap / unit for gap in gaps]])
-    upper = array("d", [(hi - s) * c for _, hi, _, s, c in ends] + [_INFINITY] * k)
-    target = [(s - v) * c for _, _, v, s, c in ends]
-    sizes = qp.sizes
+    start, scales = qp.start, [root / unit for root in qp.roots]
+    least = [*map(mul, map(sub, qp.low, start), scales)]
+    lower = array("d", least + [gap / unit for gap in gaps])
+    upper = array("d", [*map(mul, map(sub, qp.high, start), scales)] + [_INFINITY] * k)
+    target = [*map(mul, map(sub, start, qp.v), scales)]
+    sizes, nothing = qp.sizes, [0.0] * k
     smallest, largest = min(sizes), max(sizes)
     # Where constraints weigh very differently, soft ones give way though they could be met.
     soft = max(_SOFT * smallest, _FIRM * largest)
     for width in (k, 0) if soft < 100.0 * _SOFT * smallest else (0, k):
         if width:
             numbers = []
-            for i, (normal, size) in enumerate(zip(qp.normals, sizes, strict=True)):
-                slack = [0.0] * k
-                slack[i] = soft / size
+            for i, normal in enumerate(qp.normals):
                 numbers += normal
-                numbers += slack
+                numbers += nothing
+                numbers[i - k] = soft / sizes[i]
         else:
             numbers = [c for normal in qp.normals for c in normal]
-        pressures = _pressures(m + width, k, target + [0.0] * width, numbers, upper, lower)
+        pressures = _pressures(m + width, k, target + nothing[:width], numbers, upper, lower)
         if pressures:
             yield WorkingSet(
                 [i for i in range(k) if pressures[m + i] < 0.0],

@@ -15,8 +15,9 @@ import numpy as np
 
 from safe_envs.wrappers.qp import active_set, one_constraint, plane_batch
 from safe_envs.wrappers.qp.dual_active_set import propose
+from safe_envs.wrappers.qp.plain_qp import margins
 from safe_envs.wrappers.qp.rounding import FloatAnswer, Floats
-from safe_envs.wrappers.qp.working_set import FloatQP, Point, margins
+from safe_envs.wrappers.qp.working_set import FloatQP, Point
 
 _PIVOTS = 12
 """How often a working set is changed: more do not help where these do not."""

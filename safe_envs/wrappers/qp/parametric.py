@@ -158,9 +158,16 @@ class _Path:
         table, n, size = self.table, len(self.table), len(going)
         states = going.nonzero()[0]
         place = self._place[states]
-        column, row = table[:, place, states], table[place, :, states].T
-        least, most, fixed, follows = self.state[:, place, states]
-        low, high = self.ends[:, place, states]
+        # Numbers of entries in the flat table, which are faster than three indices.
+        flat = table.reshape(-1)
+        here = place * size + states
+        of_column = here + np.arange(0, n * (n + 2) * size, (n + 2) * size)[:, None]
+        of_row = here + place * ((n + 1) * size) + np.arange(0, (n + 2) * size, size)[:, None]
+        column, row = flat.take(of_column), flat.take(of_row)
+        of_state = here + np.arange(0, 4 * n * size, n * size)[:, None]
+        state = self.state.reshape(-1)
+        least, most, fixed, follows = state.take(of_state)
+        low, high = self.ends.take(of_state[:2])
         down = row[n + 1] < 0.0
         target = np.where(down, least, most)
         each = np.arange(len(states))
@@ -179,14 +186,14 @@ class _Path:
                 entries -= step
         else:
             table -= every[0][:, None] * every[1]
-        table[:, place, states] = column / head
+        flat[of_column] = column / head
         # What was fixed depends now, and the other way round.
         np.negative(row, out=row)
         row[n] += fixed
         row[place, each] = 1.0 / head
-        table[place, :, states] = row.T
+        flat[of_row] = row
         stops = (follows > 0.0) & (place < self.inputs)
-        self.state[:, place, states] = (
+        state[of_state] = (
             np.where(stops, np.where(down, -np.inf, 0.0), low),
             np.where(stops & down, 0.0, np.where(stops, np.inf, high)),
             target,

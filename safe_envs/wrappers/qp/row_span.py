@@ -60,6 +60,7 @@ class LineSpan:
 
     Attributes:
         dependent: whether there are several.
+        inverse: what the products with the vectors count in the step, or in its entries.
     """
 
     def __init__(self, vectors: Sequence[list[float]], weights: Floats) -> None:
@@ -70,7 +71,7 @@ class LineSpan:
             largest = max(weights)
             pulls = [n * (w / largest) ** 2 for n, w in zip(numbers, weights, strict=True)]
         square = sum(map(mul, pulls, numbers))
-        self._inverse = [pull / square for pull in pulls] if any(numbers) else numbers
+        self.inverse = [pull / square for pull in pulls] if any(numbers) else numbers
 
     def step(self, products: Floats) -> list[float]:
         """Return the shortest step (n) that has given products with the vectors.
@@ -79,9 +80,9 @@ class LineSpan:
             products: one for each vector.
         """
         if self.dependent:
-            return [sum(map(mul, self._inverse, products))]
+            return [sum(map(mul, self.inverse, products))]
         (product,) = products
-        return [product * part for part in self._inverse]
+        return [product * part for part in self.inverse]
 
     def pressures(self, way: Floats) -> list[float]:
         """Return the least factors with which the vectors add up to the part of a way in the span.
@@ -91,8 +92,8 @@ class LineSpan:
         """
         if self.dependent:
             (length,) = way
-            return [length * part for part in self._inverse]
-        return [sum(map(mul, self._inverse, way))]
+            return [length * part for part in self.inverse]
+        return [sum(map(mul, self.inverse, way))]
 
 
 class RowSpan:

@@ -19,10 +19,10 @@ Operations Research 21, 1994).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from operator import mul, truediv
 from typing import NamedTuple
 
+from safe_envs.wrappers.qp.plain_qp import PlainQP, margins
 from safe_envs.wrappers.qp.rounding import ROUNDING, Floats
 from safe_envs.wrappers.qp.row_span import LineSpan, RowSpan
 
@@ -55,63 +55,26 @@ class Point(NamedTuple):
     change: WorkingSet | None
 
 
-def margins(a: Sequence[Floats], b: Floats, u: Floats) -> tuple[list[float], list[float]]:
-    """Return the margins (k) at inputs, and their rounding.
-
-    Args:
-        a: k constraints of m coefficients.
-        b: k offsets.
-        u: m inputs.
-    """
-    margin, allowed = [], []
-    for row, offset in zip(a, b, strict=True):
-        terms = [*map(mul, row, u), offset]
-        margin.append(sum(terms))
-        allowed.append(ROUNDING * sum(map(abs, terms)))
-    return margin, allowed
-
-
-class FloatQP:
-    """A QP whose constraints all depend on the input.
+class FloatQP(PlainQP):
+    """A QP whose constraints all depend on the input, for working sets.
 
     Attributes:
         roots: of the weights.
-        start: the clipped proposal.
-        margin: of the constraints there.
         normals: of unit length, in inputs times the roots.
         lengths: of the constraints, likewise.
         sizes: these, times the roots of the priorities.
     """
 
-    def __init__(
-        self,
-        a: Sequence[Floats],
-        b: Floats,
-        v: Floats,
-        low: Floats,
-        high: Floats,
-        w: Floats,
-        priority: Floats,
-    ) -> None:
-        """Take a QP; see `dispatch.project_floats`."""
-        self.a, self.b, self.v, self.low, self.high = a, b, v, low, high
-        self.w, self.priority = w, priority
-        self.start = [
-            lo if vj < lo else hi if vj > hi else vj
-            for vj, lo, hi in zip(v, low, high, strict=True)
-        ]
-        self.margin = [
-            sum(map(mul, row, self.start)) + offset for row, offset in zip(a, b, strict=True)
-        ]
-        self.roots: list[float] = []
-        self.normals: list[list[float]] = []
-        self.lengths: list[float] = []
-        self.sizes: list[float] = []
+    roots: list[float]
+    normals: list[list[float]]
+    lengths: list[float]
+    sizes: list[float]
 
     def scaled(self) -> FloatQP:
         """Return this with the roots, normals, lengths and sizes that working sets need."""
         self.roots = [math.sqrt(wj) for wj in self.w]
         self._rows = [(*row, offset) for row, offset in zip(self.a, self.b, strict=True)]
+        self.normals, self.lengths = [], []
         for row in self.a:
             scaled = [*map(truediv, row, self.roots)]
             length = math.hypot(*scaled)
@@ -192,20 +155,6 @@ class FloatQP:
             WorkingSet([*kept, *more], [changed.get(j, side) for j, side in enumerate(at)]),
         )
 
-    def meets_each(self, rows: list[int]) -> bool:
-        """Return whether the input bounds allow to meet each of some constraints by itself.
-
-        Args:
-            rows: the constraints.
-        """
-        for i in rows:
-            most = self.b[i]
-            for aj, lo, hi in zip(self.a[i], self.low, self.high, strict=True):
-                most += aj * (hi if aj > 0.0 else lo)
-            if not most >= 0.0:
-                return False
-        return True
-
     def _presses(
         self, working: WorkingSet, span: LineSpan | RowSpan | None, way: list[float]
     ) -> list[tuple[float, list[float]]]:
@@ -229,17 +178,44 @@ class FloatQP:
             return u, *margins(self.a, self.b, u), None, {}
         span, known = None, None
         if rows:
+            if len(free) == 1:
+                return self._settle_single(u, free[0], rows)
             normals = [self.normals[i] for i in rows]
             if len(free) < len(u):
                 normals = [[n[j] for j in free] for n in normals]
-            span = (LineSpan if len(free) == 1 or len(rows) == 1 else RowSpan)(
-                normals, [self.sizes[i] for i in rows]
-            )
+            span = (LineSpan if len(rows) == 1 else RowSpan)(normals, [self.sizes[i] for i in rows])
             known = self._move(u, free, rows, span)
         outside, moved = self._clip(u, free)
         if moved or not known:
             known = margins(self.a, self.b, u)
         return u, *known, span, outside
+
+    def _settle_single(
+        self, u: list[float], j: int, rows: list[int]
+    ) -> tuple[list[float], list[float], list[float], LineSpan, dict[int, int]]:
+        """Return what `_settle` does where one input is free."""
+        span = LineSpan([[self.normals[i][j]] for i in rows], [self.sizes[i] for i in rows])
+        root, uj = self.roots[j], u[j]
+        u[j] = 0.0
+        parts = [
+            (
+                (sum(map(mul, self.a[i], u)) + self.b[i]) / self.lengths[i],
+                self.a[i][j] / self.lengths[i],
+                share,
+            )
+            for i, share in zip(rows, span.inverse, strict=True)
+        ]
+        for _ in range(_CORRECTIONS):
+            step = 0.0
+            for rest, slope, share in parts:
+                step += share * (rest + slope * uj)
+            step /= root
+            uj -= step
+            if abs(step) <= ROUNDING * abs(uj):
+                break
+        u[j] = uj
+        outside, _ = self._clip(u, [j])
+        return u, *margins(self.a, self.b, u), span, outside
 
     def _move(
         self, u: list[float], free: list[int], rows: list[int], span: LineSpan | RowSpan

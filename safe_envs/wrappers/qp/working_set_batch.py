@@ -139,14 +139,18 @@ def find_points(p: ArrayQP, rows: np.ndarray, at: np.ndarray) -> Points:
     unit = np.where(unit > 0.0, unit, 1.0)
     parts = p.a * np.where(missed, p.priority * (-margin / unit), 0.0)[:, None]
     force, doubt = total(parts), _NOTHING * total(np.abs(parts))
-    unsure = np.abs(p.a) * np.where(missed, p.priority * (allowed / unit), 0.0)[:, None]
     rest = way - total(p.normals * pressures[:, None])
     outwards = force * at
-    proved &= np.where(
-        free,
-        np.abs(force) <= doubt + total(unsure),
-        (outwards > doubt) | ((outwards >= -doubt) & (rest * at <= nothing)),
-    ).all(axis=0)
+    presses = (outwards > doubt) | ((outwards >= -doubt) & (rest * at <= nothing))
+    balanced: Any = np.where(free, np.abs(force) <= doubt, presses).all(axis=0)
+    close = (proved & ~balanced).nonzero()[0]
+    if close.size:  # then the rounding of the slacks counts, too
+        errors = np.where(missed, p.priority * allowed, 0.0)[:, close] / unit[close]
+        unsure = doubt[:, close] + total(np.abs(p.a[..., close]) * errors[:, None])
+        balanced[close] = np.where(
+            free[:, close], np.abs(force[:, close]) <= unsure, presses[:, close]
+        ).all(axis=0)
+    proved &= balanced
     return Points(u, margin, allowed, proved)
 
 
