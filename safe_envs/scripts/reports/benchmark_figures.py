@@ -38,8 +38,8 @@ COMPILED = "compiled: "
 
 _SPEED = "million steps a second"
 _VECTOR = ("vector env, unfiltered", "vector env, filtered")
-_EPISODES = {"numpy": 5_000, "compiled": 50_000}
-_ROUNDS = 12
+_EPISODES = {"numpy": 2_000, "compiled": 20_000}
+_ROUNDS = 8
 _SECONDS_PER_ROUND = 0.08
 _NEW_BYTES = 1 << 20
 _AMOUNT = {"points": 300, "repetitions": 10_000}
