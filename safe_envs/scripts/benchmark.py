@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 from rich.table import Table
 
 from safe_envs.bounded_reading import read_json
@@ -28,22 +30,34 @@ def benchmark(
 ) -> None:
     """Measure the speed of filters and envs."""
     from safe_envs import __version__
-    from safe_envs.scripts.reports import benchmark_figures, latency
+    from safe_envs.scripts.reports import benchmark_figures
     from safe_envs.scripts.reports.benchmark_cases import ENV_ID
 
     require_result(json)
     earlier = {} if compare is None else _read_figures(compare)
-    figures = benchmark_figures.measure()
-    console = stdout()
+    console, figures = stdout(), {}
     cores = f"one of {os.cpu_count()} cores"
-    say(console, f"{ENV_ID} with scbf, safe-envs {__version__}, on {cores}\n")
-    console.print(_table(figures, earlier))
-    if tails := latency.rows_of(figures):
-        console.print(_latency(tails))
-    sides = benchmark_figures.side_by_side(figures)
-    if sides:
+    say(console, f"{ENV_ID} with scbf, safe-envs {__version__}, on {cores}; 1 to 3 minutes")
+    for part in benchmark_figures.parts():
+        say(console, f"\nmeasuring {part.what} ...\n")
+        found = part.measure()
+        figures |= found
+        _print(console, found, earlier)
+    if sides := benchmark_figures.side_by_side(figures):
         console.print(_engines(sides))
     write_result(json, lambda: figures)
+
+
+def _print(console: Console, figures: Mapping[str, float], earlier: Mapping[str, float]) -> None:
+    """Print the tables of a part of the benchmark; a pipe gets them at once, too."""
+    from safe_envs.scripts.reports import latency
+
+    # Tails have a table of their own, and stand in this one only to be compared.
+    if any(name in earlier or not latency.is_latency(name) for name in figures):
+        console.print(_table(figures, earlier))
+    if tails := latency.rows_of(figures):
+        console.print(_latency(tails))
+    sys.stdout.flush()
 
 
 def _read_figures(path: Path) -> dict[str, float]:
@@ -76,7 +90,6 @@ def _table(figures: Mapping[str, float], earlier: Mapping[str, float]) -> Table:
     titles = ("figure", *["earlier", "figure / earlier"] * bool(earlier))
     table = make_table("pr", first, *titles, tight=False)
     for name, value in figures.items():
-        # Tails have a table of their own; here they are compared only.
         if is_latency(name) and name not in earlier:
             continue
         before = earlier.get(name)

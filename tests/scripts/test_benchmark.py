@@ -20,6 +20,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import benchmark
 from safe_envs.scripts.reports import benchmark_cases, benchmark_figures, latency
 from safe_envs.scripts.reports.benchmark_cases import Case
+from safe_envs.scripts.reports.benchmark_figures import Part
 from safe_envs.scripts.reports.hand_written_loop import step_by_hand
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
@@ -48,10 +49,20 @@ def quick(monkeypatch):
     monkeypatch.setattr(latency, "_DRAWN", 1024)
 
 
+def measured():
+    """Return the figures of all parts."""
+    return {name: v for part in benchmark_figures.parts() for name, v in part.measure().items()}
+
+
+def part_of(figures):
+    """Return what measures these."""
+    return lambda: [Part("something", lambda: figures)]
+
+
 @pytest.mark.slow
 def test_figures_are_finite_and_positive_and_ratios_fit(quick, monkeypatch):
     monkeypatch.setattr(benchmark_figures, "is_available", lambda: False)
-    figures = benchmark_figures.measure()
+    figures = measured()
     tails = {name: figures.pop(name) for name in list(figures) if latency.is_latency(name)}
     assert all(math.isfinite(value) for value in tails.values())
     assert len(tails) == 6 * len(latency.COLUMNS)
@@ -136,7 +147,7 @@ def test_the_hand_written_loop_does_the_work_of_the_env():
 
 def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(
-        benchmark_figures, "measure", lambda: {"filter call, 1 state": 5.0, "a ratio": 0.5}
+        benchmark_figures, "parts", part_of({"filter call, 1 state": 5.0, "a ratio": 0.5})
     )
     benchmark.benchmark(tmp_path / "out.json")
     figures = json.loads((tmp_path / "out.json").read_text())
@@ -145,11 +156,29 @@ def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
         assert name in out
 
 
+def test_each_table_is_printed_before_the_next_part_is_measured(monkeypatch, capfd):
+    seen = []
+
+    def measure(name):
+        seen.append(capfd.readouterr().out)
+        return {name: 1.0}
+
+    parts = [Part(f"part {name}", lambda name=name: measure(name)) for name in ("one", "two")]
+    monkeypatch.setattr(benchmark_figures, "parts", lambda: parts)
+    benchmark.benchmark()
+    seen.append(capfd.readouterr().out)
+    assert "measuring part one" in seen[0]
+    assert "one" in seen[1].split("measuring part two")[0]
+    assert "measuring part two" in seen[1]
+    assert "two" in seen[2]
+    assert "measuring" not in seen[2]
+
+
 def test_earlier_figures_stand_beside_with_their_ratio(monkeypatch, tmp_path, capsys):
     earlier = tmp_path / "earlier.json"
     earlier.write_text('{"filter call, 1 state": 4.0, "hand-fused loop": 0.1}')
     monkeypatch.setattr(
-        benchmark_figures, "measure", lambda: {"filter call, 1 state": 5.0, "new": 0.5}
+        benchmark_figures, "parts", part_of({"filter call, 1 state": 5.0, "new": 0.5})
     )
     benchmark.benchmark(compare=earlier)
     lines = {
@@ -208,7 +237,7 @@ def test_times_of_decisions_grow_from_the_middle_to_the_end(monkeypatch, capsys)
         assert median <= p99 <= p999 <= most
         assert p999_off <= most_off
         assert collections >= 0
-    monkeypatch.setattr(benchmark_figures, "measure", lambda: figures)
+    monkeypatch.setattr(benchmark_figures, "parts", part_of(figures))
     benchmark.benchmark()
     out = capsys.readouterr().out
     assert all(name in out for name in (*cases, "p99.9", "gc off: max"))

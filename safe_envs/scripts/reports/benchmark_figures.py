@@ -6,7 +6,7 @@ import mmap
 import time
 import timeit
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,8 @@ COMPILED = "compiled: "
 
 _SPEED = "million steps a second"
 _VECTOR = ("vector env, unfiltered", "vector env, filtered")
-_EPISODES = {"numpy": 20_000, "compiled": 200_000}
-_ROUNDS = 15
+_EPISODES = {"numpy": 2_000, "compiled": 20_000}
+_ROUNDS = 8
 _SECONDS_PER_ROUND = 0.08
 _NEW_BYTES = 1 << 20
 _AMOUNT = {"points": 300, "repetitions": 10_000}
@@ -55,16 +55,31 @@ _LEARNED: dict[str, tuple[str, str, dict[str, Any]]] = {
 """Env, method and settings of each learned filter."""
 
 
-def measure() -> Figures:
-    """Measure all: microseconds for each state, and the ratios that matter."""
-    learned, seconds = _learn()
-    cases = {
-        **filter_calls(),
-        **several_constraints(),
-        **_learned_calls(learned),
-        **scalar_steps(),
-        **vector_steps(),
-    }
+class Part(NamedTuple):
+    """A part of the benchmark.
+
+    Attributes:
+        what: is measured.
+        measure: returns the figures.
+    """
+
+    what: str
+    measure: Callable[[], Figures]
+
+
+def parts() -> list[Part]:
+    """Return the parts of the benchmark, in the order in which they are measured."""
+    return [
+        Part("single decisions", latency.measure),
+        Part("filter calls and envs", _calls_and_envs),
+        Part("learned filters", _learned_filters),
+        Part("evaluations and the VecEnv of Stable-Baselines3", _engines),
+    ]
+
+
+def _calls_and_envs() -> Figures:
+    """Return microseconds for each state, and the ratios that matter."""
+    cases = {**filter_calls(), **several_constraints(), **scalar_steps(), **vector_steps()}
     compiled = _compiled_cases() if is_available() else {}
     times = _times({**cases, FUSED: fused_loop(), **compiled})
     return {
@@ -74,11 +89,21 @@ def measure() -> Figures:
         ),
         **_ratios_of_vector_envs(times),
         **_page_faults(cases["vector env, filtered"]),
-        **latency.measure(),
-        **seconds,
-        **_of_engine("numpy"),
-        **({COMPILED + name: v for name, v in _of_engine("compiled").items()} if compiled else {}),
     }
+
+
+def _learned_filters() -> Figures:
+    """Return microseconds for each state, and how long learning took."""
+    learned, seconds = _learn()
+    return {**_times(_learned_calls(learned)), **seconds}
+
+
+def _engines() -> Figures:
+    """Return the speeds of the engines."""
+    found = _of_engine("numpy")
+    if is_available():
+        found |= {COMPILED + name: value for name, value in _of_engine("compiled").items()}
+    return found
 
 
 def side_by_side(figures: Mapping[str, float]) -> dict[str, tuple[float, float]]:
