@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.errors import require_whole
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import stdout, write_result
+from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
+
+if TYPE_CHECKING:
+    from safe_envs.problem.problem import SafetyProblem
+    from safe_envs.wrappers import SafetyFilter
+    from safe_envs.wrappers.export import CComparison, ExportOptions, PromiseComparison
+    from safe_envs.wrappers.export.interface import Interface
+    from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
 @with_env
@@ -27,7 +34,7 @@ def export(
             "--filter",
             metavar="NAME",
             autocompletion=completion.filters,
-            help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own.",
+            help="As for evaluate: hocbf:p=2,8, promise:p=0.99, ... By default the env's own.",
         ),
     ] = None,
     knowledge: text_options.Knowledge = "model",
@@ -65,10 +72,9 @@ def export(
     """
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.export_report import ExportAnswer, print_export
-    from safe_envs.wrappers import SafetyFilter, parse_conditions
     from safe_envs.wrappers.conditions.text_parts import names_promise
-    from safe_envs.wrappers.export import ExportOptions, export_filter
-    from safe_envs.wrappers.export import compare as compare_with_python
+    from safe_envs.wrappers.export import ExportOptions
+    from safe_envs.wrappers.value.promise_text import PromiseSettings
 
     require_whole("states", states, 1)
     require_whole("seed", seed, 0)
@@ -76,23 +82,65 @@ def export(
     text_options.require_outputs(json, None, inputs=text_options.inputs_of(env.system, "", [text]))
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
-    if names_promise(text):
-        raise ConfigurationError(
-            f"{text} looks values up in a table, which has no form in C; export a condition, such"
-            f" as {problem.filter}"
-        )
-    conditions = parse_conditions(filter_name or problem.filter, problem)
-    safety_filter = SafetyFilter.for_problem(problem, conditions, knowledge, objective)
     units = {v.symbol.name: v.unit for v in (*problem.states, *problem.inputs)}
     options = ExportOptions(name, units, problem.sampling_domain.region)
-    interface = export_filter(safety_filter, out, float32, options)
-    found = None
-    if compare:
-        found = compare_with_python(out, safety_filter, options, states=states, seed=seed)
+    tried = (states, seed) if compare else None
+    if names_promise(text):
+        settings = PromiseSettings.of_text(text)
+        settings.require_fit(problem, objective)
+        interface, found = _promise(problem, settings, knowledge, out, float32, options, tried)
+    else:
+        safety_filter = _conditions(problem, text or problem.filter, knowledge, objective)
+        interface, found = _closed_form(safety_filter, out, float32, options, tried)
     config = {"env_id": known, "options": arguments, "filter": text or problem.filter, "seed": seed}
     answer = ExportAnswer(title_of(known, arguments), config, str(out), interface, found)
     print_export(stdout(), answer)
     write_result(json, answer.document)
+
+
+def _conditions(problem: SafetyProblem, text: str, knowledge: str, objective: str) -> SafetyFilter:
+    from safe_envs.wrappers import SafetyFilter, parse_conditions
+
+    conditions = parse_conditions(text, problem)
+    return SafetyFilter.for_problem(problem, conditions, knowledge, objective)
+
+
+def _closed_form(
+    safety_filter: SafetyFilter,
+    out: Path,
+    float32: bool,
+    options: ExportOptions,
+    tried: tuple[int, int] | None,
+) -> tuple[Interface, CComparison | None]:
+    """Export conditions in closed form, and compare at a number of states with a seed."""
+    from safe_envs.wrappers.export import compare, export_filter
+
+    interface = export_filter(safety_filter, out, float32, options)
+    if tried is None:
+        return interface, None
+    return interface, compare(out, safety_filter, options, states=tried[0], seed=tried[1])
+
+
+def _promise(
+    problem: SafetyProblem,
+    settings: PromiseSettings,
+    knowledge: str,
+    out: Path,
+    float32: bool,
+    options: ExportOptions,
+    tried: tuple[int, int] | None,
+) -> tuple[Interface, PromiseComparison | None]:
+    """Export a promise filter, and compare at a number of states with a seed."""
+    from safe_envs.wrappers.export import compare_promise, export_promise
+    from safe_envs.wrappers.value.promise_tables import promise_filter_for
+
+    with progress_bar("Computing the table") as tell:
+        promise_filter = promise_filter_for(problem, settings, knowledge, tell)
+    interface = export_promise(promise_filter, out, float32, options)
+    if tried is None:
+        return interface, None
+    found = compare_promise(out, promise_filter, options, states=tried[0], seed=tried[1])
+    return interface, found
 
 
 if __name__ == "__main__":

@@ -45,7 +45,8 @@ def test_without_a_compiler_it_says_so(export, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--filter", "promise", "--out", "c"), "looks values up in a table"),
+        (("--filter", "promise:p=0.9", "--out", "c", "--float32"), "double precision"),
+        (("--filter", "promise:p=0.9", "--out", "c", "--objective", "clf"), "objective"),
         (("--filter", "scbf", "--out", "c", "--name", "a b"), "is no name of C"),
         (("--out", "no/such/c"), "no/such"),
         (("--out", "c", "--states", "0"), "states"),

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table, print_whole
-from safe_envs.wrappers.export import CComparison
+from safe_envs.wrappers.export import CComparison, PromiseComparison
 from safe_envs.wrappers.export.interface import Interface
 
 
@@ -31,7 +31,7 @@ class ExportAnswer:
     config: dict[str, Any]
     folder: str
     interface: Interface
-    comparison: CComparison | None
+    comparison: CComparison | PromiseComparison | None
 
     def document(self) -> dict[str, Any]:
         """Return all that was found, for JSON."""
@@ -77,7 +77,14 @@ def print_export(console: Console, answer: ExportAnswer) -> None:
         )
         return
     table = make_table("lr", f"built with {escape(found.compiler)}", "")
-    for what, number in (
+    rows = _of_promise(found) if isinstance(found, PromiseComparison) else _of_conditions(found)
+    for what, number in rows:
+        table.add_row(what, number)
+    print_whole(console, table)
+
+
+def _of_conditions(found: CComparison) -> list[tuple[str, str]]:
+    return [
         ("states", f"{found.states:,}"),
         ("  infeasible", f"{found.infeasible:,}"),
         ("  a constraint says nothing of the input", f"{found.without_effect:,}"),
@@ -89,6 +96,20 @@ def print_export(console: Console, answer: ExportAnswer) -> None:
         ("  actions beyond 1e-12, or 1e-5 of floats", f"{found.beyond:,}"),
         ("largest error of an action, of its size", f"{found.largest_relative_error:.2g}"),
         ("processor time of a call", f"{found.nanoseconds:,.0f} ns"),
-    ):
-        table.add_row(what, number)
-    print_whole(console, table)
+    ]
+
+
+def _of_promise(found: PromiseComparison) -> list[tuple[str, str]]:
+    return [
+        ("single decisions", f"{found.states:,}"),
+        ("decisions in whole episodes", f"{found.steps:,}"),
+        ("  of both, where the proposed input is replaced", f"{found.replaced:,}"),
+        ("  where nothing is guaranteed", f"{found.infeasible:,}"),
+        ("refused: not finite", f"{found.invalid:,}"),
+        ("flags that differ", f"{found.flags_different:,}"),
+        ("actions outside their bounds", f"{found.out_of_bounds:,}"),
+        ("largest error of an action, in half-widths", f"{found.largest_error:.2g}"),
+        ("largest error of a probability", f"{found.largest_level_error:.2g}"),
+        ("  decisions beyond 1e-9, or 1e-12 of probabilities", f"{found.beyond:,}"),
+        ("processor time of a call", f"{found.nanoseconds:,.0f} ns"),
+    ]

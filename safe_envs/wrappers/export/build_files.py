@@ -55,7 +55,8 @@ def readme_text(interface: Interface) -> str:
         for q, low, high in zip(interface.inputs, interface.low, interface.high, strict=True)
     )
     runtime = (
-        f"## Quantities measured at run time: `input.runtime`\n\n{_table(interface.runtime)}\n\n"
+        "## Quantities measured at run time: `input.runtime`\n\n"
+        f"{quantities_table(interface.runtime)}\n\n"
         if interface.runtime
         else ""
     )
@@ -90,7 +91,7 @@ if ({name}_decide(&input, &result) != {macro}_OK) {{
 
 {goal}## States: `input.state`
 
-{_table(interface.states)}
+{quantities_table(interface.states)}
 
 {runtime}## Inputs: `input.proposed`, `input.low`, `input.high`, `result.action`
 
@@ -134,6 +135,7 @@ def _cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
 
 
-def _table(quantities: Sequence[Quantity]) -> str:
+def quantities_table(quantities: Sequence[Quantity]) -> str:
+    """Return a table of names, symbols and units."""
     lines = "\n".join(f"| `{q.name}` | {_cell(q.symbol)} | {_cell(q.unit)} |" for q in quantities)
     return f"| Name | Symbol | Unit |\n|---|---|---|\n{lines}"

@@ -1,4 +1,4 @@
-"""From calls in kernels to calls in C."""
+"""From calls and entries of tables in kernels to those in C."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from safe_envs.wrappers.export.c_expressions import Operators, unknown
 from safe_envs.wrappers.export.c_numbers import require_known
 from safe_envs.wrappers.export.kinds import (
+    FLOATS,
     NUMBERS,
     REAL,
     TABLE,
@@ -21,6 +22,13 @@ from safe_envs.wrappers.export.kinds import (
 
 class Expressions(Operators):
     """Translates the expressions of one function."""
+
+    def _Subscript(self, node: ast.Subscript) -> Text:  # noqa: N802
+        whole = node.value
+        if not (isinstance(whole, ast.Name) and self.kinds.get(whole.id) == FLOATS):
+            return super()._Subscript(node)
+        code = f"{self.text(whole).code}.at[{self.text(node.slice).code}]"
+        return Text(f"({self._program.precision.type}){code}", REAL, UNARY)
 
     def _Call(self, node: ast.Call) -> Text:  # noqa: N802
         if not isinstance(node.func, ast.Name) or node.keywords:

@@ -22,7 +22,7 @@ _GIVEN = re.compile(r"a[0-9]{3,}")
 _ARGUMENTS = {"x": "states", "u": "inputs"}
 """What arguments of generated formulas are called, so that states may be called x."""
 
-_OF_TYPES = {"vector", "table", "numbers"}
+_OF_TYPES = {"vector", "table", "numbers", "floats"}
 
 
 class CContext(ABC):

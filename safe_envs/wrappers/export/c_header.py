@@ -25,7 +25,7 @@ def header_text(interface: Interface) -> str:
     """Return filter.h."""
     name, macro, real = interface.name, interface.macro, interface.precision.type
     k, m = len(interface.constraints), len(interface.inputs)
-    runtime = _struct(
+    runtime = struct_text(
         f"{name}_runtime", "Quantities measured at run time.", interface.runtime, real
     )
     statuses = "\n".join(
@@ -71,9 +71,9 @@ typedef enum {{
 {statuses}
 }} {name}_status;
 
-{_struct(f"{name}_state", "A state.", interface.states, real)}
+{struct_text(f"{name}_state", "A state.", interface.states, real)}
 {runtime}
-{_struct(f"{name}_inputs", "An input.", interface.inputs, real)}
+{struct_text(f"{name}_inputs", "An input.", interface.inputs, real)}
 /* What the filter is given. */
 typedef struct {{
     {name}_state state;
@@ -126,7 +126,15 @@ def _stack(interface: Interface) -> int:
     return 512 * math.ceil((2 * arrays + 512) / 512)
 
 
-def _struct(name: str, doc: str, quantities: Sequence[Quantity], real: str) -> str:
+def struct_text(name: str, doc: str, quantities: Sequence[Quantity], real: str) -> str:
+    """Return the struct of some quantities; "" of none.
+
+    Args:
+        name: of the struct.
+        doc: what it is.
+        quantities: its fields.
+        real: type of numbers.
+    """
     if not quantities:
         return ""
     lines = "\n".join(f"    {real} {q.name}; /* {q.described} */" for q in quantities)

@@ -13,7 +13,7 @@ from safe_envs.wrappers.export.c_context import CContext
 from safe_envs.wrappers.export.c_names import comment
 from safe_envs.wrappers.export.c_numbers import HELPERS, Precision
 from safe_envs.wrappers.export.c_statements import FunctionTranslator
-from safe_envs.wrappers.export.kinds import REAL, WHOLE, CFunction, Kind, Result
+from safe_envs.wrappers.export.kinds import FLOATS, REAL, WHOLE, CFunction, Kind, Result
 
 _WIDTH = 100
 
@@ -35,6 +35,13 @@ typedef struct {
     const real *at;
     int size;
 } numbers;
+"""
+
+_FLOATS = """/* Entries of a table that is only read. */
+typedef struct {
+    const float *at;
+    int size;
+} floats;
 """
 
 
@@ -64,6 +71,8 @@ class CProgram(CContext):
     def text(self) -> str:
         """Return types, constants and functions, each one before those that need it."""
         parts = [_TYPES.replace("real", self.precision.type)]
+        if any(FLOATS in function.kinds for function in self._functions.values()):
+            parts.append(_FLOATS)
         parts += [self._struct(k.type, [("at", k)]) for _, k in sorted(self._tuples.items())]
         parts.append("".join(f"{line}\n" for line in self._constants.values()))
         for name in HELPERS:

@@ -9,6 +9,27 @@ from safe_envs.wrappers.export.decision import DOCUMENTED, FilterProgram
 from safe_envs.wrappers.export.interface import Interface
 from safe_envs.wrappers.export.kinds import NUMBERS, VECTOR
 
+PREAMBLE = """\
+ * Compile it as C99 with -ffp-contract=off and without -ffast-math: flags depend on the rounding
+ * of sums and products.
+ */
+#include "filter.h"
+
+#include <math.h>
+#include <stddef.h>
+
+#ifdef __FAST_MATH__
+#error "compile the filter without -ffast-math: it tells numbers from NaN and rounding from misses"
+#endif
+#if defined(__FLT_EVAL_METHOD__) && __FLT_EVAL_METHOD__ == 2
+#error "the filter needs sums in their own precision: compile with -msse2 -mfpmath=sse"
+#endif
+#ifdef __clang__
+#pragma STDC FP_CONTRACT OFF
+#endif
+"""
+"""How every exported source goes on, from its first comment to its includes."""
+
 
 def source_text(interface: Interface, program: FilterProgram) -> str:
     """Return filter.c.
@@ -36,24 +57,7 @@ def source_text(interface: Interface, program: FilterProgram) -> str:
  *
  * {interface.title}
  *
- * Compile it as C99 with -ffp-contract=off and without -ffast-math: flags depend on the rounding
- * of sums and products.
- */
-#include "filter.h"
-
-#include <math.h>
-#include <stddef.h>
-
-#ifdef __FAST_MATH__
-#error "compile the filter without -ffast-math: it tells numbers from NaN and rounding from misses"
-#endif
-#if defined(__FLT_EVAL_METHOD__) && __FLT_EVAL_METHOD__ == 2
-#error "the filter needs sums in their own precision: compile with -msse2 -mfpmath=sse"
-#endif
-#ifdef __clang__
-#pragma STDC FP_CONTRACT OFF
-#endif
-
+{PREAMBLE}
 {translated.text()}
 {translated.data_table() if needs_data else ""}{public}"""
     )

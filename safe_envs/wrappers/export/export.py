@@ -69,7 +69,7 @@ def export_filter(
         NotCompilableError: Something in the filter has no form in C, such as a table of values.
     """
     folder, options = Path(directory), options or ExportOptions()
-    _require_own(folder)
+    require_own(folder)
     interface, texts = sources(safety_filter, float32, options)
     region = region_of(safety_filter, options)
     golden = golden_cases(safety_filter, region, is_single=float32)
@@ -78,12 +78,25 @@ def export_filter(
         "CMakeLists.txt": cmake_text(interface),
         "README.md": readme_text(interface),
     }
+    write_files(folder, texts)
+    return interface
+
+
+def write_files(folder: Path, texts: Mapping[str, str]) -> None:
+    """Write the files of an export.
+
+    Args:
+        folder: where; it is created where its parent exists.
+        texts: by the names of `NAMES`.
+
+    Raises:
+        ConfigurationError: It cannot be written.
+    """
     with writing(folder):
         folder.mkdir(exist_ok=True)
     for name in NAMES:
         content = texts[name].encode()
         write_atomically(folder / name, lambda part, content=content: part.write_bytes(content))
-    return interface
 
 
 def sources(
@@ -148,7 +161,7 @@ def _about(symbol: sp.Symbol, default: float | None) -> tuple[float, float]:
     return ends.get(word, (-2.0, 0.0) if word == "nonpositive" else (-2.0, 2.0))
 
 
-def _require_own(folder: Path) -> None:
+def require_own(folder: Path) -> None:
     """Raise ConfigurationError where files would be overwritten that no export has written."""
     if folder.exists() and not folder.is_dir():
         raise ConfigurationError(f"{shortened(folder)} is a file; name a folder")

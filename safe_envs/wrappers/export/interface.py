@@ -101,12 +101,9 @@ def interface_of(
     Raises:
         ConfigurationError: The name is no name of C.
     """
-    if c_name(name) != name or not name.isidentifier():
-        raise ConfigurationError(
-            f"name = {shown(name)} is no name of C; give letters, digits and _, no keyword"
-        )
+    require_name(name)
     qp, model = safety_filter.qp, safety_filter.model
-    quantities = _quantities(qp.symbols, {TIME.name: "s", **units}, model.parameters)
+    quantities = quantities_of(qp.symbols, {TIME.name: "s", **units}, model.parameters)
     names = [barrier.name for barrier, _ in safety_filter.pairs]
     conditions = [condition.name for _, condition in safety_filter.pairs]
     of_condition: dict[str, list[str]] = {}
@@ -118,7 +115,7 @@ def interface_of(
         precision,
         quantities[: model.n],
         quantities[model.n :],
-        _quantities(model.inputs, units, {}),
+        quantities_of(model.inputs, units, {}),
         tuple(c_names(names)),
         tuple(names),
         tuple(qp.low),
@@ -129,9 +126,24 @@ def interface_of(
     )
 
 
-def _quantities(
+def require_name(name: str) -> None:
+    """Raise ConfigurationError where public names of C cannot begin with a name."""
+    if c_name(name) != name or not name.isidentifier():
+        raise ConfigurationError(
+            f"name = {shown(name)} is no name of C; give letters, digits and _, no keyword"
+        )
+
+
+def quantities_of(
     symbols: Sequence[sp.Symbol], units: Mapping[str, str], defaults: Mapping[sp.Symbol, float]
 ) -> tuple[Quantity, ...]:
+    """Return quantities, with their names in C.
+
+    Args:
+        symbols: of them.
+        units: by symbol.
+        defaults: their values where none are given, by symbol.
+    """
     return tuple(
         Quantity(
             name,

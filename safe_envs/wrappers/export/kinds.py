@@ -28,6 +28,8 @@ TABLE = Kind("table")
 """The same with two indices."""
 NUMBERS = Kind("numbers")
 """Entries that are only read: a state, an input, constants."""
+FLOATS = Kind("floats")
+"""A table that is only read, in single precision whatever the precision of the numbers is."""
 NOTHING = Kind("")
 
 SCALARS = (REAL, WHOLE, TRUTH)

@@ -32,17 +32,23 @@ class ExpectedBounds:
         step: of the problem.
         smoothing: of the table's grid.
         sets: of the problem; or of its specification, with the states of the automaton.
+
+    Attributes:
+        rest: what noise beyond all boxes adds to bounds of the negative upper envelope.
+        slack: see `grid_arrays`.
+        grid: of the smoothed tables.
     """
 
     def __init__(
         self, table: ValueTable, step: Step, smoothing: Smoothing, sets: Sets | ProductTables
     ) -> None:
         self._table, self._step, self._smoothing, self._sets = table, step, smoothing, sets
-        self._substeps = step.substeps
-        self._rest = -(step.noise.rest + smoothing.beyond)
+        self._substeps, self.grid = step.substeps, smoothing.means
+        self.rest = -(step.noise.rest + smoothing.beyond)
         if isinstance(sets, ProductTables) and sets.most:
-            self._rest = 0.0
-        self._means = grid_arrays(smoothing.means, ROUNDING if step.is_noisy else POINT_SLACK)
+            self.rest = 0.0
+        self.slack = ROUNDING if step.is_noisy else POINT_SLACK
+        self._means = grid_arrays(smoothing.means, self.slack)
         self._parts: CellSets | None = None
         self._prepare()
 
@@ -99,6 +105,19 @@ class ExpectedBounds:
                 found[rows] = part
         elif len(k):
             self._fill((k, places), q, inputs, sign, 0, found)
+        return found
+
+    def smoothed(self, sign: int) -> np.ndarray:
+        """Return the smoothed tables of all instants, shape (T, cells of the grid), float32.
+
+        Args:
+            sign: see `bounds`.
+        """
+        found, first = np.zeros_like(self._ahead[sign]), max(1 - self._table.first, 0)
+        for row in range(first, len(self._table.lower)):
+            self._fill_row(row, sign, row + self._table.first)
+        # No step leads to the instant 0, whose table is not smoothed.
+        found[first:] = self._ahead[sign][first:]
         return found
 
     @cached_property
@@ -191,7 +210,7 @@ class ExpectedBounds:
         k, places = at
         rows = self._layers(k, places, sign)
         images, effects = self._step.of_points(q, inputs, instant * self._substeps)
-        rest = 0.0 if sign > 0 else self._rest
+        rest = 0.0 if sign > 0 else self.rest
         expected = self._functions["expected_values"]
 
         def sweep(first: int, last: int, shifts: np.ndarray) -> None:

@@ -18,6 +18,7 @@ from safe_envs.wrappers.value.seen_sets import SeenSets
 from safe_envs.wrappers.value.smoothing import Smoothing
 from safe_envs.wrappers.value.step_images import Step
 from safe_envs.wrappers.value.table import ValueTable
+from safe_envs.wrappers.value.table_parts import TableParts
 
 
 class LookAhead:
@@ -36,6 +37,7 @@ class LookAhead:
         box: (low, high) of each input.
         specification: of the table; "" for that of staying safe.
         automaton: of the specification; None for the values of staying safe.
+        parts: what is read, for those who write it as code.
         noise_boxes: number of boxes into which the noise of a step is divided.
 
     Raises:
@@ -62,6 +64,7 @@ class LookAhead:
         self._seen = SeenSets(problem, small, settings.leaving)
         self._tables = ExpectedBounds(table, step, smoothing, self._product or self._sets)
         self.noise_boxes = len(step.noise.weights)
+        self.parts = TableParts(table, small, step, self._tables, settings.leaving)
         self._scanned = scanned_inputs(small.box, settings.inputs)
         if not np.array_equal(self._scanned.values, table.inputs):
             raise ConfigurationError(

@@ -109,6 +109,7 @@ class PromiseFilter:
         problem: as given.
         look_ahead: as given; for a specification one of pairs.
         text: of the settings.
+        coarse, coarse_spacing: inputs that are looked at first, and how far they are apart.
 
     Raises:
         ConfigurationError: The episodes of the problem are longer than the table.
@@ -133,8 +134,8 @@ class PromiseFilter:
             [problem.plant.numeric(barrier.expression) for barrier in problem.barriers],
             "arrays",
         )
-        self._coarse = _coarse(look_ahead.inputs)
-        self._spacing = _spacing(look_ahead.inputs)
+        self.coarse = _coarse(look_ahead.inputs)
+        self.spacing, self.coarse_spacing = _spacing(look_ahead.inputs), _spacing(self.coarse)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> PromiseFilter:
         """Return the filter itself: it never changes, and its table may be of gigabytes."""
@@ -209,18 +210,18 @@ class PromiseFilter:
         """Return the inputs (B, m) in place of proposed ones, their q_k and the levels p_k."""
         level, ahead = level.copy(), self.look_ahead
         action, found = np.empty(given.shape), np.empty(len(given))
-        spacing = np.full(len(given), _spacing(self._coarse))
+        spacing = np.full(len(given), self.coarse_spacing)
         held = np.flatnonzero(level > 0.0)
         values = ahead.expected(
             k[held],
             _part(x, held),
-            np.broadcast_to(self._coarse, (len(held), *self._coarse.shape)),
+            np.broadcast_to(self.coarse, (len(held), *self.coarse.shape)),
         )
-        action[held], found[held] = _closest(self._coarse, values, level[held], given[held])
+        action[held], found[held] = _closest(self.coarse, values, level[held], given[held])
         # What is between these inputs decides where none of them is allowed.
         open_ = held[found[held] < level[held]]
         if open_.size:
-            values, spacing[open_] = ahead.scanned(k[open_], _part(x, open_)), self._spacing
+            values, spacing[open_] = ahead.scanned(k[open_], _part(x, open_)), self.spacing
             level[open_] = np.minimum(level[open_], np.maximum(values.max(axis=1), 0.0))
             action[open_], found[open_] = _closest(ahead.inputs, values, level[open_], given[open_])
         held = np.flatnonzero(level > 0.0)

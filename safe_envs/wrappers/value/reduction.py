@@ -32,7 +32,7 @@ from safe_envs.wrappers.value.product_states import keeps_safe
 MOST_COORDINATES = 4
 """Axes of a grid that fits into memory."""
 
-_ROUNDING = 1e-6
+KNOWN_ROUNDING = 1e-6
 """By which known states may differ from what they are to be: that of single precision."""
 
 _NONE: Mapping[str, tuple[float, float]] = MappingProxyType({})
@@ -101,7 +101,7 @@ class ReducedProblem:
         found = np.ones(len(k), dtype=bool)
         for i, values in self.assumed.items():
             expected = values[k]
-            found &= np.abs(x[i] - expected) <= _ROUNDING * (1.0 + np.abs(expected))
+            found &= np.abs(x[i] - expected) <= KNOWN_ROUNDING * (1.0 + np.abs(expected))
         return found
 
     @property

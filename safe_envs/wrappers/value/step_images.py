@@ -56,6 +56,7 @@ class Step:
         blur: standard deviation of the noise along each coordinate that is left out here.
         noise: boxes of all other noise.
         is_affine: whether inputs move the images in proportion.
+        parts: of the step, as expressions.
     """
 
     def __init__(self, reduced: ReducedProblem) -> None:
@@ -65,8 +66,8 @@ class Step:
                 " problems whose control period is one integration step; take substeps = 1"
             )
         self._reduced = reduced
-        self._parts = step_parts(reduced)
-        self.blur, self.is_affine = self._parts.blur, self._parts.is_affine
+        self.parts = step_parts(reduced)
+        self.blur, self.is_affine = self.parts.blur, self.parts.is_affine
         self._scenarios = scenarios(reduced.intervals)
         self.noise: NoiseBoxes = noise_boxes(self._intervals())
 
@@ -92,12 +93,12 @@ class Step:
     @cached_property
     def depends_on_time(self) -> bool:
         """Whether states that are known in advance occur in the step."""
-        used = set().union(*(e.free_symbols for e in self._parts.expressions))
+        used = set().union(*(e.free_symbols for e in self.parts.expressions))
         return bool(used & set(self._reduced.known))
 
     @cached_property
     def _functions(self) -> tuple[Any, Any]:
-        reduced, parts = self._reduced, self._parts
+        reduced, parts = self._reduced, self.parts
         symbols = (
             *(c.symbol for c in reduced.coordinates),
             *reduced.known,
@@ -114,7 +115,7 @@ class Step:
 
         The more one of them moves the coordinates, as parts of their ranges, the more it has.
         """
-        reduced, channels = self._reduced, len(self._parts.boxed)
+        reduced, channels = self._reduced, len(self.parts.boxed)
         if channels < 2:
             return [_ALONE] * channels
         rng = np.random.default_rng(0)
@@ -173,7 +174,7 @@ class Step:
 
     @cached_property
     def _kernel(self) -> Any:
-        reduced, parts = self._reduced, self._parts
+        reduced, parts = self._reduced, self.parts
         symbols = {
             "points": reduced.symbols,
             "known": tuple(reduced.known),
@@ -184,7 +185,8 @@ class Step:
         return image_function(symbols, parts.rest, parts.effect)
 
     @cached_property
-    def _worlds(self) -> np.ndarray:
+    def worlds(self) -> np.ndarray:
+        """Ends of the uncertain parameters in each scenario, shape (R, S, 2)."""
         return np.array(self._scenarios, dtype=float).reshape(len(self._scenarios), -1, 2)
 
     def of_points(self, q: Sequence[np.ndarray], inputs: np.ndarray, instant: int) -> StepImages:
@@ -203,7 +205,7 @@ class Step:
         effects = np.empty((points.shape[1], scenarios, n, m, 2))
         known = np.array([values[instant] for values in self._reduced.known.values()], dtype=float)
         self._kernel(
-            0, points.shape[1], points, known, self._worlds, noise.low, noise.high, inputs, images,
+            0, points.shape[1], points, known, self.worlds, noise.low, noise.high, inputs, images,
             effects,
         )  # fmt: skip
         return StepImages(images, effects)
