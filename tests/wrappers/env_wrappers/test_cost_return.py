@@ -68,7 +68,7 @@ def test_attributes_are_those_of_the_env():
     for name in ("nothing", "_private"):
         with pytest.raises(AttributeError, match=name):
             getattr(env, name)
-    assert copy.copy(env).env is inner
+    assert copy.copy(env).env is not inner
     env.close()
 
 

@@ -55,7 +55,7 @@ def test_next_states_lie_in_the_windows(gain, own):
         control = RNG.uniform(given[:, 0, 0], given[:, 0, 1])
         box = RNG.integers(0, boxes, 150)
         noise = {w: np.zeros(150) for w in small.noise}
-        for w, a, b in zip(step._parts.boxed, step.noise.low, step.noise.high, strict=True):
+        for w, a, b in zip(step.parts.boxed, step.noise.low, step.noise.high, strict=True):
             noise[w] = RNG.uniform(a[box], b[box])
         found = next_state(*state, *noise.values(), control)
         for i, axis in enumerate(grid.axes):
