@@ -39,7 +39,8 @@ def read_bounds(
     if pairs.shape != (len(inputs), 2):
         raise ConfigurationError(
             f"bounds = {shown(given)}; give (low, high) of the input in physical units, for all"
-            f" inputs or for each of the {len(inputs)}; -math.inf and math.inf are no bounds"
+            f" inputs or for each of the {len(inputs)}"
+            f"{'; an end may be infinite' if endless else ''}"
         )
     table: Any = pairs.tolist()
     for symbol, (low, high) in zip(inputs, table, strict=True):
