@@ -99,16 +99,16 @@ class FilteredCostReplayBuffer(FilteredReplayBuffer, CostReplayBuffer):
     """
 
 
-def with_costs(kind: type[ReplayBuffer] | None) -> type[CostReplayBuffer]:
+def with_costs(kind: type[ReplayBuffer]) -> type[CostReplayBuffer]:
     """Return the replay buffer with costs that stores steps as another one does.
 
     Args:
-        kind: of the other one; None for that of Stable-Baselines3.
+        kind: of the other one.
 
     Raises:
         ConfigurationError: there is none, as for n-step returns.
     """
-    if kind is None or kind is ReplayBuffer:
+    if kind is ReplayBuffer:
         return CostReplayBuffer
     if kind is FilteredReplayBuffer:
         return FilteredCostReplayBuffer

@@ -23,20 +23,33 @@ Sources: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018,
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional
 
 from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of
-from safe_envs.agents.training.cost_replay_buffer import CostReplayBuffer, with_costs
+from safe_envs.agents.training.cost_replay_buffer import with_costs
 from safe_envs.errors import ConfigurationError
 
 _OF_THE_CRITICS = 0xC057
 """Key of the random numbers of the first weights of cost critics."""
+
+_OF_THE_CONSTRAINT = (
+    "cost_limit",
+    "cost_unit",
+    "cost_gamma",
+    "multiplier_gains",
+    "constraint",
+    "cost_critic",
+    "cost_critic_target",
+    "_buffer_class",
+)
 
 
 class SACLagrangian(SAC):
@@ -68,8 +81,6 @@ class SACLagrangian(SAC):
         ConfigurationError: an argument is out of range, or the buffer cannot hold costs.
     """
 
-    replay_buffer: CostReplayBuffer
-
     def __init__(
         self,
         *args: Any,
@@ -100,7 +111,8 @@ class SACLagrangian(SAC):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
-        self.replay_buffer_class = with_costs(self.replay_buffer_class)
+        given = vars(self).get("_buffer_class") or self.replay_buffer_class or ReplayBuffer
+        self._buffer_class, self.replay_buffer_class = given, with_costs(given)
         super()._setup_model()
         known: EpisodeConstraint | None = vars(self).get("constraint")
         self.constraint = EpisodeConstraint(
@@ -128,11 +140,14 @@ class SACLagrangian(SAC):
         total_timesteps: int,
         callback: Any = None,
         reset_num_timesteps: bool = True,
-        *args: Any,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
     ) -> Any:
         if reset_num_timesteps or self._last_obs is None:
             self.constraint.begin_episodes()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         """Take the costs of a step, for whose place Stable-Baselines3 has no other method."""
@@ -160,6 +175,15 @@ class SACLagrangian(SAC):
         self.logger.record("train/cost_critic_loss", np.mean(update.losses))
         for name, value in self.constraint.figures().items():
             self.logger.record(f"constraint/{name}", value)
+
+    def plain(self) -> SAC:
+        """Return the same model as SAC, whose files Stable-Baselines3 reads by itself."""
+        twin: Any = copy.copy(self)
+        twin.__class__ = SAC
+        twin.replay_buffer_class = self._buffer_class
+        for name in _OF_THE_CONSTRAINT:
+            del vars(twin)[name]
+        return twin
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         states, variables = super()._get_torch_save_params()
@@ -230,7 +254,8 @@ class _Update:
     def _step(self) -> None:
         """Take a gradient step of the cost critics, and move their targets."""
         model, critic = self._model, self._model.cost_critic
-        steps, costs = model.replay_buffer.last_sample()
+        buffer: Any = model.replay_buffer
+        steps, costs = buffer.last_sample()
         gamma = model.gamma if model.cost_gamma is None else model.cost_gamma
         with th.no_grad():
             ahead = _larger(model.cost_critic_target(steps.next_observations, self._next_actions))
