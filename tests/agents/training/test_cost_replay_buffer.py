@@ -52,7 +52,7 @@ def plain(kind=CostReplayBuffer, rows=7, **arguments):
 def test_costs_are_those_of_the_sampled_steps(steps, small):
     memory = {"optimize_memory_usage": True, "handle_timeout_termination": False} if small else {}
     buffer = fill(plain(**memory), steps)
-    np.random.seed(4)
+    np.random.seed(4)  # noqa: NPY002
     steps, costs = buffer.sample(200), buffer.last_sample().costs
     assert buffer.last_sample().steps is steps
     assert costs.shape == (200, 1)
@@ -65,9 +65,9 @@ def test_it_draws_what_stable_baselines3_draws():
     batches, left = [], []
     for kind in (ReplayBuffer, CostReplayBuffer):
         buffer = fill(plain(kind), 9)
-        np.random.seed(4)
+        np.random.seed(4)  # noqa: NPY002
         batches.append([buffer.sample(16) for _ in range(3)])
-        left.append(np.random.random())
+        left.append(np.random.random())  # noqa: NPY002
     for theirs, ours in zip(*batches, strict=True):
         for a, b in zip(theirs, ours, strict=True):
             assert (a is None and b is None) or (a == b).all()

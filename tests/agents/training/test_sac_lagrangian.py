@@ -71,9 +71,9 @@ def assert_same(one, other):
 )
 def test_it_is_sac_bit_for_bit_where_the_multiplier_is_zero(condition, changes):
     plain = learned(SAC, condition, **changes)
-    draws = [torch.rand(1).item(), np.random.random()]
+    draws = [torch.rand(1).item(), np.random.random()]  # noqa: NPY002
     ours = learned(SACLagrangian, condition, **changes, **NO_GAINS)
-    assert [torch.rand(1).item(), np.random.random()] == draws
+    assert [torch.rand(1).item(), np.random.random()] == draws  # noqa: NPY002
     assert_same(plain, ours)
     # There were costs, and the critics learned them.
     assert ours.replay_buffer.costs.any()
