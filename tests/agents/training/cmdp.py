@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import gymnasium as gym
 import numpy as np
+import torch
 from scipy.optimize import linprog
-from scipy.special import ndtr
+from scipy.special import ndtri
+from stable_baselines3 import SAC
 
 GOES_ON = 0.75
 ROAD, ICE, DITCH = range(3)
@@ -35,9 +37,10 @@ START = np.array([1.0, 0.0, 0.0])
 
 
 class IcyRoad(gym.Env):
-    """The process, with a continuous action: bold above 0.
+    """The process, with a continuous action a: bold with probability (1 + a)/2.
 
-    Observations are unit vectors.
+    So the values of actions are linear, and a policy of random actions is worth what that of their
+    means is. Observations are unit vectors.
     """
 
     observation_space = gym.spaces.Box(0.0, 1.0, (3,))
@@ -49,8 +52,8 @@ class IcyRoad(gym.Env):
         return np.eye(3, dtype=np.float32)[ROAD], {"cost": 0.0}
 
     def step(self, action):
-        state, bold = self._state, int(action[0] > 0.0)
-        ends, lot = self.np_random.random(2)
+        coin, ends, lot = self.np_random.random(3)
+        state, bold = self._state, int(2.0 * coin - 1.0 < action[0])
         self._state = int(np.searchsorted(MOVES[state, bold].cumsum(), lot, side="right"))
         observation = np.eye(3, dtype=np.float32)[self._state]
         info = {"cost": float(COSTS[state, bold])}
@@ -90,18 +93,15 @@ def value_of(bold):
 
 
 def boldness(model):
-    """Return the probability of boldness in each state of a model with normal actions.
-
-    SAC squashes its actions monotonically, and 0 stays 0.
-    """
-    import torch
-
+    """Return the probability of boldness in each state of a model, which acts at random."""
+    states = torch.eye(3)
+    # The mean of a function of a normal number, over many of its quantiles.
+    normal = ndtri((np.arange(1000) + 0.5) / 1000)
     with torch.no_grad():
-        states = torch.eye(3)
-        if hasattr(model, "actor"):
+        if isinstance(model, SAC):
             mean, log_std, _ = model.actor.get_action_dist_params(states)
-            deviation = log_std.exp()
+            actions = np.tanh(mean.numpy() + log_std.exp().numpy() * normal)
         else:
-            normal = model.policy.get_distribution(states).distribution
-            mean, deviation = normal.mean, normal.stddev
-    return ndtr((mean / deviation).numpy().ravel().astype(float))
+            found = model.policy.get_distribution(states).distribution
+            actions = np.clip(found.mean.numpy() + found.stddev.numpy() * normal, -1.0, 1.0)
+    return 0.5 + 0.5 * actions.mean(axis=1)
