@@ -18,7 +18,7 @@ LIMIT = 0.5
 
 
 class Values(BaseCallback):
-    """The exact return and cost of the policy of each rollout."""
+    """The exact return and cost of the policy of each rollout, and the multiplier."""
 
     def __init__(self):
         super().__init__()
@@ -28,11 +28,12 @@ class Values(BaseCallback):
         return True
 
     def _on_rollout_end(self):
-        self.found.append(value_of(boldness(self.model)))
+        values = value_of(boldness(self.model))
+        self.found.append((*values, self.model.constraint.value))
 
 
 def trained(kind, steps, seed, count, **settings):
-    """Return the mean return and cost of the second half of a training, and the model."""
+    """Return the mean return, cost and multiplier of the second half of a training."""
     torch.set_num_threads(1)
     envs = DummyVecEnv([IcyRoad] * count)
     model = kind(
@@ -46,7 +47,7 @@ def trained(kind, steps, seed, count, **settings):
         **settings,
     )
     model.learn(steps, values := Values())
-    return np.mean(values.found[len(values.found) // 2 :], axis=0), model
+    return np.mean(values.found[len(values.found) // 2 :], axis=0)
 
 
 PPO = {
@@ -61,7 +62,7 @@ PPO = {
     "multiplier_ki": 0.5,
 }
 SAC = {
-    "count": 32,
+    "count": 64,
     "train_freq": 4,
     "gradient_steps": 4,
     "batch_size": 128,
@@ -72,8 +73,8 @@ SAC = {
     "policy_kwargs": {"net_arch": {"pi": [], "qf": [32]}},
     # So the multiplier is that of the linear program.
     "cost_scale": 1.0,
-    "multiplier_kp": 1.0,
-    "multiplier_ki": 0.1,
+    "multiplier_kp": 2.0,
+    "multiplier_ki": 0.3,
 }
 
 
@@ -138,7 +139,7 @@ QUICK_SAC = {
 )
 def test_learners_come_near_the_best_policy(kind, settings, steps):
     # Without a constraint the best policy has a return of 8.45 and a cost of 1.81.
-    (value, cost), _ = trained(kind, steps, 0, **settings)
+    value, cost, _ = trained(kind, steps, 0, **settings)
     assert value == pytest.approx(best(LIMIT)[0], rel=0.1)
     assert cost == pytest.approx(LIMIT, rel=0.3)
 
@@ -147,12 +148,12 @@ def test_learners_come_near_the_best_policy(kind, settings, steps):
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     ("kind", "settings", "steps"),
-    [(PPOLagrangian, PPO, 500_000), (SACLagrangian, SAC, 300_000)],
+    [(PPOLagrangian, PPO, 500_000), (SACLagrangian, SAC, 400_000)],
 )
 def test_learners_find_the_best_policy_within_two_percent(kind, settings, steps, seed):
-    (value, cost), model = trained(kind, steps, seed, **settings)
+    value, cost, multiplier = trained(kind, steps, seed, **settings)
     assert value == pytest.approx(best(LIMIT)[0], rel=0.02)
     assert cost == pytest.approx(LIMIT, rel=0.02)
     if kind is SACLagrangian:
         # The multiplier of PPO is in another unit.
-        assert model.constraint.value == pytest.approx(best(LIMIT)[2], rel=0.2)
+        assert multiplier == pytest.approx(best(LIMIT)[2], rel=0.2)
