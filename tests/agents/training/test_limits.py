@@ -235,3 +235,18 @@ def test_the_files_of_the_constrained_extend_those_of_the_others():
         folder = files("safe_envs.agents.training").joinpath("hyperparams")
         table = yaml.safe_load(folder.joinpath(f"{algorithm}.yml").read_text())
         assert set(table) == {"extends", "default"}
+
+
+@pytest.mark.slow
+def test_without_gains_the_training_is_that_of_ppo(tmp_path):
+    gains = {f"multiplier_{name}": 0.0 for name in ("kp", "ki", "kd")}
+    settings = {**SMALL["settings"], "normalize": True}
+    plain = Training.of(SCALAR, "ppo", **SMALL | {"settings": settings})
+    train(plain, tmp_path / "ppo")
+    limited = Training.of(SCALAR, "ppo-lag", cost_limit=0, **SMALL | {"settings": settings | gains})
+    train(limited, tmp_path / "lag")
+    one, other = (np.load(tmp_path / name / "policy.npz") for name in ("ppo", "lag"))
+    # The header names the algorithm.
+    for name in set(one.files) - {"header"}:
+        np.testing.assert_array_equal(one[name], other[name])
+    assert set(one.files) == set(other.files)
