@@ -40,7 +40,9 @@ def judged(
         `kind`, `limit`, the `multiplier` and whether it is `saturated`; number of `episodes` in
         training, their `mean` cost, and its 95 % interval from `low` to `high`, all None before
         every env ended an episode; `met`: False if this interval, or that of the evaluation, lies
-        above the limit, otherwise True, or None as long as nothing was measured.
+        above the limit, otherwise True, or None as long as nothing was measured; and
+        `evaluation_met`: the same for the evaluation alone, None for a limit of the cost, which it
+        does not measure.
     """
     found = {
         "kind": kind,
@@ -48,6 +50,10 @@ def judged(
         "multiplier": constraint.value,
         "saturated": constraint.multiplier.saturated,
     }
+    if kind == VIOLATION:
+        found["evaluation_met"] = 1.0 - evaluation["ci_high"] <= constraint.limit
+    else:
+        found["evaluation_met"] = None
     if not constraint.recent:
         unknown = dict.fromkeys(("mean", "low", "high", "met"))
         return found | {"episodes": 0, **unknown}
@@ -57,26 +63,28 @@ def judged(
     mean = cost / episodes
     if kind == VIOLATION:
         low, high = rate_interval(int(violated), int(episodes))
-        exceeded = max(low, 1.0 - evaluation["ci_high"]) > constraint.limit
     else:
         error = math.sqrt(max(squares / episodes - mean**2, 0.0) / max(episodes - 1.0, 1.0))
         low, high = max(mean - _DEVIATIONS * error, 0.0), mean + _DEVIATIONS * error
-        exceeded = low > constraint.limit
     return found | {
         "episodes": int(episodes),
         "mean": mean,
         "low": low,
         "high": high,
-        "met": not exceeded,
+        "met": low <= constraint.limit and found["evaluation_met"] is not False,
     }
 
 
 def rank(evaluation: Mapping[str, Any]) -> tuple[bool, float]:
     """Return what the best policy has most of: first that it keeps its limit, then return.
 
+    The policies that are kept do not explore, so that their evaluation decides, if it can.
+
     Args:
         evaluation: row with `return_mean`, and with what is `judged` about a limit, if there is
             one.
     """
     judgement = evaluation.get("constraint") or {}
-    return judgement.get("met") is not False, evaluation["return_mean"]
+    met = judgement.get("evaluation_met")
+    met = judgement.get("met") if met is None else met
+    return met is not False, evaluation["return_mean"]

@@ -61,6 +61,13 @@ def _print_constraint(console: Console, row: Mapping[str, Any]) -> None:
     if judgement["met"]:
         say(console, f"Limit: {limit}. Measured: {measured}. {multiplier}")
         return
+    if judgement["evaluation_met"]:
+        say(
+            console,
+            f"NOT MET by the policy as it explores: the limit {limit}. Measured: {measured}."
+            f" {multiplier} The evaluation does not exclude the limit.",
+        )
+        return
     say(
         console,
         f"NOT MET: the limit {limit}. Measured: {measured}. {multiplier} Either the limit cannot be"

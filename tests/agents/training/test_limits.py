@@ -105,6 +105,13 @@ def test_violations_are_judged_in_training_and_after_it():
     assert judged(observed(0.1, [0] * 100), VIOLATION, row(0.6, 0.8))["met"] is False
 
 
+def test_the_evaluation_is_judged_for_itself():
+    explores = observed(0.1, [0, 1] * 50)
+    assert judged(explores, VIOLATION, row())["evaluation_met"] is True
+    assert judged(explores, VIOLATION, row(0.6, 0.8))["evaluation_met"] is False
+    assert judged(explores, COST, row())["evaluation_met"] is None
+
+
 def test_costs_are_judged_by_the_interval_of_their_mean():
     costs = np.random.default_rng(0).poisson(3.0, 100)
     found = judged(observed(3.5, costs), COST, row(0.0, 0.0))
@@ -127,6 +134,8 @@ def test_the_best_keeps_its_limit_first():
     exceeded = row(return_mean=9.0, constraint={"met": False})
     assert rank(kept) > rank(exceeded)
     assert rank(row(return_mean=2.0)) > rank(kept)
+    without_exploration = {"met": False, "evaluation_met": True}
+    assert rank(row(constraint=without_exploration, return_mean=0.5)) > rank(exceeded)
 
 
 def printed(rows):
@@ -135,13 +144,17 @@ def printed(rows):
     return stream.getvalue()
 
 
-def evaluated(constraint, kind=VIOLATION):
-    entry = row(safety_rate=0.95, timesteps=10, episodes=200, training={"violations": 3}, safe=190)
+def evaluated(constraint, kind=VIOLATION, rate=(0.9, 1.0)):
+    entry = row(
+        *rate, safety_rate=0.95, timesteps=10, episodes=200, training={"violations": 3}, safe=190
+    )
     return [entry | {"constraint": judged(constraint, kind, entry)}]
 
 
 def test_a_limit_that_is_not_met_is_told():
-    text = printed(evaluated(observed(0.01, [1, 0] * 50, unit=0.1)))
+    explores = observed(0.01, [1, 0] * 50, unit=0.1)
+    assert "NOT MET by the policy as it explores" in printed(evaluated(explores))
+    text = printed(evaluated(explores, rate=(0.9, 0.98)))
     assert "NOT MET: the limit P(any violation) <= 1 %. Measured: 50 % [40.4 %, 59.6 %]" in text
     assert "the limit cannot be reached" in text
     assert "its greatest value" not in text
@@ -165,7 +178,7 @@ def test_an_unreachable_limit_is_in_the_evaluations(tmp_path):
     last = json.loads((tmp_path / "run" / "evaluations.json").read_text())[-1]
     assert last["constraint"]["met"] is False
     assert last["constraint"]["low"] > 0.001
-    assert "NOT MET" in printed([last])
+    assert "NOT MET: the limit" in printed([last])
 
 
 @pytest.mark.slow
@@ -222,3 +235,18 @@ def test_the_files_of_the_constrained_extend_those_of_the_others():
         folder = files("safe_envs.agents.training").joinpath("hyperparams")
         table = yaml.safe_load(folder.joinpath(f"{algorithm}.yml").read_text())
         assert set(table) == {"extends", "default"}
+
+
+@pytest.mark.slow
+def test_without_gains_the_training_is_that_of_ppo(tmp_path):
+    gains = {f"multiplier_{name}": 0.0 for name in ("kp", "ki", "kd")}
+    settings = {**SMALL["settings"], "normalize": True}
+    plain = Training.of(SCALAR, "ppo", **SMALL | {"settings": settings})
+    train(plain, tmp_path / "ppo")
+    limited = Training.of(SCALAR, "ppo-lag", cost_limit=0, **SMALL | {"settings": settings | gains})
+    train(limited, tmp_path / "lag")
+    one, other = (np.load(tmp_path / name / "policy.npz") for name in ("ppo", "lag"))
+    # The header names the algorithm.
+    for name in set(one.files) - {"header"}:
+        np.testing.assert_array_equal(one[name], other[name])
+    assert set(one.files) == set(other.files)
