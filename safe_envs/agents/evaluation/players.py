@@ -18,7 +18,7 @@ from safe_envs.agents.jobs.threads import available_threads
 from safe_envs.compiled.engine import compiled_or_none
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilter
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 
 
 class NumpyPlayer:
@@ -118,10 +118,8 @@ class CompiledPlayer:
             raise NotCompilableError(
                 f"{resolved.target.title} is a third-party env, which only its own code can step"
             )
-        if isinstance(conditions, PromiseSettings):
-            raise NotCompilableError(
-                f"the filter {conditions.text} looks up a table, which the engine 'numpy' alone can"
-            )
+        if isinstance(conditions, FilterSettings):
+            raise NotCompilableError(f"the filter {conditions.text} {conditions.not_compiled}")
         if settings.record:
             raise NotCompilableError(
                 "trajectories for pictures are kept by the engine 'numpy' alone"

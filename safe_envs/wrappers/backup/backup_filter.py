@@ -41,29 +41,44 @@ are accepted or refused as a whole. The proof in terms of held inputs and the se
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import Components, stacked
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source
+from safe_envs.dynamics.codegen import stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    InvalidInputError,
+    NotCompilableError,
+    SystemDefinitionError,
+    shown,
+)
 from safe_envs.number_text import finite_number
 from safe_envs.problem.backup import Backup, backup_of
+from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.backup.plan_filter import ROUNDING, PlanFilter
 from safe_envs.wrappers.backup.plans import PlannedLaw, Plans
-from safe_envs.wrappers.backup.search import Search
 from safe_envs.wrappers.backup.settings import LONGEST, BackupSettings
 from safe_envs.wrappers.filter_qp import FilterDecision, arguments, limits
 from safe_envs.wrappers.filter_qp.runtime import doubles, require_finite
 
-ROUNDING = 1e-9
-"""Below which no barrier falls on the plan of an input that is executed in place of a backup."""
+
+class _Stated(NamedTuple):
+    """What a filter was made for."""
+
+    system: ControlAffineSDE
+    barriers: tuple[Barrier, ...]
+    bounds: tuple[tuple[float, float], ...]
+    dt: float
+    substeps: int
 
 
-class BackupFilter:
+class BackupFilter(PlanFilter):
     """Chooses an input near a proposed one after which a backup law keeps the system safe.
 
     Args:
@@ -121,7 +136,7 @@ class BackupFilter:
                 f"horizon = {horizon:g} s of the backup filter has {periods} control periods of"
                 f" {period:g} s; {LONGEST} at most"
             )
-        self.plans = Plans(
+        plans = Plans(
             system,
             [barrier.expression for barrier in named],
             planned(backup),
@@ -130,8 +145,10 @@ class BackupFilter:
             substeps,
             periods,
         )
-        self._barriers, self._floor = len(named), max(self.settings.margin, ROUNDING)
-        self._search = Search(self.plans, self._floor)
+        super().__init__(plans, max(self.settings.margin, ROUNDING))
+        self._stated = _Stated(
+            system, tuple(named), tuple(zip(low, high, strict=True)), period, substeps
+        )
 
     @classmethod
     def for_problem(
@@ -168,6 +185,37 @@ class BackupFilter:
             problem.substeps,
             settings,
         )
+
+    def require_problem(self, problem: SafetyProblem) -> None:
+        """Raise ConfigurationError where the filter was made for something else than a problem."""
+        ours = self._stated
+        for what, fits in (
+            ("system", ours.system in (problem.model, problem.plant)),
+            ("barriers", ours.barriers == problem.barriers),
+            ("input bounds", ours.bounds == problem.box),
+            ("control period", (ours.dt, ours.substeps) == (problem.dt, problem.substeps)),
+        ):
+            if not fits:
+                raise ConfigurationError(
+                    f"the {what} of the backup filter: {problem.name} has others; make the filter"
+                    " for the env's own problem, BackupFilter.for_problem(env.problem)"
+                )
+
+    def why_not(self, plant: ControlAffineSDE) -> str:
+        """Return why nothing is guaranteed of a plant; "" where it is.
+
+        Args:
+            plant: that is simulated.
+        """
+        if plant.noisy:
+            return "the plant has noise, which the plans of a backup filter leave out"
+        if plant != self.model:
+            return "the plans are of the filter's model, from which the plant differs"
+        return ""
+
+    def source(self, data: Data) -> Source:
+        """Raise NotCompilableError: NumPy decides."""
+        raise NotCompilableError(f"the filter {self.text} {self.settings.not_compiled}")
 
     def filter(self, x: Any, u_nominal: Any) -> FilterDecision:
         """Decide for one state or a batch.
@@ -213,82 +261,8 @@ class BackupFilter:
             slack,
             found.cause.reshape(batch),
             u.copy(),
-            stacked(self.plans.barriers(states), size).reshape(*batch, self._barriers),
+            stacked(self.plans.barriers(states), size).reshape(*batch, self.plans.count),
         )
-
-    # Components: floats of one state.
-
-    def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
-        """Decide for one state.
-
-        Args:
-            x: n finite components of the state.
-            u: m finite components of the proposed input.
-
-        Returns:
-            The decision in components.
-        """
-        wanted = [min(max(c, a), b) for c, a, b in zip(u, *self.plans.bounds, strict=True)]
-        given = self.plans.kept_after_one(x, wanted, self._floor)
-        count = self._barriers
-        if given.kept:
-            action = list(u) if wanted == list(u) else wanted
-            none = [0.0] * count
-            return FilterDecision(action, [given.lowest] * count, [False], True, none, -1, u)
-        found = self._search.of_one(x, wanted)
-        if found is not None:
-            action, lowest = found
-            margin, none = [lowest] * count, [0.0] * count
-            return FilterDecision(action, margin, [True], True, none, given.failed, u)
-        with np.errstate(all="ignore"):
-            last = self._search.last_resort(tuple([np.array([c]) for c in x]))
-        action, lowest, slack = [[c.item() for c in part] for part in last[:3]]
-        return FilterDecision(action, lowest, [True], last.good.item(), slack, given.failed, u)
-
-    # Components: arrays of a batch.
-
-    def decide_arrays(self, x: Components, u: Components) -> FilterDecision:
-        """Decide for a batch; as `decide_floats`, with an array (B,) for each component.
-
-        Args:
-            x: n components of the states.
-            u: m components of the proposed inputs.
-
-        Returns:
-            The decisions in components.
-        """
-        with np.errstate(all="ignore"):
-            return self._decide(x, u)
-
-    def _decide(self, x: Components, u: Components) -> FilterDecision:
-        wanted = tuple([np.clip(c, *ends) for c, ends in zip(u, self.plans.ends, strict=True)])
-        kept, lowest, failed = self.plans.kept_after(x, wanted, self._floor)
-        count, size = self._barriers, len(kept)
-        rows = np.flatnonzero(~kept)
-        none = np.zeros(size)
-        if not rows.size:
-            return FilterDecision(
-                wanted, (lowest,) * count, (~kept,), kept, (none,) * count, failed, u
-            )
-        action = tuple([c.copy() for c in wanted])
-        margin = tuple([lowest.copy() for _ in range(count)])
-        slack = tuple([none.copy() for _ in range(count)])
-        feasible = np.ones(size, dtype=bool)
-        at, goal = [tuple([c[rows] for c in part]) for part in (x, wanted)]
-        points, lowest, found = self._search.of_batch(at, goal)
-        _put((*action, *margin), rows, (*points, *(lowest,) * count))
-        lost = np.flatnonzero(~found)
-        if lost.size:
-            last, rows = self._search.last_resort(tuple([c[lost] for c in at])), rows[lost]
-            _put((*action, *margin, *slack), rows, (*last.action, *last.lowest, *last.slack))
-            feasible[rows] = last.good
-        failed = np.where(kept, -1, failed)
-        return FilterDecision(action, margin, (~kept,), feasible, slack, failed, u)
-
-
-def _put(parts: Sequence[np.ndarray], rows: np.ndarray, values: Sequence[np.ndarray]) -> None:
-    for part, value in zip(parts, values, strict=True):
-        part[rows] = value
 
 
 def planned(backup: Backup) -> list[PlannedLaw]:

@@ -69,6 +69,7 @@ class Plans:
         periods: as given.
         bounds: as given.
         ends: lower and upper bound of each input.
+        count: number of barriers.
     """
 
     def __init__(
@@ -85,7 +86,7 @@ class Plans:
         self.bounds, self._barriers = bounds, tuple(barriers)
         self.ends = [(np.array(a), np.array(b)) for a, b in zip(*bounds, strict=True)]
         self._middle = [0.5 * a + 0.5 * b for a, b in zip(*bounds, strict=True)]
-        self._system, self._count = system, len(self._barriers)
+        self._system, self.count = system, len(self._barriers)
         self._steps = {f: Integrator(system, dt, substeps, f) for f in _FLAVOURS}
         self._readings = {f: [self._compile(law, f) for law in laws] for f in _FLAVOURS}
         self._still = [0.0] * self._steps["floats"].channels
@@ -115,7 +116,7 @@ class Plans:
 
     def _clipped(self, values: Sequence[float]) -> list[float]:
         """Return the inputs among readings within their bounds; the middle where there is none."""
-        wanted = values[self._count + 1 :]
+        wanted = values[self.count + 1 :]
         limits = zip(wanted, *self.bounds, self._middle, strict=True)
         return [c if u != u else min(max(u, a), b) for u, a, b, c in limits]
 
@@ -135,13 +136,13 @@ class Plans:
         for reading in self._readings["floats"]:
             found = self._followed_by_one(reading, reached, floor)
             if found.kept:
-                return found if first is None else Kept(True, found.lowest, first.failed)
+                return found
             first = first or found
         assert first is not None
         return first
 
     def _followed_by_one(self, reading: Any, x: Components, floor: float) -> Kept:
-        step, count, lowest = self._steps["floats"].step, self._count, np.inf
+        step, count, lowest = self._steps["floats"].step, self.count, np.inf
         for k in range(self.periods + 1):
             try:
                 values = reading(*x)
@@ -171,7 +172,7 @@ class Plans:
         return [self._clipped_arrays(reading(*x), x) for reading in self._readings["arrays"]]
 
     def _clipped_arrays(self, values: Components, x: Components) -> Components:
-        shape, wanted = x[0].shape, values[self._count + 1 :]
+        shape, wanted = x[0].shape, values[self.count + 1 :]
         found = []
         for u, (low, high), middle in zip(wanted, self.ends, self._middle, strict=True):
             clipped = np.minimum(np.maximum(filled(u, shape), low), high)
@@ -186,7 +187,7 @@ class Plans:
             x: n components (B,).
         """
         with np.errstate(all="ignore"):
-            return self._readings["arrays"][0](*x)[: self._count]
+            return self._readings["arrays"][0](*x)[: self.count]
 
     def advanced(self, x: Components, u: Components) -> Components:
         """Return the states one period later.
@@ -225,11 +226,12 @@ class Plans:
             found = self._followed(reading, _at(reached, rows), floor)
             now = rows[found.kept]
             kept[now], lowest[now] = True, found.lowest[found.kept]
+        failed[kept] = -1
         return Kept(kept, lowest, failed)
 
     def _followed(self, reading: Any, x: Components, floor: float) -> Kept:
         """Follow a law from states, each as long as it is neither lost nor in the terminal set."""
-        size, count = len(x[0]), self._count
+        size, count = len(x[0]), self.count
         kept, lowest = np.zeros(size, dtype=bool), np.empty(size)
         failed, rows = np.full(size, -1), np.arange(size)
         low = np.full(size, np.inf)
@@ -271,7 +273,7 @@ class Plans:
         Returns:
             Whether the terminal set is reached, (M,), and each barrier's smallest value, (k, M).
         """
-        reading, count = self._readings["arrays"][law], self._count
+        reading, count = self._readings["arrays"][law], self.count
         entered, lows = np.zeros(len(x[0]), dtype=bool), np.full((count, len(x[0])), np.inf)
         for k in range(self.periods + 1):
             x = self.advanced(x, u)

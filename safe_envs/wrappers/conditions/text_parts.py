@@ -12,6 +12,7 @@ from typing import NamedTuple
 from safe_envs.object_import import resolved
 from safe_envs.plugins import CONDITIONS, module_of
 from safe_envs.wrappers.conditions.registry import (
+    BACKUP,
     BY_THEMSELVES,
     PROMISE,
     condition_class,
@@ -69,6 +70,11 @@ def name_by_itself(text: str) -> str:
 def names_promise(text: str) -> bool:
     """Return whether the text of a filter is that of the promise filter."""
     return name_by_itself(text) == PROMISE
+
+
+def names_backup(text: str) -> bool:
+    """Return whether the text of a filter is that of the backup filter."""
+    return name_by_itself(text) == BACKUP
 
 
 def _is_known(name: str) -> bool:
