@@ -44,7 +44,8 @@ class BackupBound:
     def at(self, starts: np.ndarray) -> np.ndarray:
         """Return the bound at starts, 0 or 1; see `HeldInputBound.at`."""
         x = tuple(np.ascontiguousarray(starts.T))
-        h = np.array([np.broadcast_to(c, len(starts)) for c in self._filter.plans.barriers(x)])
+        plans = self._filter.plans
+        h = np.array([np.broadcast_to(c, len(starts)) for c in plans.barriers(plans.part(x))])
         return (self._filter.domain(x) & (h >= 0.0).all(axis=0)).astype(float)
 
     def contradiction(self, visited: VisitedStates) -> str:

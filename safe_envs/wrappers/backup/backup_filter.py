@@ -249,6 +249,7 @@ class BackupFilter(PlanFilter):
         )
         found = self.decide_arrays(states, inputs)
         size = len(inputs[0])
+        barriers = stacked(self.plans.barriers(self.plans.part(states)), size)
         action, margin, active, slack = [
             stacked(part, size).reshape(*batch, len(part))
             for part in (found.action, found.margin, found.active, found.slack)
@@ -261,7 +262,9 @@ class BackupFilter(PlanFilter):
             slack,
             found.cause.reshape(batch),
             u.copy(),
-            stacked(self.plans.barriers(states), size).reshape(*batch, self.plans.count),
+            stacked(self.plans.barriers(self.plans.part(states)), size).reshape(
+                *batch, self.plans.count
+            ),
         )
 
 

@@ -37,7 +37,7 @@ class PlanFilter:
             x: n components (B,).
         """
         with np.errstate(all="ignore"):
-            return self._search.last_resort(x).good
+            return self._search.last_resort(self.plans.part(x)).good
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
         """Decide for one state.
@@ -49,6 +49,7 @@ class PlanFilter:
         Returns:
             The decision in components.
         """
+        x = self.plans.part(x)
         wanted = [min(max(c, a), b) for c, a, b in zip(u, *self.plans.bounds, strict=True)]
         given = self.plans.kept_after_one(x, wanted, self._floor)
         count = self.plans.count
@@ -77,7 +78,7 @@ class PlanFilter:
             The decisions in components.
         """
         with np.errstate(all="ignore"):
-            return self._decide(x, u)
+            return self._decide(self.plans.part(x), u)
 
     def _decide(self, x: Components, u: Components) -> FilterDecision:
         wanted = tuple([np.clip(c, *ends) for c, ends in zip(u, self.plans.ends, strict=True)])

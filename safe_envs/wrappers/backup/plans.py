@@ -12,6 +12,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function, filled
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.wrappers.backup.closed_part import closed_part
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
 
 _CHUNK = 2048
@@ -86,8 +87,10 @@ class Plans:
         self.bounds, self._barriers = bounds, tuple(barriers)
         self.ends = [(np.array(a), np.array(b)) for a, b in zip(*bounds, strict=True)]
         self._middle = [0.5 * a + 0.5 * b for a, b in zip(*bounds, strict=True)]
-        self._system, self.count = system, len(self._barriers)
-        self._steps = {f: Integrator(system, dt, substeps, f) for f in _FLAVOURS}
+        self.count = len(self._barriers)
+        wanted = [*self._barriers, *(e for law in laws for e in (law.terminal, *law.law))]
+        self._system, self._places = closed_part(system, wanted)
+        self._steps = {f: Integrator(self._system, dt, substeps, f) for f in _FLAVOURS}
         self._readings = {f: [self._compile(law, f) for law in laws] for f in _FLAVOURS}
         self._still = [0.0] * self._steps["floats"].channels
         self._still_arrays = [np.array(0.0)] * len(self._still)
@@ -98,13 +101,23 @@ class Plans:
         numbers = [self._system.numeric(e) for e in wanted]
         return compile_function(self._system.states, numbers, flavour)
 
+    def part(self, x: Sequence[Any]) -> Components:
+        """Return those components of a state, or of states, that plans need.
+
+        All other methods take states as these p components.
+
+        Args:
+            x: n components.
+        """
+        return tuple([x[i] for i in self._places])
+
     # One state, in floats.
 
     def inputs_of_one(self, x: Sequence[float]) -> list[list[float]]:
         """Return what each law executes at a state.
 
         Args:
-            x: n components.
+            x: p components.
         """
         found = []
         for reading in self._readings["floats"]:
@@ -124,7 +137,7 @@ class Plans:
         """Return whether some law keeps the state that an input leads to; see `kept_after`.
 
         Args:
-            x: n components of the state.
+            x: p components of the state.
             u: m components of the input.
             floor: which no barrier may be below.
         """
@@ -164,7 +177,7 @@ class Plans:
         """Return what each law executes at states.
 
         Args:
-            x: n components (B,).
+            x: p components (B,).
 
         Returns:
             For each law m components (B,).
@@ -184,7 +197,7 @@ class Plans:
         """Return the barriers at states, k components.
 
         Args:
-            x: n components (B,).
+            x: p components (B,).
         """
         with np.errstate(all="ignore"):
             return self._readings["arrays"][0](*x)[: self.count]
@@ -193,7 +206,7 @@ class Plans:
         """Return the states one period later.
 
         Args:
-            x: n components (B,) of the states.
+            x: p components (B,) of the states.
             u: m components (B,) of the inputs.
         """
         shape = x[0].shape
@@ -207,7 +220,7 @@ class Plans:
         plan, until the plan is in the terminal set of its law, within so many `periods`.
 
         Args:
-            x: n components (M,) of the states.
+            x: p components (M,) of the states.
             u: m components (M,) of the inputs.
             floor: which no barrier may be below.
         """
@@ -267,7 +280,7 @@ class Plans:
 
         Args:
             law: its index.
-            x: n components (M,) of the states.
+            x: p components (M,) of the states.
             u: m components (M,) of the first inputs.
 
         Returns:

@@ -53,7 +53,7 @@ class Search:
         """Search for one state.
 
         Args:
-            x: n components of the state.
+            x: p components of the state.
             wanted: m components of the proposed input, within its bounds.
 
         Returns:
@@ -95,7 +95,7 @@ class Search:
         """Search for a batch, as `of_one` does.
 
         Args:
-            x: n components (R,) of the states.
+            x: p components (R,) of the states.
             wanted: m components (R,) of the proposed inputs, within their bounds.
 
         Returns:
@@ -161,7 +161,7 @@ class Search:
         """Return the inputs of the laws with the best plans, where nothing else is allowed.
 
         Args:
-            x: n components (B,) of the states.
+            x: p components (B,) of the states.
         """
         best: list[Any] = []
         for law, u in enumerate(self._plans.inputs(x)):
