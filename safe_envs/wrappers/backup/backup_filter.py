@@ -262,9 +262,7 @@ class BackupFilter(PlanFilter):
             slack,
             found.cause.reshape(batch),
             u.copy(),
-            stacked(self.plans.barriers(self.plans.part(states)), size).reshape(
-                *batch, self.plans.count
-            ),
+            barriers.reshape(*batch, self.plans.count),
         )
 
 
