@@ -46,7 +46,7 @@ class BackupBound:
         x = tuple(np.ascontiguousarray(starts.T))
         plans = self._filter.plans
         h = np.array([np.broadcast_to(c, len(starts)) for c in plans.barriers(plans.part(x))])
-        return (self._filter.domain(x) & (h >= 0.0).all(axis=0)).astype(float)
+        return (self._filter.domain(x) & (h > 0.0).all(axis=0)).astype(float)
 
     def contradiction(self, visited: VisitedStates) -> str:
         """Return "": what no state of an episode could show, its rate does.

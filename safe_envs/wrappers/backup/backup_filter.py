@@ -35,7 +35,7 @@ Source: T. Gurriet, M. Mote, A. Singletary, P. Nilsson, E. Feron, A. D. Ames, "A
 critical control framework for nonlinear systems", IEEE Access 8 (2020), for backup laws under input
 bounds; D. R. Agrawal, R. Chen, D. Panagou, "gatekeeper: Online safety verification and control for
 nonlinear systems in dynamic environments", IEEE Transactions on Robotics 40 (2024), for plans that
-are accepted or refused as a whole. The proof in terms of held inputs and the search are our own.
+are accepted or refused as a whole. The proof is for held inputs.
 """
 
 from __future__ import annotations
