@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safe_envs.agents.evaluation.decision_source import decider_of
 from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation
 from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.jobs.threads import available_threads
@@ -15,8 +16,7 @@ from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
 from safe_envs.agents.rare_events.particles import PathPlayer
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from safe_envs.compiled.engine import compiled_or_none
-from safe_envs.errors import ConfigurationError, NotCompilableError
-from safe_envs.wrappers import SafetyFilter
+from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 
 
@@ -84,13 +84,8 @@ def _compiled(
     continuous: bool,
     reference: PathPlayer,
 ) -> ChosenPlayer:
-    if isinstance(conditions, FilterSettings):
-        raise NotCompilableError(f"the filter {conditions.text} {conditions.not_compiled}")
-    problem, spec = resolved.problem, resolved.spec
-    qp = None
-    if conditions:
-        qp = SafetyFilter.for_problem(problem, conditions, spec.knowledge, spec.objective).qp
-    program = PathProgram(problem, resolved.policy, qp, continuous)
+    decider = decider_of(resolved, conditions)
+    program = PathProgram(resolved.problem, resolved.policy, decider, continuous)
     threads = available_threads()
     functions = program.compiled()
     player = CompiledPaths(program, functions, reference, threads)

@@ -52,7 +52,6 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import (
     ConfigurationError,
     InvalidInputError,
-    NotCompilableError,
     SystemDefinitionError,
     shown,
 )
@@ -61,8 +60,10 @@ from safe_envs.problem.backup import Backup, backup_of
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.backup.compiled_source import backup_source
 from safe_envs.wrappers.backup.plan_filter import ROUNDING, PlanFilter
-from safe_envs.wrappers.backup.plans import PlannedLaw, Plans
+from safe_envs.wrappers.backup.planned_system import PlannedLaw
+from safe_envs.wrappers.backup.plans import Plans
 from safe_envs.wrappers.backup.settings import LONGEST, BackupSettings
 from safe_envs.wrappers.filter_qp import FilterDecision, arguments, limits
 from safe_envs.wrappers.filter_qp.runtime import doubles, require_finite
@@ -214,8 +215,12 @@ class BackupFilter(PlanFilter):
         return ""
 
     def source(self, data: Data) -> Source:
-        """Raise NotCompilableError: NumPy decides."""
-        raise NotCompilableError(f"the filter {self.text} {self.settings.not_compiled}")
+        """Return the function `decide` of a compiled program.
+
+        Args:
+            data: receives its numbers.
+        """
+        return backup_source(self.plans, self.floor, data)
 
     def filter(self, x: Any, u_nominal: Any) -> FilterDecision:
         """Decide for one state or a batch.

@@ -28,7 +28,7 @@ def closed_part(
     rates = [
         sp.sympify(f).free_symbols.union(*(e.free_symbols for e in row))
         for f, row in zip(
-            sp.Matrix(system.drift), sp.Matrix(system.input_matrix).tolist(), strict=True
+            list(sp.Matrix(system.drift)), sp.Matrix(system.input_matrix).tolist(), strict=True
         )
     ]
     needed: set[Any] = set().union(*(e.free_symbols for e in expressions))
@@ -42,7 +42,7 @@ def closed_part(
     if system.noisy or not chosen or len(chosen) == system.n:
         return system, tuple(range(system.n))
     places = sorted(chosen)
-    drift, effect = sp.Matrix(system.drift), sp.Matrix(system.input_matrix)
+    drift, effect = list(sp.Matrix(system.drift)), sp.Matrix(system.input_matrix)
     part = ControlAffineSDE(
         states=tuple(system.states[i] for i in places),
         inputs=system.inputs,

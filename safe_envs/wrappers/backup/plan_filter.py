@@ -24,10 +24,11 @@ class PlanFilter:
 
     Attributes:
         plans: as given.
+        floor: as given.
     """
 
     def __init__(self, plans: Plans, floor: float) -> None:
-        self.plans, self._floor = plans, floor
+        self.plans, self.floor = plans, floor
         self._search = Search(plans, floor)
 
     def domain(self, x: Components) -> np.ndarray:
@@ -51,7 +52,7 @@ class PlanFilter:
         """
         x = self.plans.part(x)
         wanted = [min(max(c, a), b) for c, a, b in zip(u, *self.plans.bounds, strict=True)]
-        given = self.plans.kept_after_one(x, wanted, self._floor)
+        given = self.plans.kept_after_one(x, wanted, self.floor)
         count = self.plans.count
         if given.kept:
             action = list(u) if wanted == list(u) else wanted
@@ -82,7 +83,7 @@ class PlanFilter:
 
     def _decide(self, x: Components, u: Components) -> FilterDecision:
         wanted = tuple([np.clip(c, *ends) for c, ends in zip(u, self.plans.ends, strict=True)])
-        kept, lowest, failed = self.plans.kept_after(x, wanted, self._floor)
+        kept, lowest, failed = self.plans.kept_after(x, wanted, self.floor)
         count, size = self.plans.count, len(kept)
         rows = np.flatnonzero(~kept)
         none = np.zeros(size)

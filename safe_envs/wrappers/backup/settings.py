@@ -32,7 +32,6 @@ class BackupSettings(FilterSettings):
 
     name = BACKUP
     only_of_steps = "its plans are of the env's own steps"
-    not_compiled = "simulates plans, which the engine 'numpy' alone can"
 
     horizon: float | None = None
     margin: float = 0.0

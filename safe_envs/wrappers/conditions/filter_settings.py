@@ -21,13 +21,13 @@ class FilterSettings(ABC):
     Attributes:
         name: with which its text begins.
         only_of_steps: why it has no bound for continuous control.
-        not_compiled: why only NumPy can simulate whole episodes under it.
+        not_compiled: why only NumPy can simulate under it; "" where that is not so.
         of_paths: what it remembers of the path so far; "" where it decides by the state alone.
     """
 
     name: ClassVar[str]
     only_of_steps: ClassVar[str]
-    not_compiled: ClassVar[str]
+    not_compiled: ClassVar[str] = ""
     of_paths: ClassVar[str] = ""
 
     @property
