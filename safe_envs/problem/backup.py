@@ -32,16 +32,20 @@ class BackupLaw:
         equilibrium: value of each coordinate of a set that is derived, by the symbol of the state:
             a number or an expression of the parameters. These states must form a system of their
             own under the law, and all barriers must be functions of them.
+        extent: about how far a derived set is to reach in each coordinate, in proportion to the
+            others; half the width of the workspace by default.
 
     Raises:
         SystemDefinitionError: neither or both of `terminal` and `equilibrium` are given, or a part
             is no expression.
+        ConfigurationError: an extent is not positive and finite.
     """
 
     name: str
     law: tuple[sp.Expr, ...]
     terminal: sp.Expr | None = None
     equilibrium: Mapping[sp.Symbol, Any] = field(default_factory=dict)
+    extent: Mapping[sp.Symbol, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -67,6 +71,10 @@ class BackupLaw:
             object.__setattr__(self, "terminal", formula(f"terminal of {what}", self.terminal))
         rest = {s: formula(f"equilibrium of {what}", e) for s, e in self.equilibrium.items()}
         object.__setattr__(self, "equilibrium", rest)
+        extent = {s: finite_number(f"extent of {what}", w) for s, w in self.extent.items()}
+        if not all(width > 0 for width in extent.values()):
+            raise ConfigurationError(f"extent of {what} = {extent}; give positive numbers")
+        object.__setattr__(self, "extent", extent)
 
     def require_known(self, system: ControlAffineSDE) -> None:
         """Check that the law fits a system.
@@ -86,6 +94,7 @@ class BackupLaw:
         for entry in (*self.law, *([] if self.terminal is None else [self.terminal])):
             system.require_known(f"backup law {self.name}", entry.free_symbols, known)
         system.require_known("its equilibrium", self.equilibrium, system.states)
+        system.require_known("its extent", self.extent, tuple(self.equilibrium))
         for entry in self.equilibrium.values():
             system.require_known("its equilibrium", entry.free_symbols, parameters)
 
