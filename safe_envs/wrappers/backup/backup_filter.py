@@ -56,7 +56,7 @@ from safe_envs.errors import (
     shown,
 )
 from safe_envs.number_text import finite_number
-from safe_envs.problem.backup import Backup, backup_of
+from safe_envs.problem.backup import Backup
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.problem import SafetyProblem
@@ -65,6 +65,7 @@ from safe_envs.wrappers.backup.plan_filter import ROUNDING, PlanFilter
 from safe_envs.wrappers.backup.planned_system import PlannedLaw
 from safe_envs.wrappers.backup.plans import Plans
 from safe_envs.wrappers.backup.settings import LONGEST, BackupSettings
+from safe_envs.wrappers.backup_sets.terminal_set import with_terminal_sets
 from safe_envs.wrappers.filter_qp import FilterDecision, arguments, limits
 from safe_envs.wrappers.filter_qp.runtime import doubles, require_finite
 
@@ -175,10 +176,11 @@ class BackupFilter(PlanFilter):
             settings = BackupSettings.of_text(settings)
         settings = BackupSettings() if settings is None else settings
         settings.require_fit(problem)
-        backup = backup_of(problem)
+        system = problem.model if knowledge == "model" else problem.plant
+        backup = with_terminal_sets(problem, system)
         assert backup is not None
         return cls(
-            problem.model if knowledge == "model" else problem.plant,
+            system,
             problem.barriers,
             backup,
             problem.box,
@@ -282,7 +284,8 @@ def planned(backup: Backup) -> list[PlannedLaw]:
         if law.terminal is None:
             raise SystemDefinitionError(
                 f"backup law {law.name} has no terminal set; give terminal=..., an expression that"
-                " is >= 0 in a set that the law never leaves"
+                " is >= 0 in a set that the law never leaves; or take BackupFilter.for_problem,"
+                " which derives it from the equilibrium"
             )
         found.append(PlannedLaw(law.name, law.law, law.terminal))
     return found

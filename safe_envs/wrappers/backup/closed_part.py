@@ -25,12 +25,9 @@ def closed_part(
     Returns:
         The part, and the indices of its states.
     """
-    rates = [
-        sp.sympify(f).free_symbols.union(*(e.free_symbols for e in row))
-        for f, row in zip(
-            list(sp.Matrix(system.drift)), sp.Matrix(system.input_matrix).tolist(), strict=True
-        )
-    ]
+    drift, effect = sp.Matrix(system.drift), sp.Matrix(system.input_matrix)
+    both: Any = drift.row_join(effect).tolist()
+    rates = [set[Any]().union(*(sp.sympify(e).free_symbols for e in row)) for row in both]
     needed: set[Any] = set().union(*(e.free_symbols for e in expressions))
     chosen: set[int] = set()
     while True:
@@ -42,7 +39,6 @@ def closed_part(
     if system.noisy or not chosen or len(chosen) == system.n:
         return system, tuple(range(system.n))
     places = sorted(chosen)
-    drift, effect = list(sp.Matrix(system.drift)), sp.Matrix(system.input_matrix)
     part = ControlAffineSDE(
         states=tuple(system.states[i] for i in places),
         inputs=system.inputs,
