@@ -31,10 +31,11 @@ class BallMatrix(NamedTuple):
 
 
 def enclosing(a: Interval) -> BallMatrix:
-    """Return the ball matrix that holds an interval of matrices."""
-    center = 0.5 * a.low + 0.5 * a.high
-    radius = np.maximum(a.high - center, center - a.low) * _MORE + _ULP * np.abs(center) + _TINY
-    return BallMatrix(center, radius)
+    """Return the ball matrix that holds an interval of matrices; NaN where nothing is known."""
+    with np.errstate(invalid="ignore"):
+        center = 0.5 * a.low + 0.5 * a.high
+        radius = np.maximum(a.high - center, center - a.low) * _MORE
+        return BallMatrix(center, radius + _ULP * np.abs(center) + _TINY)
 
 
 def interval_of(a: BallMatrix) -> Interval:
@@ -81,8 +82,8 @@ def norm_bound(a: BallMatrix) -> np.ndarray:
     Returns:
         Shape (...); infinite where a is not finite.
     """
-    finite = (np.isfinite(a.center) & np.isfinite(a.radius)).all(axis=(-2, -1))
-    center = np.where(finite[..., None, None], a.center, 0.0)
+    finite = np.isfinite(a.center + a.radius).all(axis=(-2, -1), keepdims=True)
+    center = np.where(finite, a.center, 0.0)
     left, s, right = np.linalg.svd(center, full_matrices=False)
     product = times(exactly(left * s[..., None, :]), exactly(right))
     rest = plus(exactly(center), scaled(-1.0, product))
@@ -90,7 +91,9 @@ def norm_bound(a: BallMatrix) -> np.ndarray:
     of_rest = frobenius(BallMatrix(rest.center, slack))
     bound = s.max(axis=-1) * _stretch(left) * _stretch(np.swapaxes(right, -1, -2)) + of_rest
     with np.errstate(invalid="ignore"):
-        return np.where(finite, (bound + frobenius(a, of_radius=True)) * _MORE + _TINY, np.inf)
+        return np.where(
+            finite[..., 0, 0], (bound + frobenius(a, of_radius=True)) * _MORE + _TINY, np.inf
+        )
 
 
 def frobenius(a: BallMatrix, of_radius: bool = False) -> np.ndarray:
