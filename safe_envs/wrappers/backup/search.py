@@ -25,13 +25,13 @@ class LastResort(NamedTuple):
 
     Attributes:
         action: m components.
-        lowest: the smallest value of each barrier on the plan.
+        heights: the smallest value of each barrier on the plan.
         slack: by how much each barrier is violated there.
         good: whether none is, and the terminal set is reached.
     """
 
     action: Components
-    lowest: Components
+    heights: Components
     slack: Components
     good: np.ndarray
 
@@ -81,8 +81,8 @@ class Search:
                     for a, b, low, high in zip(begin, end, *self._plans.bounds, strict=True)
                 ]
                 tried = self._plans.kept_after_one(x, point, self._floor)
-                if tried.kept:
-                    found, share = (point, tried.lowest), at
+                if tried.allowed:
+                    found, share = (point, tried.height), at
                     break
             if found is None:
                 break
@@ -153,7 +153,7 @@ class Search:
         at, begin, end = [_repeated(each, count) for each in segments]
         shares = np.concatenate([share + width * part for part in parts])
         found = self._plans.kept_after(at, self._between(begin, end, shares), self._floor)
-        kept, low = found.kept.reshape(count, size), found.lowest.reshape(count, size)
+        kept, low = found.allowed.reshape(count, size), found.height.reshape(count, size)
         which = kept.argmax(axis=0)
         return kept.any(axis=0), low[which, np.arange(size)], np.array(parts)[which]
 
