@@ -191,6 +191,8 @@ def _largest(
             f" equilibrium: held for control periods, deviations are multiplied by {radius:.4g} in"
             " each; give a law that brings them back, or a shorter dt"
         )
+    if (conditions.least(point, disturbed) < 0.0).any():
+        return None
     best: tuple[float, Ellipsoid] | None = None
     for p in _shapes(a, radius, widths):
         root = np.linalg.cholesky(p)
