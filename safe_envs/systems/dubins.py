@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -18,6 +19,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import in_disk, positive, uniforms
+from safe_envs.systems._turning import turning_backup
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
 v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
@@ -191,6 +193,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
         horizon=50.0,
         gains=gains,
         filter="hocbf",
+        backup=partial(turning_backup, speed=v, radius=r),
     )
 
 
@@ -231,6 +234,10 @@ class DubinsDisk(SystemEnv):
     ## Mismatch
     The plant has v = .8 m/s, the model v = .5 m/s. A filter that trusts the model lets h settle
     near -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
+
+    ## Backup
+    `left` and `right`: turn at the full rate, once the circle of the turn fits into the disk, and
+    drive straight on before. The terminal set is in closed form. With noise nothing is guaranteed.
 
     ## Reward
     (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from

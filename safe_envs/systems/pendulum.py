@@ -6,6 +6,7 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
+from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -20,6 +21,14 @@ P = sp.ImmutableMatrix([[sp.sqrt(3), 1], [1, sp.sqrt(3)]])
 """Weights of the safe ellipse."""
 
 _TARGET = sp.Rational(2, 5)
+
+_UPRIGHT = BackupLaw(
+    "upright",
+    (-15 * theta - 16 * thetadot,),
+    equilibrium={theta: 0, thetadot: 0},
+    extent={theta: 0.4, thetadot: 0.4},
+)
+"""The law brings the pendulum back without leaving the ellipse on the way."""
 
 
 def inverted_pendulum() -> ControlAffineSDE:
@@ -75,6 +84,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         plane=("theta", "thetadot"),
         scene="pendulum",
         sampling=SamplingDomain(region=((-reach, reach), (-reach, reach))),
+        backup=Backup((_UPRIGHT,), 1.0),
     )
 
 
@@ -114,6 +124,10 @@ class Pendulum(SystemEnv):
     ## Mismatch
     None by default. The thesis takes the diffusion as unknown: `model={"sigma": 0.0}` is a designer
     who neglects it.
+
+    ## Backup
+    `upright`: u = -15 theta - 16 thetadot. Its terminal set is proved when a filter is made, for
+    the numbers of the problem, without noise: with it nothing is guaranteed.
 
     ## Reward
     exp(-(5 (theta - .4))^2) a step, in (0, 1]. Our choice: at rest there h = -.08.

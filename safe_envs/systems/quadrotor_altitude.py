@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -9,6 +10,7 @@ import sympy as sp
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.number_text import finite_number
+from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -96,6 +98,25 @@ def altitude_problem(
     )
 
 
+def hovering_backup(problem: SafetyProblem, middle: float, reach: float) -> Backup:
+    """Return the backup of braking to a hover in level flight.
+
+    Args:
+        problem: with altitude and climb rate as its states and the thrust as its input.
+        middle: of the band, in m.
+        reach: from there to its ends, in m.
+    """
+    slower = min(1.0, 0.05 / problem.dt)
+    wanted = -1.5 * sp.tanh(slower * (z - middle) / 1.5)
+    hover = BackupLaw(
+        "hover",
+        (m * (g + 7 * slower * (wanted - zdot)),),
+        equilibrium={z: middle, zdot: 0},
+        extent={z: reach, zdot: 1.0},
+    )
+    return Backup((hover,), 2.0 / slower)
+
+
 CLIMB_RATES = (-5.0, 5.0)
 """Where a climb rate is explored, in m/s."""
 
@@ -123,6 +144,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         plane=("z", "zdot"),
         scene="altitude",
         sampling=SamplingDomain(region=((center - half_width, center + half_width), CLIMB_RATES)),
+        backup=partial(hovering_backup, middle=float(center), reach=float(half_width)),
     )
 
 
@@ -160,6 +182,10 @@ class QuadrotorAltitude(SystemEnv):
     ## Mismatch
     The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much acceleration
     again as the thrust gives.
+
+    ## Backup
+    `hover`: thrust brakes to a hover in the middle of the band. Its terminal set is proved when a
+    filter is made, for the numbers of the problem: for the plant with knowledge of the plant.
 
     ## Reward
     exp(-(z - z_ref)^2) a step, in (0, 1].
