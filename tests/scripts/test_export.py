@@ -57,3 +57,9 @@ def test_errors_end_with_status_2(export, arguments, message, tmp_path):
     assert status == 2
     assert message in err
     assert not (tmp_path / "c").exists()
+
+
+def test_the_backup_filter_has_no_form_in_c(export, tmp_path):
+    status, _, error = export("DubinsDisk-v0", "--filter", "backup", "--out", tmp_path / "c")
+    assert status == 2
+    assert "it simulates plans" in error

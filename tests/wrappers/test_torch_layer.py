@@ -354,6 +354,11 @@ def test_a_layer_takes_finite_bounds_and_nothing_at_each_call():
         TorchFilter(SafetyFilter(still, 1 - x, "cbf", (-math.inf, 1.0)))
 
 
+def test_the_backup_filter_has_no_gradient_either():
+    with pytest.raises(ConfigurationError, match=r"'backup'.*no gradient.*'scbf'"):
+        TorchFilter.for_problem(make_problem("safe_envs/DubinsDisk-v0"), "backup")
+
+
 def test_the_promise_filter_has_no_gradient_and_says_what_to_use():
     problem = make_problem("safe_envs/Scalar-v0")
     with pytest.raises(ConfigurationError, match=r"'promise:p=0\.9'.*no gradient.*'scbf'"):

@@ -144,17 +144,23 @@ class Plans(PlannedSystem):
         Returns:
             Whether the terminal set is reached, (M,), and each barrier's smallest value, (k, M).
         """
-        reading, count = self.compiled["arrays"][law], self.count
-        entered, lows = np.zeros(len(x[0]), dtype=bool), np.full((count, len(x[0])), np.inf)
+        reading, count, size = self.compiled["arrays"][law], self.count, len(x[0])
+        entered, lows = np.zeros(size, dtype=bool), np.empty((count, size))
+        rows, low = np.arange(size), np.full((count, size), np.inf)
         for k in range(self.periods + 1):
             x = self.advanced(x, u)
-            values = reading(*x)
-            h = np.array([filled(v, x[0].shape) for v in values[:count]])
-            lows = np.where(entered, lows, np.minimum(lows, h))
-            entered |= filled(values[count], x[0].shape) >= 0.0
-            if k == self.periods or entered.all():
+            values, shape = reading(*x), x[0].shape
+            low = np.minimum(low, np.array([filled(v, shape) for v in values[:count]]))
+            there = filled(values[count], shape) >= 0.0
+            over = np.flatnonzero(there)
+            entered[rows[over]], lows[:, rows[over]] = True, low[:, over]
+            if k == self.periods or over.size == rows.size:
+                lows[:, rows[~there]] = low[:, ~there]
                 break
             u = self.clipped_arrays(values, x)
+            if over.size:
+                on = np.flatnonzero(~there)
+                rows, low, x, u = rows[on], low[:, on], _at(x, on), _at(u, on)
         return entered, np.where(np.isnan(lows), -np.inf, lows)
 
 

@@ -100,6 +100,7 @@ def _none_stated(problem: SafetyProblem) -> str:
     return (
         f"{problem.name} states no backup: a law that brings the system to a set which it never"
         " leaves. Give one, state_problem(..., backup=Backup((BackupLaw(name, law, terminal),),"
-        " horizon)) or dataclasses.replace(problem, backup=...), from safe_envs.problem.backup; or"
-        f" take another filter, such as {problem.filter}"
+        " horizon)), dataclasses.replace(problem, backup=...), or FilterSpec(..., backup=...) for a"
+        " third-party env, from safe_envs.problem.backup; or take another filter, such as"
+        f" {problem.filter}"
     )

@@ -87,6 +87,7 @@ class FilterSpec:
             `SafetyProblem`.
         nominal: a controller to be kept safe, an expression of the model's states and parameters
             for each input; if any.
+        backup: laws for the filter "backup", see `safe_envs.problem.backup.Backup`; if any.
 
     Raises:
         RelativeDegreeError: no input reaches a barrier.
@@ -102,6 +103,7 @@ class FilterSpec:
     dt: float | None = None
     gains: tuple[Any, ...] | None = None
     nominal: Any = None
+    backup: Any = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, ControlAffineSDE):
@@ -230,6 +232,7 @@ class FilterSpec:
             starts={"of the env": Start.at((0.0,) * model.n)},
             dt=period,
             horizon=(steps or 1) * period,
+            backup=self.backup,
             **{**defaults, **({} if self.gains is None else {"gains": self.gains})},
         )
 

@@ -19,6 +19,7 @@ from safe_envs import (
     SystemDefinitionError,
     SystemDefinitionWarning,
 )
+from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.wrappers import (
     ActionMap,
     FilterSpec,
@@ -69,6 +70,22 @@ def smallest_h(env: gym.Env, episodes: int = 3) -> float:
 def test_a_filter_keeps_the_pendulum_slow_at_the_top():
     assert smallest_h(SafetyMonitor(gym.make("Pendulum-v1"), FilterSpec(**PENDULUM))) < -30
     assert smallest_h(SafetyFilterWrapper(gym.make("Pendulum-v1"), FILTER, **PENDULUM)) > 0
+
+
+def test_a_backup_keeps_the_pendulum_slow():
+    """Full torque against the motion below, where the pendulum hangs."""
+    slow = sp.Integer(50) - rate**2 / 2 - 15 * (1 + sp.cos(theta))
+    brake = BackupLaw("brake", (-2 * rate,), terminal=slow)
+    view = {**PENDULUM, "barriers": 50 - rate**2 / 2 - 15 * (1 + sp.cos(theta))}
+    with pytest.raises(ConfigurationError, match="FilterSpec"):
+        SafetyFilterWrapper(gym.make("Pendulum-v1"), "backup", **view)
+    env = SafetyFilterWrapper(
+        gym.make("Pendulum-v1"), "backup", **view, backup=Backup((brake,), 2.0)
+    )
+    env.reset(seed=0)
+    infos = [env.step(np.array([2.0]))[-1] for _ in range(50)]
+    assert all(info["feasible"] for info in infos)
+    assert env.safety_filter.text == "backup"
 
 
 def test_the_executed_action_is_the_filters_in_the_models_units():
