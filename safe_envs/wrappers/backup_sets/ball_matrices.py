@@ -52,21 +52,36 @@ def interval_of(a: BallMatrix) -> Interval:
 
 @_QUIET
 def plus(a: BallMatrix, b: BallMatrix) -> BallMatrix:
-    """Return a + b."""
+    """Return a + b.
+
+    Args:
+        a: shapes (..., n, m).
+        b: likewise.
+    """
     center = a.center + b.center
     return BallMatrix(center, (a.radius + b.radius) * _MORE + _ULP * np.abs(center) + _TINY)
 
 
 @_QUIET
 def scaled(factor: float, a: BallMatrix) -> BallMatrix:
-    """Return the product of a float and a."""
+    """Return the product of a float and a ball matrix.
+
+    Args:
+        factor: the float.
+        a: the matrices.
+    """
     center = factor * a.center
     return BallMatrix(center, abs(factor) * a.radius * _MORE + _ULP * np.abs(center) + _TINY)
 
 
 @_QUIET
 def times(a: BallMatrix, b: BallMatrix) -> BallMatrix:
-    """Return the matrix product a b; NaN where nothing is known of a factor."""
+    """Return the matrix product a b; NaN where nothing is known of a factor.
+
+    Args:
+        a: shapes (..., n, k).
+        b: shapes (..., k, m).
+    """
     center = a.center @ b.center
     sizes = np.abs(a.center), np.abs(b.center)
     rounding = 4 * a.center.shape[-1] * _ULP * (sizes[0] @ sizes[1])

@@ -47,7 +47,7 @@ from safe_envs.wrappers.backup_sets.ball_matrices import (
     scaled,
     times,
 )
-from safe_envs.wrappers.backup_sets.closed_loop import Block, Disturbance, columns, stacked
+from safe_envs.wrappers.backup_sets.held_law import Block, Disturbance, columns, stacked
 
 _MARGIN = 1e-9
 _MOST_CELLS = 512
@@ -81,7 +81,10 @@ class Ellipsoid:
         return BallMatrix(near, np.full_like(near, share * float(frobenius(exactly(near))) * _UP))
 
     def box(self) -> Interval:
-        """Return the bounding box, shape (n,): |y_i - e_i| <= sqrt(c) |row i of L'^-1|."""
+        """Return the bounding box, shape (n,).
+
+        |y_i - e_i| <= sqrt(c) |L^-1 b_i| with the unit vectors b_i.
+        """
         w = self.inverse()
         rows = np.sqrt(((np.abs(w.center) + w.radius) ** 2).sum(axis=1))
         half = np.sqrt(self.level) * rows * _UP + 1e-15 * np.abs(self.center)
@@ -113,7 +116,12 @@ class Conditions:
         self._slopes: IntervalFunction = interval_function(symbols, slopes)
 
     def least(self, cells: Interval, disturbed: Disturbance) -> np.ndarray:
-        """Return lower bounds on cells, shape (B, count)."""
+        """Return lower bounds on cells, shape (B, count).
+
+        Args:
+            cells: shape (B, n).
+            disturbed: bounds of the blocks before.
+        """
         if not self.count:
             return np.zeros((len(cells.low), 0))
         found = self._values([*columns(cells), *columns(disturbed.held)])

@@ -27,7 +27,7 @@ from safe_envs.dynamics.interval_arithmetic import Interval
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.backup import Backup, BackupLaw, backup_of
-from safe_envs.wrappers.backup_sets.closed_loop import Block, Disturbance, closed_loop
+from safe_envs.wrappers.backup_sets.held_law import Block, Disturbance, held_law
 from safe_envs.wrappers.backup_sets.invariance import Conditions, Ellipsoid, is_kept
 
 _SHARES = (0.2, 0.45, 0.7)
@@ -132,7 +132,7 @@ def _derived(
     timing: tuple[float, int],
 ) -> tuple[BlockSet, ...]:
     name, laws, equilibrium = stated
-    loop = closed_loop(system, BackupLaw(name, laws, None, dict(equilibrium)), *timing)
+    loop = held_law(system, BackupLaw(name, laws, None, dict(equilibrium)), *timing)
     expressions: list[Any] = [*barriers, *loop.switches]
     for entry, (low, high) in zip(loop.law, box, strict=True):
         expressions += [entry - sp.Float(low, 17), sp.Float(high, 17) - entry]

@@ -11,7 +11,7 @@ import sympy as sp
 from safe_envs import ControlAffineSDE
 from safe_envs.dynamics.interval_arithmetic import Interval
 from safe_envs.problem.backup import BackupLaw
-from safe_envs.wrappers.backup_sets.closed_loop import Disturbance, closed_loop
+from safe_envs.wrappers.backup_sets.held_law import Disturbance, held_law
 from safe_envs.wrappers.backup_sets.invariance import Conditions, Ellipsoid, is_kept
 
 x, v, u = sp.symbols("x v u", real=True)
@@ -21,7 +21,7 @@ NOTHING = Disturbance(*[Interval(np.zeros(0), np.zeros(0))] * 2)
 def scalar(rate, law=-x):
     """Return x' = rate(x) + u under a held law, for periods of .1 s."""
     system = ControlAffineSDE((x,), (u,), [rate], [1], [[0]])
-    return closed_loop(system, BackupLaw("law", (law,), equilibrium={x: 0}), 0.1, 1).blocks[0]
+    return held_law(system, BackupLaw("law", (law,), equilibrium={x: 0}), 0.1, 1).blocks[0]
 
 
 def interval(half, center=0.0):
@@ -76,10 +76,10 @@ def test_what_is_to_be_positive_is_so_to_the_edge(excess):
 def test_a_linear_condition_is_judged_on_the_ellipsoid_not_on_its_box():
     system = ControlAffineSDE((x, v), (u,), [-x, -v], [0, 0], [[0], [0]])
     law = BackupLaw("law", (sp.Integer(0),), equilibrium={x: 0, v: 0})
-    block = closed_loop(system, law, 0.1, 1).blocks
+    block = held_law(system, law, 0.1, 1).blocks
     assert len(block) == 2
     coupled = ControlAffineSDE((x, v), (u,), [-x + v / 100, -v + x / 100], [0, 0], [[0], [0]])
-    (block,) = closed_loop(coupled, law, 0.1, 1).blocks
+    (block,) = held_law(coupled, law, 0.1, 1).blocks
     for level, truth in ((0.99, True), (1.01, False)):
         e = Ellipsoid(np.zeros(2), np.eye(2), level)
         assert kept(block, e, [math.sqrt(2) - x - v]) == truth
@@ -94,7 +94,7 @@ def test_what_has_no_value_is_refused():
 def test_a_disturbance_must_not_push_out():
     system = ControlAffineSDE((x, v), (u,), [-x, x - v], [0, 0], [[0], [0]])
     law = BackupLaw("law", (sp.Integer(0),), equilibrium={x: 0, v: 0})
-    block = closed_loop(system, law, 0.1, 1).blocks[1]
+    block = held_law(system, law, 0.1, 1).blocks[1]
     for half, truth in ((0.9, True), (1.06, False)):
         bounds = Interval(np.array([-half]), np.array([half]))
         assert (

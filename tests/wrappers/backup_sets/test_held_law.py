@@ -12,7 +12,7 @@ from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.interval_arithmetic import Interval
 from safe_envs.problem.backup import BackupLaw, backup_of
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.backup_sets.closed_loop import Disturbance, closed_loop
+from safe_envs.wrappers.backup_sets.held_law import Disturbance, held_law
 
 x, v, w, u, k = sp.symbols("x v w u k", real=True)
 NOTHING = Disturbance(*[Interval(np.zeros(0), np.zeros(0))] * 2)
@@ -35,7 +35,7 @@ HANG = BackupLaw("hang", (-k * v,), equilibrium={w: 0, x: 0, v: 0})
 
 
 def test_coordinates_fall_into_blocks_in_the_order_of_their_dependence():
-    blocks = closed_loop(swing(), HANG, 0.1, 1).blocks
+    blocks = held_law(swing(), HANG, 0.1, 1).blocks
     assert [block.symbols for block in blocks] == [(x, v), (w,)]
     assert blocks[1].outer == (x, v)
     assert blocks[0].nonlinear.tolist() == [True, False]
@@ -44,7 +44,7 @@ def test_coordinates_fall_into_blocks_in_the_order_of_their_dependence():
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_a_period_encloses_the_integrators_step_and_its_slopes(substeps):
     system = swing()
-    block = closed_loop(system, HANG, 0.3 / substeps, substeps).blocks[0]
+    block = held_law(system, HANG, 0.3 / substeps, substeps).blocks[0]
     step = Integrator(system, 0.3, substeps, "arrays")
 
     def executed(y):
@@ -69,7 +69,7 @@ def test_a_period_encloses_the_integrators_step_and_its_slopes(substeps):
 
 
 def test_a_point_is_enclosed_tightly():
-    block = closed_loop(swing(), HANG, 0.1, 1).blocks[0]
+    block = held_law(swing(), HANG, 0.1, 1).blocks[0]
     y = np.array([[0.3, -0.4]])
     found = block.period(Interval(y, y), NOTHING)
     assert (found.after.high - found.after.low < 1e-12).all()
@@ -77,7 +77,7 @@ def test_a_point_is_enclosed_tightly():
 
 
 def test_a_disturbance_widens_what_depends_on_it():
-    block = closed_loop(swing(), HANG, 0.1, 1).blocks[1]
+    block = held_law(swing(), HANG, 0.1, 1).blocks[1]
     point = Interval(np.zeros((1, 1)), np.zeros((1, 1)))
     for half in (0.0, 0.5):
         bounds = Interval(np.full(2, -half), np.full(2, half))
@@ -89,7 +89,7 @@ def test_a_disturbance_widens_what_depends_on_it():
 
 def test_the_laws_branch_at_the_equilibrium_is_taken_and_its_limits_are_conditions():
     law = BackupLaw("held", (sp.Max(-1, sp.Min(1, -k * v)),), equilibrium={x: 0, v: 0})
-    loop = closed_loop(swing(), law, 0.1, 1)
+    loop = held_law(swing(), law, 0.1, 1)
     assert loop.law == (-2 * v,)
     assert {sp.expand(e) for e in loop.switches} == {1 - 2 * v, 1 + 2 * v}
 
@@ -97,7 +97,7 @@ def test_the_laws_branch_at_the_equilibrium_is_taken_and_its_limits_are_conditio
 def test_the_rotors_of_a_quadrotor_cancel_exactly():
     problem = make_problem("safe_envs/QuadrotorLimits-v0")
     (law,) = backup_of(problem).laws
-    blocks = closed_loop(problem.plant, law, problem.dt, 1).blocks
+    blocks = held_law(problem.plant, law, problem.dt, 1).blocks
     assert [{s.name for s in block.symbols} for block in blocks] == [
         {"psidot"},
         {"phi", "theta", "phidot", "thetadot"},
@@ -108,7 +108,7 @@ def test_the_rotors_of_a_quadrotor_cancel_exactly():
 def test_near_the_equilibrium_the_law_is_the_stated_one():
     problem = make_problem("safe_envs/QuadrotorLimits-v0")
     (law,) = backup_of(problem).laws
-    loop = closed_loop(problem.plant, law, problem.dt, 1)
+    loop = held_law(problem.plant, law, problem.dt, 1)
     symbols = problem.plant.states
     wanted = [problem.plant.numeric(e) for e in law.law]
     values = compile_function(symbols, [*wanted, *loop.law, *loop.switches], "arrays")
@@ -129,4 +129,4 @@ def test_near_the_equilibrium_the_law_is_the_stated_one():
 )
 def test_coordinates_that_do_not_close_are_told(law, complaint):
     with pytest.raises(SystemDefinitionError, match=complaint):
-        closed_loop(swing(), law, 0.1, 1)
+        held_law(swing(), law, 0.1, 1)

@@ -38,7 +38,7 @@ from safe_envs.wrappers.backup_sets.ball_matrices import (
 
 
 @dataclass(frozen=True)
-class Period:
+class HeldPeriod:
     """What a control period does to boxes of a block's coordinates.
 
     Attributes:
@@ -107,12 +107,15 @@ class Block:
         used = set().union(*(e.free_symbols for e in self._derivatives))
         return np.array([bool({s, h} & used) for s, h in zip(self.symbols, self.held, strict=True)])
 
-    def period(self, y: Interval, disturbed: Disturbance) -> Period:
+    def period(self, y: Interval, disturbed: Disturbance) -> HeldPeriod:
         """Enclose what a control period does.
 
         Args:
             y: boxes of the state at the beginning, shape (B, n).
             disturbed: by the blocks before.
+
+        Returns:
+            Enclosures of the states after it and within it, and of the Jacobians.
         """
         n = len(self.symbols)
         now, h = enclosing(y), self.step
@@ -131,7 +134,7 @@ class Block:
                 now, slope = plus(now, scaled(weight, k)), plus(slope, scaled(weight, dk))
         lowest = np.min([each.low.min(axis=0) for each in seen], axis=0)
         highest = np.max([each.high.max(axis=0) for each in seen], axis=0)
-        return Period(interval_of(now), Interval(lowest, highest), slope)
+        return HeldPeriod(interval_of(now), Interval(lowest, highest), slope)
 
     def _stage(
         self, y: Interval, held: Interval, disturbed: Disturbance, slope: BallMatrix
@@ -148,7 +151,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class ClosedLoop:
+class HeldLaw:
     """Coordinates under a held law, without bounds of the input.
 
     Attributes:
@@ -163,7 +166,7 @@ class ClosedLoop:
     switches: tuple[sp.Expr, ...]
 
 
-def closed_loop(system: ControlAffineSDE, law: BackupLaw, step: float, substeps: int) -> ClosedLoop:
+def held_law(system: ControlAffineSDE, law: BackupLaw, step: float, substeps: int) -> HeldLaw:
     """Derive the map of the coordinates of a law's terminal set.
 
     Args:
@@ -171,6 +174,9 @@ def closed_loop(system: ControlAffineSDE, law: BackupLaw, step: float, substeps:
         law: with an equilibrium.
         step: of the integration, in s.
         substeps: how many of them make a control period.
+
+    Returns:
+        The map, block by block, and what has to hold for it to be that of the law.
 
     Raises:
         SystemDefinitionError: the coordinates do not close under the law.
@@ -207,7 +213,7 @@ def closed_loop(system: ControlAffineSDE, law: BackupLaw, step: float, substeps:
             )
         )
         before = (*before, *own)
-    return ClosedLoop(
+    return HeldLaw(
         tuple(blocks),
         tuple(system.numeric(e) for e in near),
         tuple(system.numeric(e) for e in switches),
