@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.frontier_results import Frontier
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for
+from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.hyperparameters import ALGORITHMS
-from safe_envs.agents.training.study import DEFAULT, Study, Variant
+from safe_envs.agents.training.seed_statistics import SeedEstimate, over_seeds
+from safe_envs.agents.training.study import DEFAULT, Study, StudyResult, Variant
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
+from safe_envs.systems import ENV_IDS
+from safe_envs.wrappers.value.frontier import price_violations
+from safe_envs.wrappers.value.priced_values import FrontierSettings
 
 LIMIT = 0.01
 """Chance of a violation that the constrained agent and the promise filter are asked to keep."""
@@ -58,6 +68,146 @@ def board(
         Variant(f"{algo} behind backup", algo, training={"filter": _BACKUP}, filter=_BACKUP),
     ]
     return Study(env_ids, variants, seeds, seed, episodes, training=_QUICK if quick else _ALL)
+
+
+@dataclass(frozen=True)
+class LeaderboardEntry:
+    """What the agents of a variant on an env are like.
+
+    Attributes:
+        env_id: full id.
+        variant: its name.
+        filter: text of the filter of the evaluations, or "none".
+        safety: share of safe episodes, over seeds.
+        safe: number of safe episodes of all agents together.
+        episodes: number of their episodes.
+        episodes_low: lower end of the 95 % interval of the rate of these agents over episodes.
+        episodes_high: upper end.
+        returns: mean return of an episode, over seeds.
+        violations: unsafe steps in the training, over seeds; None without a training.
+        minutes: processor time of a training, their mean; None without one.
+    """
+
+    env_id: str
+    variant: str
+    filter: str
+    safety: SeedEstimate
+    safe: int
+    episodes: int
+    episodes_low: float
+    episodes_high: float
+    returns: SeedEstimate
+    violations: SeedEstimate | None
+    minutes: float | None
+
+
+def require_no_older(out: Path) -> None:
+    """Check that a folder has no results of the leaderboard of one seed.
+
+    Args:
+        out: folder of a leaderboard.
+
+    Raises:
+        ConfigurationError: it has.
+    """
+    for env_id in ENV_IDS:
+        path = out / "results" / f"{env_id.rpartition('/')[2]}.json"
+        if path.exists():
+            raise ConfigurationError(
+                f"{out} holds a leaderboard of an earlier version, of one seed ({path.name}), which"
+                " this one neither reads nor overwrites; give another --out"
+            )
+
+
+def entry_of(found: StudyResult, env_id: str, variant: str) -> LeaderboardEntry | None:
+    """Return the statistics of a variant on an env; None where it has no agent there.
+
+    Args:
+        found: of the study.
+        env_id: full id.
+        variant: its name.
+    """
+    rows = found.of(env_id, variant)
+    if not rows:
+        return None
+    safe, episodes = sum(row.safe for row in rows), sum(row.episodes for row in rows)
+    violations = [float(row.violations) for row in rows if row.violations is not None]
+    seconds = [row.seconds for row in rows if row.seconds is not None]
+    low, high = rate_interval(safe, episodes)
+    return LeaderboardEntry(
+        env_id=env_id,
+        variant=variant,
+        filter=rows[0].filter,
+        safety=over_seeds([[row.safety_rate for row in rows]]),
+        safe=safe,
+        episodes=episodes,
+        episodes_low=low,
+        episodes_high=high,
+        returns=over_seeds([[row.return_mean for row in rows]]),
+        violations=over_seeds([violations]) if violations else None,
+        minutes=sum(seconds) / len(seconds) / 60.0 if seconds else None,
+    )
+
+
+def safety_over_envs(found: StudyResult) -> dict[str, SeedEstimate]:
+    """Return the safety over all envs and seeds, of the variants that every env has.
+
+    Args:
+        found: of the study.
+    """
+    safety = {}
+    for variant in found.study.variants:
+        strata = [
+            [row.safety_rate for row in found.of(env_id, variant.name)]
+            for env_id in found.study.env_ids
+        ]
+        if all(strata):
+            safety[variant.name] = over_seeds(strata)
+    return safety
+
+
+def frontiers_of(
+    env_ids: Sequence[str], out: Path, compute: bool, progress: Callable[[float], None]
+) -> dict[str, Mapping[str, list[float]]]:
+    """Return the largest returns at each chance of a violation, of the envs that have such a curve.
+
+    Args:
+        env_ids: full ids.
+        out: folder of the leaderboard, which keeps them.
+        compute: compute what is missing.
+        progress: receives the part of the work that is done, from 0 to 1.
+
+    Returns:
+        By id "violations" and "returns", as `Frontier.curve` tells them.
+
+    Raises:
+        ConfigurationError: the folder has a file that is damaged.
+    """
+    store, found = ResultStore(out / "frontiers"), {}
+    settings = FrontierSettings(policies=0, leaving="safe")
+    for k, env_id in enumerate(env_ids):
+        key = env_id.rpartition("/")[2]
+        configuration = {
+            "env_id": env_id,
+            "settings": asdict(settings),
+            "versions": package_versions(),
+        }
+        document = store.read(key, configuration)
+        if document is None and compute:
+            problem = make_problem(env_id)
+            try:
+                values = price_violations(
+                    problem, settings, lambda part, k=k: progress((k + part) / len(env_ids))
+                )
+            except ConfigurationError:
+                continue  # No grid serves it: `attainable_of` tells why.
+            chances, returns = Frontier(problem, values, [], [], {}, 0.95).curve()
+            document = {"violations": chances.tolist(), "returns": returns.tolist()}
+            store.keep(key, configuration, document)
+        if document is not None:
+            with reading(store.path(key)):
+                found[env_id] = {name: document[name] for name in ("violations", "returns")}
+    return found
 
 
 def attainable_of(
