@@ -97,8 +97,8 @@ def _draw_entry(axes: Axes, entry: LeaderboardEntry, color: str, marker: str) ->
         color=color,
         marker=marker,
         markersize=9,
-        markeredgecolor="#FFFFFF",
-        markeredgewidth=0.8,
+        markerfacecolor="none",  # what lies below is seen
+        markeredgewidth=1.6,
         elinewidth=1.2,
         linestyle="none",
         label=entry.variant,

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from safe_envs.agents.training.study import StudyResult
 
 _NONE = "-"
+_UNIT = " %"
 _DIGITS = 4
 
 
@@ -92,18 +93,19 @@ def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]
     seeds = report.found.study.seeds
     for env_id in report.found.study.env_ids:
         titles = (
-            f"\nsafe: IQM of\n{seeds} seeds, 95 %",
-            "\nof their\nepisodes, 95 %",
-            f"\nreturn: IQM of\n{seeds} seeds, 95 %",
+            f"safe in %:\nIQM over {seeds}\nseeds [95 %]",
+            "\nin % of their\nepisodes [95 %]",
+            f"return:\nIQM over {seeds}\nseeds [95 %]",
             "unsafe\nsteps in\ntraining",
             "\n\nmin",
         )
         table = make_table("lr", "variant", *titles)
         for entry in report.of(env_id):
-            table.add_row(entry.variant, *_cells(entry))
+            table.add_row(entry.variant, *_cells(entry, unit=""))
         best = report.best_of(env_id)
         if best is not None:
-            table.add_row("best", best_text(best), *[_NONE] * (len(titles) - 1))
+            safest = best_text(best).replace(_UNIT, "")
+            table.add_row("best", safest, *[_NONE] * (len(titles) - 1))
         yield f"{short_name(env_id)}, filter {_filter(report, env_id)}", table
     if len(report.found.study.env_ids) > 1 and report.over_envs:
         table = make_table("lr", "variant", "safe: IQM, 95 %")
@@ -120,7 +122,7 @@ def leaderboard_notes(report: LeaderboardReport) -> list[str]:
     """
     notes = [
         "IQM is the interquartile mean; its interval is of the bootstrap over seeds, that of the"
-        " episodes is of these agents alone; min is the processor time of one training, in minutes.",
+        " episodes is of these agents alone; min is the processor time of a training in minutes.",
     ]
     for found in report.best.values():
         if not isinstance(found, str):
@@ -170,11 +172,12 @@ def _filter(report: LeaderboardReport, env_id: str) -> str:
     return make_problem(env_id, **report.found.study.options).filter
 
 
-def _cells(entry: LeaderboardEntry) -> list[str]:
+def _cells(entry: LeaderboardEntry, unit: str = _UNIT) -> list[str]:
     pooled = percent_in(entry.safe / entry.episodes, entry.episodes_low, entry.episodes_high)
     unsafe = _NONE if entry.violations is None else f"{entry.violations.value:,.0f}"
-    minutes = _NONE if entry.minutes is None else f"{entry.minutes:.2g}"
-    return [_percent(entry.safety), pooled, _number(entry.returns), unsafe, minutes]
+    minutes = _NONE if entry.minutes is None else f"{entry.minutes:.2f}"
+    rates = [rate.replace(_UNIT, unit) for rate in (_percent(entry.safety), pooled)]
+    return [*rates, _number(entry.returns), unsafe, minutes]
 
 
 def _percent(estimate: SeedEstimate) -> str:
