@@ -43,7 +43,9 @@ def leaderboard(
     algo: Annotated[
         str,
         typer.Option(
-            metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3."
+            metavar="NAME",
+            autocompletion=completion.algorithms,
+            help="ppo, a2c, sac, td3, ppo-lag or sac-lag.",
         ),
     ] = "ppo",
     out: Annotated[
