@@ -184,10 +184,9 @@ def _plans(
     for env_id in study.env_ids:
         default = make_problem(env_id, **study.options).filter
         for variant in study.variants:
+            seeds = range(study.seeds)
+            of_seeds = [_planned(study, env_id, variant, k, default) for k in seeds]
             try:
-                of_seeds = [
-                    _planned(study, env_id, variant, k, default) for k in range(study.seeds)
-                ]
                 for name in {of_seeds[0].filter, of_seeds[0].in_loop}:
                     _require_suitable(study, env_id, name)
             except SafeEnvsError as error:
