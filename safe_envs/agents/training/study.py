@@ -151,10 +151,11 @@ def run_study(
     Raises:
         ConfigurationError: the folder cannot be written, or has files that are damaged.
     """
+    missing: dict[tuple[str, str, int | None], str] = {}
+    # Before a folder is made: the arguments may be refused.
+    planned = list(_plans(study, out, missing))
     store = ResultStore(out / _RESULTS)
     store.remove_unfinished()
-    missing: dict[tuple[str, str, int | None], str] = {}
-    planned = list(_plans(study, out, missing))
     kept = {each.key: row for each in planned if (row := _kept(store, each)) is not None}
     jobs = _jobs([each for each in planned if each.key not in kept])
     work = {key: job.work for key, job in jobs.items()}
