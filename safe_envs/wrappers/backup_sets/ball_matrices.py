@@ -31,10 +31,11 @@ class BallMatrix(NamedTuple):
 
 
 def enclosing(a: Interval) -> BallMatrix:
-    """Return the ball matrix that holds an interval of matrices."""
-    center = 0.5 * a.low + 0.5 * a.high
-    radius = np.maximum(a.high - center, center - a.low) * _MORE + _ULP * np.abs(center) + _TINY
-    return BallMatrix(center, radius)
+    """Return the ball matrix that holds an interval of matrices; NaN where nothing is known."""
+    with np.errstate(invalid="ignore"):
+        center = 0.5 * a.low + 0.5 * a.high
+        radius = np.maximum(a.high - center, center - a.low) * _MORE
+        return BallMatrix(center, radius + _ULP * np.abs(center) + _TINY)
 
 
 def interval_of(a: BallMatrix) -> Interval:

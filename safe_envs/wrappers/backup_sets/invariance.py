@@ -1,35 +1,42 @@
 """The proof that a level set of a quadratic form is kept by a held law, safely and unclipped.
 
-Let E = {y : |L'(y - e)|^2 <= c} with L invertible, F the map of a control period under the law k, and
-q_1, q_2, ... functions that are to be >= 0: barriers, and the distances of k from the input bounds.
+Let E = {y : |L'(y - e)|^2 <= c} with L invertible, F_d the map of a control period under the law k
+while the blocks before move as d, for d in their bounds, and q_1, q_2, ... functions of y and d that
+are to be >= 0: barriers, and the distances of k from the input bounds.
 
-**Theorem.** Let M(y) = L' J(y) L'^-1 with the Jacobian J of F, |M(y)| <= rho for all y in E, and |L'
-(F(e) - e)| <= d. If rho sqrt(c) + d <= sqrt(c), then F maps E into E. If q_i(e) >= sqrt(c) |L^-1 grad
-q_i(y)| for all y in E, then q_i >= 0 on E.
+**Theorem.** Let |L' J L'^-1| <= rho for the Jacobians J of F_d on E, and |L'(F_d(e) - e)| <= s. If
+rho sqrt(c) + s <= sqrt(c), then F_d maps E into E. If q_i(e, d) >= sqrt(c) |L^-1 b| for the
+gradients b of q_i by y on E, then q_i >= 0 on E.
 
-*Proof.* E is convex. For y in E the segment from e to y is in E, so that F(y) - F(e) = A (y - e)
-with the average A of J over it (the integral form of the mean value theorem). |L' A L'^-1| <= rho,
-since a norm of an average is at most the largest norm. Hence |L'(F(y) - e)| <= rho |L'(y - e)| + d <=
-sqrt(c). Likewise q_i(y) = q_i(e) + b'(y - e) with the average b of the gradient, and |b'(y - e)| =
-|(L^-1 b)' L'(y - e)| <= |L^-1 b| sqrt(c). As k is within the input bounds on E, clipping changes
-nothing there, and F is the map that is executed. QED
+*Proof.* E is convex. For y in E the segment from e to y is in E, so that F_d(y) - F_d(e) = A (y - e)
+with the average A of the Jacobian over it (the integral form of the mean value theorem). |L' A
+L'^-1| <= rho, since the norm of an average is at most the largest norm. Hence |L'(F_d(y) - e)| <=
+rho |L'(y - e)| + s <= sqrt(c). Likewise q_i(y, d) = q_i(e, d) + b'(y - e) with the average b of the
+gradient, and |b'(y - e)| = |(L^-1 b)' L'(y - e)| <= |L^-1 b| sqrt(c). QED
+
+Block by block, the product of such sets is kept: the blocks before stay in theirs whatever this one
+does, so that d is within its bounds for good. As k is within the input bounds there, clipping
+changes nothing, and F is what is executed.
 
 All is evaluated on cells that cover the bounding box of E, in arithmetic that is rounded outwards;
 cells outside of E are left out. The gradients are taken on the whole box; where that does not show
-q_i >= 0, the values of q_i on each cell may.
-
-Rounding in the simulation itself is not part of the theorem; rho is asked to be smaller by a
-billionth than needed, which is a million times what rounding moves a state.
+q_i >= 0, the values of q_i on each cell may. Rounding in the simulation itself is not part of the
+theorem; rho is asked to be smaller by a billionth than needed, a million times what rounding moves
+a state.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from safe_envs.dynamics.interval_arithmetic import Interval
-from safe_envs.dynamics.intervals import IntervalFunction
+from safe_envs.dynamics.intervals import IntervalFunction, interval_function
+from safe_envs.dynamics.lie import has_kinks
 from safe_envs.wrappers.backup_sets.ball_matrices import (
     BallMatrix,
     enclosing,
@@ -40,10 +47,12 @@ from safe_envs.wrappers.backup_sets.ball_matrices import (
     scaled,
     times,
 )
-from safe_envs.wrappers.backup_sets.closed_loop import ClosedLoop, box_values
+from safe_envs.wrappers.backup_sets.closed_loop import Block, Disturbance, columns, stacked
 
 _MARGIN = 1e-9
-_MOST_CELLS = 4000
+_MOST_CELLS = 512
+_UP = 1.0 + 1e-12
+_NO_SLOPE = sp.Float(1e100)
 
 
 @dataclass(frozen=True)
@@ -66,106 +75,126 @@ class Ellipsoid:
         With W near it and E = I - L' W, L'^-1 - W = W E (I - E)^-1.
         """
         near = np.linalg.inv(self.root.T)
-        defect = plus(
-            exactly(np.eye(len(near))),
-            scaled(-1.0, times(exactly(self.root.T), exactly(near))),
-        )
-        size = float(frobenius(defect))
+        product = times(exactly(self.root.T), exactly(near))
+        size = float(frobenius(plus(exactly(np.eye(len(near))), scaled(-1.0, product))))
         share = size / (1.0 - size) if size < 0.5 else np.inf
-        error = share * float(frobenius(exactly(near)))
-        return BallMatrix(near, np.full_like(near, error * (1.0 + 1e-12)))
+        return BallMatrix(near, np.full_like(near, share * float(frobenius(exactly(near))) * _UP))
 
-    def half_widths(self) -> np.ndarray:
-        """Return upper bounds of |y_i - e_i| on the set: sqrt(c) times the norms of rows."""
+    def box(self) -> Interval:
+        """Return the bounding box, shape (n,): |y_i - e_i| <= sqrt(c) |row i of L'^-1|."""
         w = self.inverse()
         rows = np.sqrt(((np.abs(w.center) + w.radius) ** 2).sum(axis=1))
-        return np.sqrt(self.level) * rows * (1.0 + 1e-12)
+        half = np.sqrt(self.level) * rows * _UP + 1e-15 * np.abs(self.center)
+        return Interval(self.center - half, self.center + half)
 
 
-@dataclass(frozen=True)
 class Conditions:
-    """Functions of the coordinates that are to be >= 0.
+    """Functions of a block's coordinates and of those of the blocks before, which are to be >= 0.
 
     Attributes:
-        values: the q_i.
-        slopes: their gradients, one after the other; NaN for a function with kinks.
         count: how many.
     """
 
-    values: IntervalFunction
-    slopes: IntervalFunction
-    count: int
+    def __init__(self, block: Block, expressions: Sequence[Any]) -> None:
+        """Compile the functions.
 
-    def unsettled(self, e: Ellipsoid, inverse: BallMatrix, box: Interval) -> np.ndarray:
+        Args:
+            block: the block.
+            expressions: of its coordinates and those before.
+        """
+        symbols = (*block.symbols, *block.outer)
+        self.count, self._n = len(expressions), len(block.symbols)
+        slopes = [
+            _NO_SLOPE if _has_kinks_in(e, block.symbols) else e.diff(s)
+            for e in expressions
+            for s in block.symbols
+        ]
+        self._values: IntervalFunction = interval_function(symbols, expressions)
+        self._slopes: IntervalFunction = interval_function(symbols, slopes)
+
+    def least(self, cells: Interval, disturbed: Disturbance) -> np.ndarray:
+        """Return lower bounds on cells, shape (B, count)."""
+        if not self.count:
+            return np.zeros((len(cells.low), 0))
+        found = self._values([*columns(cells), *columns(disturbed.held)])
+        return stacked(found, len(cells.low)).low
+
+    def unsettled(self, e: Ellipsoid, box: Interval, disturbed: Disturbance) -> np.ndarray:
         """Return which of the functions their gradients do not show to be >= 0 on a set.
 
         Args:
             e: the set.
-            inverse: L'^-1.
             box: that holds it, shape (1, n).
+            disturbed: the bounds of the blocks before.
         """
-        point = Interval(e.center[None, :], e.center[None, :])
-        least = box_values(self.values, point, self.count).low[0]
-        n = len(e.center)
-        found = box_values(self.slopes, box, self.count * n)
-        slopes = enclosing(Interval(*(end.reshape(self.count, n) for end in found)))
+        if not self.count:
+            return np.zeros(0, dtype=bool)
+        least = self.least(Interval(e.center[None, :], e.center[None, :]), disturbed)[0]
+        found = stacked(self._slopes([*columns(box), *columns(disturbed.held)]), 1)
+        slopes = enclosing(Interval(*(end.reshape(self.count, self._n) for end in found)))
         # L^-1 b is the transpose of b' L'^-1.
-        moved = times(slopes, inverse)
+        moved = times(slopes, e.inverse())
         reach = np.sqrt(((np.abs(moved.center) + moved.radius) ** 2).sum(axis=1))
         with np.errstate(invalid="ignore"):
-            return ~(least >= np.sqrt(e.level) * reach * (1.0 + 1e-12))
+            return ~(least >= np.sqrt(e.level) * reach * _UP)
 
 
-def is_kept(loop: ClosedLoop, conditions: Conditions, e: Ellipsoid) -> bool:
+def is_kept(block: Block, conditions: Conditions, e: Ellipsoid, disturbed: Disturbance) -> bool:
     """Return whether the law is proved to keep an ellipsoid, safely and within the input bounds.
 
     Args:
-        loop: the law's map.
+        block: the law's map.
         conditions: what is to be >= 0 in the set.
         e: the set.
+        disturbed: bounds of the blocks before.
     """
-    half = e.half_widths()
-    if not np.isfinite(half).all():
+    low, high = e.box()
+    if not (np.isfinite(low) & np.isfinite(high)).all():
         return False
-    inverse = e.inverse()
-    cells = Interval((e.center - half)[None, :], (e.center + half)[None, :])
-    unsettled = conditions.unsettled(e, inverse, cells)
-    most = 1.0 - _MARGIN - _displacement(loop, e) / (np.sqrt(e.level) * (1.0 - 1e-12))
-    nonlinear = loop.nonlinear | unsettled.any()
-    while True:
-        slope = _seen_by(e, inverse, loop.period(cells)[1])
-        values = box_values(conditions.values, cells, conditions.count).low
-        good = (norm_bound(slope) <= most) & ((values >= 0.0) | ~unsettled).all(axis=1)
-        if good.all():
+    inverse, cells = e.inverse(), Interval(low[None, :], high[None, :])
+    unsettled = conditions.unsettled(e, cells, disturbed)
+    moved = _displacement(block, e, disturbed)
+    most = 1.0 - _MARGIN - moved / (np.sqrt(e.level) * (1.0 - 1e-12))
+    cut = block.nonlinear | unsettled.any()
+    while len(cells.low):
+        slope = _seen_by(e, inverse, block.period(cells, disturbed).slope)
+        settled = (conditions.least(cells, disturbed) >= 0.0) | ~unsettled
+        bad = ~((norm_bound(slope) <= most) & settled.all(axis=1))
+        if not bad.any():
             return True
-        if not nonlinear.any() or 2 * (~good).sum() > _MOST_CELLS:
+        if not cut.any() or 2 * bad.sum() > _MOST_CELLS:
             return False
-        cells = _meeting(e, _bisected(cells, ~good, half, nonlinear))
-        if not len(cells.low):
-            return True
-        if _fails_somewhere(loop, conditions, e, inverse, cells, most):
+        cells = _meeting(e, _bisected(Interval(cells.low[bad], cells.high[bad]), high - low, cut))
+        if _fails_somewhere(block, e, inverse, cells, disturbed, most):
             return False
+    return True
 
 
-def _displacement(loop: ClosedLoop, e: Ellipsoid) -> float:
-    """Return an upper bound of |L'(F(e) - e)|."""
+def _has_kinks_in(e: Any, symbols: Sequence[sp.Symbol]) -> bool:
+    """Return whether a function has kinks in some of its symbols."""
+    return any(
+        part.free_symbols & set(symbols) and has_kinks(part.func(*[sp.Dummy()] * len(part.args)))
+        for part in e.atoms(sp.Function, sp.Max, sp.Min)
+    )
+
+
+def _displacement(block: Block, e: Ellipsoid, disturbed: Disturbance) -> float:
+    """Return an upper bound of |L'(F_d(e) - e)|."""
     point = Interval(e.center[None, :], e.center[None, :])
-    after = enclosing(loop.period(point)[0])
+    after = enclosing(block.period(point, disturbed).after)
     moved = plus(after, exactly(-e.center[None, :]))
     return float(frobenius(times(moved, exactly(e.root))))
 
 
 def _seen_by(e: Ellipsoid, inverse: BallMatrix, slope: BallMatrix) -> BallMatrix:
-    """Return M = L' J L'^-1."""
+    """Return L' J L'^-1."""
     return times(times(exactly(e.root.T), slope), inverse)
 
 
-def _bisected(
-    cells: Interval, which: np.ndarray, half: np.ndarray, nonlinear: np.ndarray
-) -> Interval:
-    """Return some of the cells, each cut into two across its widest coordinate."""
-    low, high = cells.low[which], cells.high[which]
-    widths = np.where(nonlinear, (high - low) / half, -1.0)
+def _bisected(cells: Interval, width: np.ndarray, cut: np.ndarray) -> Interval:
+    """Return the cells, each cut into two across its widest coordinate."""
+    low, high = cells
+    widths = np.where(cut, (high - low) / width, -1.0)
     rows, across = np.arange(len(low)), widths.argmax(axis=1)
     middle = 0.5 * low[rows, across] + 0.5 * high[rows, across]
     lower, upper = high.copy(), low.copy()
@@ -187,19 +216,17 @@ def _meeting(e: Ellipsoid, cells: Interval) -> Interval:
 
 
 def _fails_somewhere(
-    loop: ClosedLoop,
-    conditions: Conditions,
+    block: Block,
     e: Ellipsoid,
     inverse: BallMatrix,
     cells: Interval,
+    disturbed: Disturbance,
     most: float,
 ) -> bool:
-    """Return whether the claim is false at the middle of a cell in E, so that cutting is vain."""
+    """Return whether the map does not contract at the middle of a cell: cutting is vain then."""
     middle = 0.5 * cells.low + 0.5 * cells.high
     middle = middle[np.linalg.norm((middle - e.center) @ e.root, axis=1) <= np.sqrt(e.level)]
     if not len(middle):
         return False
-    points = Interval(middle, middle)
-    norms = norm_bound(_seen_by(e, inverse, loop.period(points)[1]))
-    values = box_values(conditions.values, points, conditions.count).low
-    return bool((norms > most).any() or (values < 0.0).any())
+    slope = block.period(Interval(middle, middle), disturbed).slope
+    return bool((norm_bound(_seen_by(e, inverse, slope)) > most).any())

@@ -1,17 +1,20 @@
 """Terminal sets of backup laws, derived from an equilibrium and proved.
 
-The shape of the set comes from a Lyapunov equation, its size from the proof: the largest level that
-`safe_envs.wrappers.backup_sets.invariance` proves, found by bisection.
+The shape of a set comes from a Lyapunov equation, its size from the proof: the largest level that
+`safe_envs.wrappers.backup_sets.invariance` proves, within the extent that the law gives.
 
-**Shape.** With the Jacobian A of a control period at the equilibrium and the extents w that a law
-gives, P = LL' = sum_k (A/r)'^k Q (A/r)^k, Q = diag(1/w^2). Then (A/r)' P (A/r) = P - Q <= P: A contracts
-by r < 1 in the norm of P. Several r between the spectral radius of A and 1 are tried, and the set of
-the largest volume is taken.
+**Shape.** With the Jacobian A of a block's control period at the equilibrium, and the extents w,
+P = LL' = sum_k (A/r)'^k Q (A/r)^k with Q = diag(1/w^2). As (A/r)' P (A/r) = P - Q <= P, A contracts by
+r < 1 in the norm of P. Several r between the spectral radius of A and 1 are tried. Where A has a
+basis of eigenvectors, P = sum_i |a_i|^2/s_i^2 is tried too, with a_i the parts of y along them and s_i
+how far each reaches within the extents: slow directions are not cut short there. The set of the
+largest volume is taken.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -21,18 +24,20 @@ import sympy as sp
 from scipy.linalg import solve_discrete_lyapunov
 
 from safe_envs.dynamics.interval_arithmetic import Interval
-from safe_envs.dynamics.intervals import interval_function
-from safe_envs.dynamics.lie import has_kinks
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.backup import Backup, BackupLaw, backup_of
-from safe_envs.wrappers.backup_sets.closed_loop import ClosedLoop, closed_loop
+from safe_envs.wrappers.backup_sets.closed_loop import Block, Disturbance, closed_loop
 from safe_envs.wrappers.backup_sets.invariance import Conditions, Ellipsoid, is_kept
 
-_SHARES = (0.15, 0.35, 0.55, 0.75, 0.9)
-_HALVINGS = 12
-_FARTHEST = 40
-_NO_SLOPE = sp.Float(1e100)
+_SHARES = (0.2, 0.45, 0.7)
+_SHRINKING = (1.0, 0.5, 0.25, 0.125)
+_LEAST = 1e-4
+_CLOSE = 1.1
+_WORST_CONDITION = 1e4
+
+BlockSet = tuple[tuple[sp.Symbol, ...], Ellipsoid]
+"""Coordinates of a block, and the set that they stay in."""
 
 
 def with_terminal_sets(problem: Any, system: ControlAffineSDE) -> Backup | None:
@@ -54,39 +59,29 @@ def with_terminal_sets(problem: Any, system: ControlAffineSDE) -> Backup | None:
     if stated is None:
         return None
     laws = tuple(
-        replace(
-            law,
-            law=tuple(system.numeric(e) for e in law.law),
-            terminal=system.numeric(law.terminal)
+        BackupLaw(
+            law.name,
+            tuple(system.numeric(e) for e in law.law),
+            system.numeric(law.terminal)
             if law.terminal is not None
-            else terminal_expression(law, derived_set(problem, system, law)),
-            equilibrium={},
-            extent={},
+            else terminal_expression(derived_sets(problem, system, law)),
         )
         for law in stated.laws
     )
-    return Backup(laws, stated.horizon)
+    return replace(stated, laws=laws)
 
 
-def terminal_expression(law: BackupLaw, found: Ellipsoid) -> sp.Expr:
-    """Return c - |L'(y - e)|^2 as an expression of the states.
+def terminal_expression(sets: Sequence[BlockSet]) -> Any:
+    """Return an expression that is >= 0 in the product of sets, the least 1 - |L'(y - e)|^2/c.
 
     Args:
-        law: whose equilibrium names the coordinates.
-        found: the set.
+        sets: of blocks of states.
     """
-    away = [
-        s - sp.Float(e, 17) for s, e in zip(law.equilibrium, found.center.tolist(), strict=True)
-    ]
-    rows = [
-        sum(sp.Float(root, 17) * d for root, d in zip(column, away, strict=True) if root)
-        for column in found.root.T.tolist()
-    ]
-    return sp.Float(found.level, 17) - sum(row**2 for row in rows)
+    return sp.Min(*(_of_block(symbols, e) for symbols, e in sets))
 
 
-def derived_set(problem: Any, system: ControlAffineSDE, law: BackupLaw) -> Ellipsoid:
-    """Return the largest set around a law's equilibrium that is proved to be kept.
+def derived_sets(problem: Any, system: ControlAffineSDE, law: BackupLaw) -> tuple[BlockSet, ...]:
+    """Return sets around a law's equilibrium, whose product is proved to be kept.
 
     Args:
         problem: a `SafetyProblem`.
@@ -99,110 +94,157 @@ def derived_set(problem: Any, system: ControlAffineSDE, law: BackupLaw) -> Ellip
         ConfigurationError: the law does not hold the equilibrium, or nothing could be proved.
     """
     widths = {v.symbol: 0.5 * (v.high - v.low) for v in problem.states}
-    endless = [str(s) for s in law.equilibrium if not math.isfinite(law.extent.get(s, widths[s]))]
+    extent = {s: law.extent.get(s, widths[s]) for s in law.equilibrium}
+    endless = [str(s) for s, width in extent.items() if not math.isfinite(width)]
     if endless:
         raise SystemDefinitionError(
             f"backup law {law.name} needs an extent of {', '.join(endless)}, whose workspace is"
-            " unbounded: say about how far its terminal set is to reach, like extent={x: 0.5}"
+            " unbounded: say how far its terminal set may reach, like extent={x: 0.5}"
         )
     return _derived(
         system,
-        law.name,
-        law.law,
-        tuple(law.equilibrium.items()),
+        (law.name, law.law, tuple(law.equilibrium.items())),
+        tuple(extent.items()),
         tuple(b.expression for b in problem.barriers),
         problem.box,
         (problem.dt / problem.substeps, problem.substeps),
-        tuple(law.extent.get(s, widths[s]) for s in law.equilibrium),
     )
+
+
+def _of_block(symbols: Sequence[sp.Symbol], e: Ellipsoid) -> Any:
+    """Return 1 - |L'(y - e)|^2/c, with the floats as they are."""
+    away = [s - sp.Float(c, 17) for s, c in zip(symbols, e.center.tolist(), strict=True)]
+    scale = sp.Float(1.0 / math.sqrt(e.level), 17)
+    rows = [
+        sum(scale * sp.Float(r, 17) * d for r, d in zip(column, away, strict=True) if r)
+        for column in e.root.T.tolist()
+    ]
+    return 1 - sum(row**2 for row in rows)
 
 
 @lru_cache(maxsize=64)
 def _derived(
     system: ControlAffineSDE,
-    name: str,
-    laws: tuple[sp.Expr, ...],
-    equilibrium: tuple[tuple[sp.Symbol, sp.Expr], ...],
+    stated: tuple[str, tuple[sp.Expr, ...], tuple[tuple[sp.Symbol, sp.Expr], ...]],
+    extents: tuple[tuple[sp.Symbol, float], ...],
     barriers: tuple[sp.Expr, ...],
     box: tuple[tuple[float, float], ...],
     timing: tuple[float, int],
-    extent: tuple[float, ...],
-) -> Ellipsoid:
+) -> tuple[BlockSet, ...]:
+    name, laws, equilibrium = stated
     loop = closed_loop(system, BackupLaw(name, laws, None, dict(equilibrium)), *timing)
-    expressions = [*barriers, *loop.switches]
+    expressions: list[Any] = [*barriers, *loop.switches]
     for entry, (low, high) in zip(loop.law, box, strict=True):
         expressions += [entry - sp.Float(low, 17), sp.Float(high, 17) - entry]
+    known = tuple(s for s, _ in equilibrium)
     for e in expressions:
-        system.require_known(
-            f"what the terminal set of backup law {name} has to keep,", e.free_symbols, loop.symbols
-        )
-    conditions = _conditions(loop, expressions)
-    best: tuple[float, Ellipsoid] | None = None
-    for root in _shapes(loop, extent, name):
-        level = _largest_level(loop, conditions, root)
-        if level is not None:
-            volume = 0.5 * len(root) * math.log(level) - np.linalg.slogdet(root)[1]
-            if best is None or volume > best[0]:
-                best = volume, Ellipsoid(loop.rest, root, level)
-    if best is None:
-        raise ConfigurationError(
-            f"backup law {name} could not be proved to keep any set around its equilibrium"
-            f" {dict(equilibrium)}; look whether it is one, whether it is safe and within the input"
-            " bounds, and whether the law holds it with this control period"
-        )
-    return best[1]
-
-
-def _conditions(loop: ClosedLoop, expressions: list[Any]) -> Conditions:
-    slopes = [_NO_SLOPE if has_kinks(e) else e.diff(s) for e in expressions for s in loop.symbols]
-    return Conditions(
-        interval_function(loop.symbols, expressions),
-        interval_function(loop.symbols, slopes),
-        len(expressions),
+        what = f"what the terminal set of backup law {name} has to keep,"
+        system.require_known(what, e.free_symbols, known)
+    checked = []
+    for block in reversed(loop.blocks):  # A condition belongs to the last block that is in it.
+        own = [e for e in expressions if e.free_symbols & set(block.symbols)]
+        expressions = [e for e in expressions if e not in own]
+        checked.append((block, Conditions(block, own)))
+    for shrinking in _SHRINKING:
+        found = _product(checked[::-1], {s: shrinking * w for s, w in extents}, name)
+        if found is not None:
+            return found
+    raise ConfigurationError(
+        f"backup law {name} could not be proved to keep any set around its equilibrium"
+        f" {dict(equilibrium)}; look whether it is one, whether it is safe and within the input"
+        " bounds, and whether the law holds it with this control period"
     )
 
 
-def _shapes(loop: ClosedLoop, extent: tuple[float, ...], name: str) -> list[np.ndarray]:
-    """Return roots L of the forms that are tried.
+def _product(
+    blocks: Sequence[tuple[Block, Conditions]], extent: dict[sp.Symbol, float], name: str
+) -> tuple[BlockSet, ...] | None:
+    """Return sets of the blocks, each within an extent; None where one could not be proved."""
+    nothing = Interval(np.zeros(0), np.zeros(0))
+    disturbed, sets = Disturbance(nothing, nothing), []
+    for block, conditions in blocks:
+        widths = np.array([extent[s] for s in block.symbols])
+        e = _largest(block, conditions, disturbed, widths, name)
+        if e is None:
+            return None
+        sets.append((block.symbols, e))
+        box = e.box()
+        within = block.period(Interval(box.low[None, :], box.high[None, :]), disturbed).within
+        disturbed = Disturbance(_joined(disturbed.held, box), _joined(disturbed.within, within))
+    return tuple(sets)
+
+
+def _largest(
+    block: Block, conditions: Conditions, disturbed: Disturbance, widths: np.ndarray, name: str
+) -> Ellipsoid | None:
+    """Return the set of the largest volume that is proved; None without any.
 
     Raises:
         ConfigurationError: the law does not stabilise its equilibrium.
     """
-    point = Interval(loop.rest[None, :], loop.rest[None, :])
-    a = loop.period(point)[1].center[0]
+    point = Interval(block.rest[None, :], block.rest[None, :])
+    a = block.period(point, disturbed).slope.center[0]
     radius = float(abs(np.linalg.eigvals(a)).max())
     if not radius < 1.0:
         raise ConfigurationError(
-            f"backup law {name} does not bring the system back to its equilibrium: held for control"
-            f" periods, deviations grow by {radius:.4g} a period; give a law that does, or a"
-            " shorter dt"
+            f"backup law {name} does not bring {', '.join(map(str, block.symbols))} back to the"
+            f" equilibrium: held for control periods, deviations are multiplied by {radius:.4g} in"
+            " each; give a law that brings them back, or a shorter dt"
         )
-    q = np.diag(1.0 / np.array(extent) ** 2)
-    roots = []
+    best: tuple[float, Ellipsoid] | None = None
+    for p in _shapes(a, radius, widths):
+        root = np.linalg.cholesky(p)
+        most = float((widths**2 / np.diag(np.linalg.inv(p))).min())
+        level = _largest_level(block, conditions, disturbed, root, most)
+        if level is not None:
+            volume = 0.5 * len(root) * math.log(level) - float(np.linalg.slogdet(root)[1])
+            if best is None or volume > best[0]:
+                best = volume, Ellipsoid(block.rest, root, level)
+    return None if best is None else best[1]
+
+
+def _shapes(a: np.ndarray, radius: float, widths: np.ndarray) -> list[np.ndarray]:
+    """Return forms P in whose norms a map contracts.
+
+    Args:
+        a: A, shape (n, n).
+        radius: its spectral radius.
+        widths: w, shape (n,).
+    """
+    shapes = []
     for share in _SHARES:
         scale = radius + share * (1.0 - radius)
-        p = solve_discrete_lyapunov((a / scale).T, q)
-        roots.append(np.linalg.cholesky(0.5 * (p + p.T)))
-    return roots
+        shapes.append(solve_discrete_lyapunov((a / scale).T, np.diag(1.0 / widths**2)))
+    right = np.linalg.eig(a)[1]
+    if np.linalg.cond(right / widths[:, None]) < _WORST_CONDITION:
+        sizes = (widths[:, None] / np.maximum(np.abs(right), 1e-300)).min(axis=0)
+        modes = np.linalg.inv(right * sizes)
+        shapes.append((modes.conj().T @ modes).real)
+    return [0.5 * (p + p.T) for p in shapes]
 
 
-def _largest_level(loop: ClosedLoop, conditions: Conditions, root: np.ndarray) -> float | None:
-    """Return the largest level that is proved, to a few percent; None without any."""
+def _largest_level(
+    block: Block, conditions: Conditions, disturbed: Disturbance, root: np.ndarray, most: float
+) -> float | None:
+    """Return the largest level up to a given one that is proved, to a tenth; None without any."""
 
     def proved(level: float) -> bool:
-        return is_kept(loop, conditions, Ellipsoid(loop.rest, root, level))
+        return is_kept(block, conditions, Ellipsoid(block.rest, root, level), disturbed)
 
-    high = 4.0
-    for _ in range(_FARTHEST):
-        low = high / 4.0
-        if proved(low):
-            break
-        high = low
-    else:
-        return None
-    for _ in range(_HALVINGS):
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if proved(middle) else (low, middle)
-        if high < 1.02 * low:
-            break
+    if proved(most):
+        return most
+    low, high = 0.0, most
+    level = 0.25 * most
+    while high > _CLOSE * low:
+        if proved(level):
+            low = level
+        elif level < _LEAST * most:
+            return None
+        else:
+            high = level
+        level = math.sqrt(low * high) if low else 0.25 * high
     return low
+
+
+def _joined(a: Interval, b: Interval) -> Interval:
+    return Interval(np.concatenate([a.low, b.low]), np.concatenate([a.high, b.high]))
