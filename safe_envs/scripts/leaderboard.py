@@ -79,7 +79,8 @@ def leaderboard(
             "--best",
             help=(
                 "Compute the best attainable safety of each env, and the largest return at each"
-                " chance of a violation; without it those are shown that were computed before."
+                " chance of a violation; without it those are shown that were computed before,"
+                " with --quick by this command."
             ),
         ),
     ] = False,
@@ -146,7 +147,7 @@ def leaderboard(
             tell or (lambda _: None),
             lambda text: print(text, file=sys.stderr, flush=True),
         )
-    report = _report(found, out, best)
+    report = _report(found, out, best or (False if quick else None))
     if pictures is not None:
         _draw(report, pictures)
     written = leaderboard_markdown(report, _links(report, pictures, page))
@@ -166,7 +167,7 @@ def leaderboard(
     write_result(json_file, lambda: document | report.document())
 
 
-def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
+def _report(found: Any, out: Path, best: bool | None) -> LeaderboardReport:
     """Return the statistics of a study, with what is known of what could be had."""
     from safe_envs.agents.training.leaderboard import (
         attainable_of,
@@ -181,9 +182,9 @@ def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
         entry_of(found, e, variant.name) for e in study.env_ids for variant in study.variants
     ]
     with progress_bar("Best attainable safety") as tell:
-        known = attainable_of(study.env_ids, best, tell or (lambda _: None))
+        known = attainable_of(study.env_ids, out, best, tell or (lambda _: None))
     with progress_bar("Largest returns") as tell:
-        frontiers = frontiers_of(study.env_ids, out, best, tell or (lambda _: None))
+        frontiers = frontiers_of(study.env_ids, out, bool(best), tell or (lambda _: None))
     return LeaderboardReport(
         found,
         tuple(entry for entry in entries if entry is not None),

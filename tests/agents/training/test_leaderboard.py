@@ -135,4 +135,21 @@ def test_curves_are_computed_where_they_are_asked_for_and_kept(tmp_path, monkeyp
     assert max(done) <= 1.0
     assert found[SCALAR]["violations"] == sorted(found[SCALAR]["violations"])
     assert frontiers_of(ids, tmp_path, False, none) == found
-    assert attainable_of(ids, False, none) == {}
+
+
+@pytest.mark.slow
+def test_the_best_is_computed_where_it_is_asked_for_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path / "cache"))
+    ids = (SCALAR, "safe_envs/QuadrotorLimits-v0")
+    none = lambda _: None  # noqa: E731
+    for compute in (False, None):
+        assert attainable_of(ids, tmp_path, compute, none) == {}
+    found = attainable_of(ids, tmp_path, True, none)
+    best = found[SCALAR]
+    assert not isinstance(best, str)
+    assert best.lower is not None
+    assert "at most 4" in str(found[ids[1]])
+    again = attainable_of(ids[:1], tmp_path, False, none)[SCALAR]
+    assert not isinstance(again, str)
+    assert (again.lower, again.upper) == (best.lower, best.upper)
+    assert again.as_dict()["cells"] == list(best.cells)
