@@ -68,7 +68,7 @@ def board(
     variants += [
         Variant(f"{algo} + filter", algo, filter=DEFAULT),
         Variant(f"{algo} behind filter", algo, training={"filter": DEFAULT}, filter=DEFAULT),
-        Variant(f"{algo} + promise", algo, filter=_PROMISE),
+        Variant(f"{algo} + promise filter", algo, filter=_PROMISE),
         Variant(f"{algo} behind backup", algo, training={"filter": _BACKUP}, filter=_BACKUP),
     ]
     return Study(env_ids, variants, seeds, seed, episodes, training=_QUICK if quick else _ALL)

@@ -109,7 +109,12 @@ class StudyResult:
     missing: Mapping[tuple[str, str, int | None], str]
 
     def of(self, env_id: str, variant: str) -> list[StudyRow]:
-        """Return the rows of a variant on an env, in the order of their seeds."""
+        """Return the rows of a variant on an env, in the order of their seeds.
+
+        Args:
+            env_id: full id.
+            variant: its name.
+        """
         return [r for r in self.rows if (r.env_id, r.variant) == (env_id, variant)]
 
 
@@ -147,6 +152,9 @@ def run_study(
         backend: where; by default two processes of this machine.
         progress: receives the part of the work that is done, from 0 to 1.
         report: receives what the user should know meanwhile.
+
+    Returns:
+        The rows of all agents, and what is missing.
 
     Raises:
         ConfigurationError: the folder cannot be written, or has files that are damaged.

@@ -26,7 +26,7 @@ _LOOKS = (
     (COLORS[3], "P"),
     (COLORS[4], "v"),
 )
-"""Colours and markers in the order of the variants; none is told by its colour alone."""
+"""Colours and markers in the order of the variants; none depends on its colour alone."""
 
 _LEAST = 1e-4
 _MARGIN = 0.06

@@ -100,12 +100,12 @@ def test_all_variants_have_one_budget_and_promise_and_limit_ask_for_the_same():
     study = board([PENDULUM])
     names = [variant.name for variant in study.variants]
     assert names[:2] == ["nominal", "ppo"]
-    assert {"ppo + filter", "ppo behind filter", "ppo + promise"} <= set(names)
+    assert {"ppo + filter", "ppo behind filter", "ppo + promise filter"} <= set(names)
     for variant in study.variants:
         assert not set(variant.training) & {"n_timesteps", "settings", "num_envs"}
     by_name = {variant.name: variant for variant in study.variants}
     limit = by_name["ppo-lag"].training["violation_limit"]
-    assert by_name["ppo + promise"].filter == f"promise:p={1 - limit:g}"
+    assert by_name["ppo + promise filter"].filter == f"promise:p={1 - limit:g}"
     assert board([PENDULUM], quick=True).training["n_timesteps"] < 10_000
     # An algorithm without a constrained form has the other variants.
     assert [v.name for v in board([PENDULUM], algo="td3").variants][:3] == [

@@ -13,7 +13,7 @@ from tests.agents.training.test_leaderboard import SCALAR, result
 
 pytestmark = pytest.mark.slow
 
-NAMES = ["nominal", "ppo", "ppo-lag", "ppo + filter", "ppo behind filter", "ppo + promise"]
+NAMES = ["nominal", "ppo", "ppo-lag", "ppo + filter", "ppo behind filter", "ppo + promise filter"]
 NAMES += ["ppo behind backup"]
 CURVE = {"violations": [1e-3, 0.1, 1.0], "returns": [-500.0, 400.0, 700.0]}
 

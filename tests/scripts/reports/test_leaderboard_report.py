@@ -33,8 +33,8 @@ def report(**changes):
         )
     }
     found = result(safe)
-    found.missing[SCALAR, "ppo + promise", None] = "no grid"  # pyright: ignore[reportIndexIssue]
-    found.missing[PENDULUM, "ppo + promise", None] = "no grid"  # pyright: ignore[reportIndexIssue]
+    found.missing[SCALAR, "ppo + promise filter", None] = "no grid"  # pyright: ignore[reportIndexIssue]
+    found.missing[PENDULUM, "ppo + promise filter", None] = "no grid"  # pyright: ignore[reportIndexIssue]
     entries = [entry_of(found, env_id, variant) for env_id, variant in safe]
     given = {"best": {SCALAR: "too many coordinates"}, "frontiers": {}}
     return LeaderboardReport(
@@ -65,7 +65,7 @@ def test_tables_fit_a_terminal_of_100_columns():
 
 def test_what_is_missing_is_told_once_with_its_envs():
     notes = leaderboard_notes(report())
-    assert "Scalar, Pendulum: ppo + promise: no grid." in notes
+    assert "Scalar, Pendulum: ppo + promise filter: no grid." in notes
     assert "Scalar: best: too many coordinates." in notes
 
 
@@ -81,7 +81,7 @@ def test_markdown_has_a_small_table_and_a_picture_for_each_env():
     assert (
         "| nominal | 0.0 % [0.0, 0.0] | 0.0 % [0.0, 1.5] | 0.000 [0.000, 0.000] | - | - |" in text
     )
-    assert "- Scalar, Pendulum: ppo + promise: no grid." in text
+    assert "- Scalar, Pendulum: ppo + promise filter: no grid." in text
     json.dumps(found.document(), allow_nan=False)
 
 
