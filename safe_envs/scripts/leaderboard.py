@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 FEW = ("safe_envs/Pendulum-v0", "safe_envs/StochasticDubins-v0", "safe_envs/QuadrotorLimits-v0")
 """The envs of a leaderboard for which none is named: noise, noise and turns, several limits."""
 
+QUICK = ("safe_envs/Pendulum-v0", "safe_envs/Scalar-v0", "safe_envs/QuadrotorLimits-v0")
+"""Those of --quick, whose tables take seconds."""
+
 _QUICK_SEEDS, _SEEDS = 2, 5
 
 
@@ -35,7 +38,7 @@ def leaderboard(
         list[str] | None,
         typer.Argument(
             metavar="[ENV_ID]...",
-            help=f"Envs; by default {', '.join(FEW)}.",
+            help=f"Envs; by default {', '.join(FEW)}, and with --quick {', '.join(QUICK)}.",
             autocompletion=completion.env_ids,
         ),
     ] = None,
@@ -129,7 +132,7 @@ def leaderboard(
             f"--all and {', '.join(env_ids)} are given; leave one of the two out"
         )
     study = board(
-        ENV_IDS if all_envs else env_ids or FEW,
+        ENV_IDS if all_envs else env_ids or (QUICK if quick else FEW),
         algo=algo,
         seeds=seeds or (_QUICK_SEEDS if quick else _SEEDS),
         seed=seed,
