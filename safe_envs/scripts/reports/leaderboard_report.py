@@ -102,7 +102,7 @@ def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]
             f"safe in %:\nIQM over {seeds}\nseeds [95 %]",
             "\nin % of their\nepisodes [95 %]",
             f"return:\nIQM over {seeds}\nseeds [95 %]",
-            "unsafe\nsteps in\ntraining",
+            "\nunsafe\nsteps",
             "\n\nmin",
         )
         table = make_table("lr", "variant", *titles)
@@ -128,7 +128,8 @@ def leaderboard_notes(report: LeaderboardReport) -> list[str]:
     """
     notes = [
         "IQM is the interquartile mean; its interval is of the bootstrap over seeds, that of the"
-        " episodes is of these agents alone; min is the processor time of a training in minutes.",
+        " episodes is of these agents alone. Unsafe steps are those in a training, min its"
+        " processor time in minutes.",
     ]
     for found in report.best.values():
         if not isinstance(found, str):
@@ -180,10 +181,18 @@ def _filter(report: LeaderboardReport, env_id: str) -> str:
 
 def _cells(entry: LeaderboardEntry, unit: str = _UNIT) -> list[str]:
     pooled = percent_in(entry.safe / entry.episodes, entry.episodes_low, entry.episodes_high)
-    unsafe = _NONE if entry.violations is None else f"{entry.violations.value:,.0f}"
+    unsafe = _NONE if entry.violations is None else _count(entry.violations.value)
     minutes = _NONE if entry.minutes is None else f"{entry.minutes:.2f}"
     rates = [rate.replace(_UNIT, unit) for rate in (_percent(entry.safety), pooled)]
     return [*rates, _number(entry.returns), unsafe, minutes]
+
+
+def _count(value: float) -> str:
+    """Return a count in at most six characters."""
+    for scale, letter in ((1e6, " M"), (1e3, " k")):
+        if value >= 9.9995 * scale:
+            return f"{value / scale:.{1 if value < 99.95 * scale else 0}f}{letter}"
+    return f"{value:,.0f}"
 
 
 def _percent(estimate: SeedEstimate) -> str:

@@ -13,6 +13,7 @@ from safe_envs.agents.training.leaderboard import entry_of, safety_over_envs
 from safe_envs.scripts.reports.leaderboard_page import BEGIN, END, link_from, put_into
 from safe_envs.scripts.reports.leaderboard_report import (
     LeaderboardReport,
+    _count,
     leaderboard_markdown,
     leaderboard_notes,
     leaderboard_tables,
@@ -29,12 +30,12 @@ def report(**changes):
         for variant, counts in (
             ("nominal", [0] * 5),
             ("ppo behind filter", [50, 49, 48, 50, 50]),
-            ("ppo behind backup", [50] * 5),
+            ("ppo + promise filter", [50] * 5),
         )
     }
     found = result(safe)
-    found.missing[SCALAR, "ppo + promise filter", None] = "no grid"  # pyright: ignore[reportIndexIssue]
-    found.missing[PENDULUM, "ppo + promise filter", None] = "no grid"  # pyright: ignore[reportIndexIssue]
+    found.missing[SCALAR, "ppo behind backup", None] = "no grid"  # pyright: ignore[reportIndexIssue]
+    found.missing[PENDULUM, "ppo behind backup", None] = "no grid"  # pyright: ignore[reportIndexIssue]
     entries = [entry_of(found, env_id, variant) for env_id, variant in safe]
     given = {"best": {SCALAR: "too many coordinates"}, "frontiers": {}}
     return LeaderboardReport(
@@ -56,16 +57,26 @@ def test_tables_fit_a_terminal_of_100_columns():
     assert headings == ["Scalar, filter scbf", "Pendulum, filter scbf", "All 2 envs"]
     text = stream.getvalue()
     assert "…" not in text
-    (line, *_) = [line for line in text.splitlines() if line.startswith("ppo behind backup")]
+    (line, *_) = [line for line in text.splitlines() if line.startswith("ppo + promise")]
     assert line.split() == [
-        "ppo", "behind", "backup", "100.0", "[100.0,", "100.0]", "100.0", "[98.5,", "100.0]",
+        "ppo", "+", "promise", "filter", "100.0", "[100.0,", "100.0]", "100.0", "[98.5,", "100.0]",
         "500.0", "[500.0,", "500.0]", "200", "2.00",
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0, "0"), (9999, "9,999"), (10_000, "10.0 k"), (99_940, "99.9 k"), (99_990, "100 k"),
+     (187_961, "188 k"), (999_600, "1000 k"), (12_340_000, "12.3 M")],
+)  # fmt: skip
+def test_counts_are_short(value, text):
+    assert _count(value) == text
+    assert len(text) <= 6
+
+
 def test_what_is_missing_is_told_once_with_its_envs():
     notes = leaderboard_notes(report())
-    assert "Scalar, Pendulum: ppo + promise filter: no grid." in notes
+    assert "Scalar, Pendulum: ppo behind backup: no grid." in notes
     assert "Scalar: best: too many coordinates." in notes
 
 
@@ -81,7 +92,7 @@ def test_markdown_has_a_small_table_and_a_picture_for_each_env():
     assert (
         "| nominal | 0.0 % [0.0, 0.0] | 0.0 % [0.0, 1.5] | 0.000 [0.000, 0.000] | - | - |" in text
     )
-    assert "- Scalar, Pendulum: ppo + promise filter: no grid." in text
+    assert "- Scalar, Pendulum: ppo behind backup: no grid." in text
     json.dumps(found.document(), allow_nan=False)
 
 
