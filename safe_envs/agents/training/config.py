@@ -87,6 +87,7 @@ class Training:
     violation_limit: float | None = None
 
     def __post_init__(self) -> None:
+        self._require_limits()
         try:
             json.dumps(asdict(self), allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -96,7 +97,6 @@ class Training:
         for name, least in _LEAST.items():
             require_whole(name, getattr(self, name), least)
         require_engine(self.engine)
-        self._require_limits()
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
         if self.action not in ACTIONS:
@@ -142,6 +142,12 @@ class Training:
         if self.algorithm not in CONSTRAINED:
             return None
         return COST if self.violation_limit is None else VIOLATION
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Arguments of the envs of the training, of which those of the evaluations are a part."""
+        ends = {"terminate_on_violation": True} if self.limit_kind == VIOLATION else {}
+        return {**self.options, **ends}
 
     @property
     def constraint(self) -> dict[str, float]:

@@ -31,10 +31,10 @@ class Values(BaseCallback):
         self.found.append(value_of(boldness(self.model)))
 
 
-def trained(kind, steps, seed, **settings):
+def trained(kind, steps, seed, count=32, **settings):
     """Return the mean return and cost of the second half of a training, and the model."""
     torch.set_num_threads(1)
-    envs = DummyVecEnv([IcyRoad] * 32)
+    envs = DummyVecEnv([IcyRoad] * count)
     model = kind(
         "MlpPolicy",
         envs,
@@ -114,22 +114,33 @@ def test_the_env_is_the_process():
     assert (np.abs(np.mean(sums, axis=0) - value_of(bold)) < 4.0 * error).all()
 
 
+QUICK_SAC = {
+    "count": 16,
+    "batch_size": 64,
+    "learning_rate": 0.02,
+    "ent_coef": 0.05,
+    "multiplier_kp": 2.0,
+    "multiplier_ki": 0.4,
+}
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "settings", "steps", "tolerance"),
-    [(PPOLagrangian, PPO, 30_000, 0.1), (SACLagrangian, SAC, 8_000, 0.25)],
+    ("kind", "settings", "steps"),
+    [(PPOLagrangian, PPO, 20_000), (SACLagrangian, SAC | QUICK_SAC, 12_000)],
 )
-def test_learners_come_near_the_best_policy(kind, settings, steps, tolerance):
-    # Both policies without a constraint are far from it: 8.45 at a cost of 1.81.
+def test_learners_come_near_the_best_policy(kind, settings, steps):
+    # Without a constraint the best policy has a return of 8.45 and a cost of 1.81.
     (value, cost), _ = trained(kind, steps, 0, **settings)
-    assert value == pytest.approx(best(LIMIT)[0], rel=tolerance)
-    assert cost == pytest.approx(LIMIT, rel=4 * tolerance)
+    assert value == pytest.approx(best(LIMIT)[0], rel=0.1)
+    assert cost == pytest.approx(LIMIT, rel=0.3)
 
 
 @pytest.mark.oracle
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("kind", "settings"), [(PPOLagrangian, PPO), (SACLagrangian, SAC)])
 def test_learners_find_the_best_policy_within_two_percent(kind, settings, seed):
-    (value, cost), model = trained(kind, 400_000, seed, **settings)
+    (value, cost), model = trained(kind, 300_000, seed, **settings)
     assert value == pytest.approx(best(LIMIT)[0], rel=0.02)
     assert cost == pytest.approx(LIMIT, rel=0.02)
     if kind is SACLagrangian:
