@@ -5,18 +5,19 @@ speed. The law asks for the acceleration min(0, (v* - v)/dt), u = F_r(v) + M min
 and is clipped to the force -F at most. v* is so far below v_f that it brakes fully where w > 0.
 
 **Terminal set.** Let a_1 = (F + F_r(v_f))/M and a = (F + F_r(v_f - a_1 dt))/M, which full braking
-from w > 0 exceeds during a period. With h the distance to what is unsafe, h = z - D or h = z - tau v,
-and w' = w - tau a (tau = 0 for a fixed distance D), a period of the law keeps
+from w > 0 exceeds during a period. With h the distance to what is unsafe, h = z - D or h = z - tau
+v, and w' = w - tau a (tau = 0 for a fixed distance D), a period of the law keeps
 
     b = h - max(w', 0)^2/(2 a) >= 0.
 
-*Proof.* Let w > 0. All four stages of the integrator brake by a at least, so that w falls by a dt or
-more, and the weighted mean of the closing speeds of the stages is at most w - a dt/2. Hence h changes
-by at least -w dt + a dt^2/2 + tau a dt = -w' dt + a dt^2/2. If w' >= a dt, b does not decrease, for
-(w' - a dt)^2/(2 a) = w'^2/(2 a) - w' dt + a dt^2/2. If 0 < w' < a dt, the new h is at least w'^2/(2 a)
-- w' dt + a dt^2/2 = (w' - a dt)^2/(2 a) >= 0, and the new w' <= 0. If w' <= 0, h grows and w' stays
-<= 0. Let now w <= 0: the input takes the drag off exactly at first, and as v falls the drag falls by
-less than what the law brakes; so v does not grow, w stays <= 0 and h does not fall. QED
+*Proof.* Let w > 0. All four stages of the integrator brake by a at least, so that w falls by a dt
+or more, and the weighted mean of the closing speeds of the stages is at most w - a dt/2. Hence h
+changes by at least -w dt + a dt^2/2 + tau a dt = -w' dt + a dt^2/2. If w' >= a dt, b does not
+decrease, for (w' - a dt)^2/(2 a) = w'^2/(2 a) - w' dt + a dt^2/2. If 0 < w' < a dt, the new h is at
+least w'^2/(2 a) - w' dt + a dt^2/2 = (w' - a dt)^2/(2 a) >= 0, and the new w' <= 0. If w' <= 0, h
+grows and w' stays <= 0. Let now w <= 0: the input takes the drag off exactly at first, and as v
+falls the drag falls by less than what the law brakes; so v does not grow, w stays <= 0 and h does
+not fall. QED
 
 As the drag grows with the speed the true stopping distance is shorter; the horizon, within which
 the law may reach the set, regains that. Noise is left out: with it no law keeps a distance for

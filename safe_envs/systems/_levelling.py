@@ -1,11 +1,11 @@
 """Backup law of a quadrotor: level out, and brake to a hover in the middle of the safe band.
 
-**Law.** Thrust over weight in the direction of gravity gives the acceleration k_2 (v_w - zdot) with the
-wanted climb rate v_w = -v_m tanh(k_1 (z - z_m)/v_m); torques give the angular accelerations
--k_3 phi - k_4 phidot and the like, with the products of the rates taken off, and damp the yaw. What a
-torque needs of the rotors is bounded smoothly by a share of their range, and the lift leaves room for
-it at both ends: so no rotor is clipped, and levelling out goes before climbing. Where the vehicle drifts
-to is not part of it.
+**Law.** Thrust, with the weight and the tilt taken into account, gives the acceleration k_2 (v_w -
+zdot) with the wanted climb rate v_w = -v_m tanh(k_1 (z - z_m)/v_m). Torques give the angular
+accelerations -k_3 phi - k_4 phidot and the like, less the products of the rates, and damp the yaw.
+What a torque needs of the rotors is bounded smoothly by a share of their range, and the lift leaves
+room for it at both ends: so no rotor is clipped, and levelling out goes before climbing. Where the
+vehicle drifts to is not part of it.
 
 The terminal set is derived and proved for the numbers of the problem: see
 `safe_envs.wrappers.backup_sets`. Attitude and altitude form blocks; x, y and the heading are left

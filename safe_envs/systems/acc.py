@@ -185,6 +185,10 @@ class ACC(SystemEnv):
     ## Mismatch
     None.
 
+    ## Backup
+    `brake`: full braking until the car is slower than its lead, then its speed is kept. The
+    terminal set is in closed form, without noise: with it nothing is guaranteed.
+
     ## Reward
     1/(1 + ((x_1 - 22)/4)^2) a step, in (0, 1].
 

@@ -136,6 +136,10 @@ class ACCGap(SystemEnv):
     ## Mismatch
     None.
 
+    ## Backup
+    `brake`: full braking until the car is slower than its lead, then its speed is kept. The
+    terminal set is in closed form, without noise: with it nothing is guaranteed.
+
     ## Reward
     exp(-z/50)/(1 + ((v - 22)/4)^2) a step, in (0, 1]: others cut into a long gap. Without the
     second factor nothing would pull an agent towards the edge, since in the long run it drives as

@@ -235,6 +235,10 @@ class DubinsDisk(SystemEnv):
     The plant has v = .8 m/s, the model v = .5 m/s. A filter that trusts the model lets h settle
     near -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
 
+    ## Backup
+    `left` and `right`: turn at the full rate, once the circle of the turn fits into the disk, and
+    drive straight on before. The terminal set is in closed form. With noise nothing is guaranteed.
+
     ## Reward
     (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
     (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the

@@ -144,6 +144,11 @@ class QuadrotorLimits(SystemEnv):
     ## Mismatch
     None: plant and model have m = .6 kg. What is hard is the number of barriers and inputs.
 
+    ## Backup
+    `level out`: torques bring roll and pitch back, and the thrust brakes to a hover in the middle
+    of the band. Its terminal set is proved when a filter is made, for the numbers of the problem.
+    Where the vehicle drifts to meanwhile is not part of it.
+
     ## Reward
     exp(-(z - z_ref)^2 - (x - x_ref)^2) a step, in (0, 1].
 

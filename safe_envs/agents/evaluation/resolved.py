@@ -32,17 +32,12 @@ from safe_envs.wrappers import (
 )
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
-from safe_envs.wrappers.env_wrappers.lone_filters import (
-    LoneFilter,
-    lone_filter_for,
-    settings_of,
-)
+from safe_envs.wrappers.env_wrappers import lone_filters
 from safe_envs.wrappers.value.closed_loop import require_few_states
 from safe_envs.wrappers.value.reduction import reduced
 
 FilterParts = tuple[Condition, ...] | FilterSettings
-"""The conditions of a filter, none for the unfiltered env, or the settings of a filter that acts by
-itself."""
+"""Conditions, none for the unfiltered env, or the settings of a filter that acts by itself."""
 
 
 class ResolvedEvaluation:
@@ -83,11 +78,10 @@ class ResolvedEvaluation:
             if not isinstance(each, str)
         }
         texts = [name for name in self.names if name not in self._given]
-        read = {text: settings_of(text) for text in texts}
-        self._alone = {text: found for text, found in read.items() if found is not None}
+        self._alone = lone_filters.settings_among(texts)
         for settings in self._alone.values():
             settings.require_fit(self.problem, spec.objective)
-        self._in_use: list[LoneFilter] = []
+        self._in_use: list[lone_filters.LoneFilter] = []
         self._texts = {name: _checked(name, self.problem) for name in texts}
         self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
         if self.target.filter_spec is not None and self.learning.missing():
@@ -122,7 +116,7 @@ class ResolvedEvaluation:
             self.learning.learn(method, repeat, part())
         # The envs of the filters find the tables as long as they are in use here.
         self._in_use = [
-            lone_filter_for(self.problem, settings, self.spec.knowledge, part())
+            lone_filters.lone_filter_for(self.problem, settings, self.spec.knowledge, part())
             for settings in self._alone.values()
         ]
         for name in self.names:
@@ -274,7 +268,7 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
             " alone or leave it out"
         )
     require_known(name, UNFILTERED)
-    settings = settings_of(name)
+    settings = lone_filters.settings_of(name)
     if settings is not None:
         return settings.text
     if learned_parts(name):

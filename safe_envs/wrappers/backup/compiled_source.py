@@ -10,103 +10,9 @@ from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.integrators import rate
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.wrappers.backup import source_texts
 from safe_envs.wrappers.backup.plans import Plans
-
-_KEPT = """\
-def backup_kept(x, u, floor, data):
-    reached = backup_step(x, u, data)
-    kept, lowest, failed = backup_follow_0(reached, floor, data)
-    if kept:
-        return True, lowest, failed
-{others}    return False, lowest, failed
-"""
-
-_FOLLOW = """\
-def backup_follow_{j}(x, floor, data):
-    lowest = inf
-    for k in range({periods} + 1):
-        values = backup_reading_{j}(x, data)
-        h, failed, total = values[0], 0, {total}
-{smaller}        if not h >= floor or total != total:
-            return False, h if h < lowest else lowest, failed
-        lowest = h if h < lowest else lowest
-        if values[{count}] >= 0.0:
-            return True, lowest, -1
-        if k < {periods}:
-            x = backup_step(x, backup_input_{j}(values, data), data)
-    return False, lowest, -1
-"""
-
-_WHOLE = """\
-def backup_whole_{j}(x, u, data):
-    entered, lows = False, ({infinite})
-    for k in range({periods} + 1):
-        x = backup_step(x, u, data)
-        values = backup_reading_{j}(x, data)
-        lows = ({smaller})
-        if values[{count}] >= 0.0:
-            entered = True
-            break
-        u = backup_input_{j}(values, data)
-    return entered, lows
-"""
-
-_LOWER = """\
-def backup_lower(a, b):
-    if b != b:
-        return -inf
-    return b if b < a else a
-"""
-
-_SEGMENT = """\
-def backup_segment(x, begin, end, floor, data):
-    share, width, found, lowest, best = 0.0, 1.0, False, 0.0, begin
-    for stage in range(3):
-        for i in range(4 if stage == 0 else 3):
-            at = share + width * (0.75 - 0.25 * i)
-            point = backup_within(({between}), data)
-            kept, low, failed = backup_kept(x, point, floor, data)
-            if kept:
-                share, lowest, best, found = at, low, point, True
-                break
-        if not found:
-            break
-        width *= 0.25
-    return found, best, lowest
-"""
-
-_DECIDE = """\
-def decide(x, u, data, work):
-    floor = data[{floor}]
-    state = ({part})
-    wanted = backup_within(u, data)
-    kept, lowest, failed = backup_kept(state, wanted, floor, data)
-    if kept:
-        return wanted, u, False, True, ({zeros}), -1, True
-    nearest, chosen = inf, wanted
-{segments}    if nearest < inf:
-        return chosen, u, True, True, ({zeros}), failed, True
-    good, low, lows = False, -inf, ({infinite})
-{plans}    slack = ({slack})
-    return chosen, u, True, good, slack, failed, True
-"""
-
-_OF_SEGMENT = """\
-    begin_{j} = backup_input_{j}(backup_reading_{j}(state, data), data)
-    found, point, lowest = backup_segment(state, begin_{j}, wanted, floor, data)
-    if found:
-        away = {away}
-        if away < nearest:
-            nearest, chosen = away, point
-"""
-
-_OF_PLAN = """\
-    entered, fallen = backup_whole_{j}(state, begin_{j}, data)
-    least = {least}
-    fine = entered and least >= 0.0
-    if {first} or (least > low if fine == good else fine):
-        good, low, lows, chosen = fine, least, fallen, begin_{j}
-"""
+from safe_envs.wrappers.backup.slope_search import DIFFERENCE, LEFT, SWEEPS
 
 
 def backup_source(plans: Plans, floor: float, data: Data) -> Source:
@@ -118,7 +24,7 @@ def backup_source(plans: Plans, floor: float, data: Data) -> Source:
         data: receives the numbers.
     """
     system, count, m = plans.system, plans.count, plans.system.m
-    source = _step(plans, data) + _within(plans, data) + Source(_LOWER)
+    source = _step(plans, data) + _within(plans, data) + Source(source_texts.LOWER)
     for j, numbers in enumerate(plans.readings):
         source += formulas(f"backup_reading_{j}", {"x": system.states}, numbers, data)
         source += Source(_input(j, plans))
@@ -128,9 +34,9 @@ def backup_source(plans: Plans, floor: float, data: Data) -> Source:
             for i in range(1, count)
         )
         total = " + ".join(f"values[{i}]" for i in range(count))
-        source += Source(_FOLLOW.format(smaller=smaller, total=total, **words))
+        source += Source(source_texts.FOLLOW.format(smaller=smaller, total=total, **words))
         lower = _tuple(f"backup_lower(lows[{i}], values[{i}])" for i in range(count))
-        source += Source(_WHOLE.format(smaller=lower, **words))
+        source += Source(source_texts.WHOLE.format(smaller=lower, **words))
     laws = range(len(plans.laws))
     others = _lines(
         f"    kept, other, none = backup_follow_{j}(reached, floor, data)\n"
@@ -142,21 +48,64 @@ def backup_source(plans: Plans, floor: float, data: Data) -> Source:
     least = "fallen[0]"
     for i in range(1, count):
         least = f"backup_lower({least}, fallen[{i}])"
-    decide = _DECIDE.format(
+    further = ""
+    if m > 1:
+        for j in laws:
+            source += Source(_aim(j, plans, data))
+            further += (
+                f"        if law == {j}:\n"
+                f"            aim = backup_aim_{j}(state, chosen, wanted, floor, data)\n"
+            )
+        start = "        aim = chosen\n"
+        way = _tuple(f"chosen[{i}] + at * (aim[{i}] - chosen[{i}])" for i in range(m))
+        further = start + further + source_texts.ON.format(between=way)
+    decide = source_texts.DECIDE.format(
+        further=further,
         floor=data.add([floor]),
         part=_tuple(f"x[{i}]" for i in plans.places),
         zeros="0.0, " * count,
         infinite="-inf, " * count,
-        segments="".join(_OF_SEGMENT.format(j=j, away=away) for j in laws),
-        plans="".join(_OF_PLAN.format(j=j, least=least, first=j == 0) for j in laws),
+        segments="".join(source_texts.OF_SEGMENT.format(j=j, away=away) for j in laws),
+        plans="".join(source_texts.OF_PLAN.format(j=j, least=least, first=j == 0) for j in laws),
         slack=_tuple(f"-lows[{i}] if not good and lows[{i}] < 0.0 else 0.0" for i in range(count)),
     )
     return (
         source
-        + Source(_KEPT.format(others=others))
-        + Source(_SEGMENT.format(between=between))
+        + Source(source_texts.KEPT.format(others=others))
+        + Source(source_texts.SEGMENT.format(between=between))
         + Source(decide)
     )
+
+
+def _aim(j: int, plans: Plans, data: Data) -> str:
+    """Return what `slope_search.aims` finds for one state, as text."""
+    (low, high), m, barriers = plans.bounds, plans.system.m, range(plans.count)
+    first = data.add([*low, *high])
+    slopes = ""
+    for i in range(m):
+        moved = _tuple(f"point[{e}] + step_{i}" if e == i else f"point[{e}]" for e in range(m))
+        lines = _lines(f"    slope_{k}_{i} = (lows[{k}] - base[{k}]) / step_{i}" for k in barriers)
+        places = {"low": first + i, "high": first + m + i, "difference": DIFFERENCE}
+        slopes += source_texts.SLOPE.format(i=i, j=j, moved=moved, slopes=lines, **places)
+    needed, sweep = "", ""
+    for k in barriers:
+        names = [f"slope_{k}_{i}" for i in range(m)]
+        needed += source_texts.NEEDED.format(
+            k=k,
+            total=" + ".join(names),
+            none=", ".join(names),
+            zeros=", ".join(["0.0"] * m),
+            product=" + ".join(f"{s} * point[{i}]" for i, s in enumerate(names)),
+            square=" + ".join(f"{s} ** 2" for s in names),
+            share=1.0 - LEFT,
+        )
+        aim = _tuple(
+            f"wanted[{i}] + {' + '.join(f'slope_{e}_{i} * y_{e}' for e in barriers)}"
+            for i in range(m)
+        )
+        product = " + ".join(f"{s} * found[{i}]" for i, s in enumerate(names))
+        sweep += source_texts.SWEEP.format(k=k, product=product, aim=aim)
+    return source_texts.AIM.format(j=j, slopes=slopes, needed=needed, sweep=sweep, sweeps=SWEEPS)
 
 
 def _step(plans: Plans, data: Data) -> Source:

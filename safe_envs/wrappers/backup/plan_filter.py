@@ -54,10 +54,10 @@ class PlanFilter:
         wanted = [min(max(c, a), b) for c, a, b in zip(u, *self.plans.bounds, strict=True)]
         given = self.plans.kept_after_one(x, wanted, self.floor)
         count = self.plans.count
-        if given.kept:
+        if given.allowed:
             action = list(u) if wanted == list(u) else wanted
             none = [0.0] * count
-            return FilterDecision(action, [given.lowest] * count, [False], True, none, -1, u)
+            return FilterDecision(action, [given.height] * count, [False], True, none, -1, u)
         found = self._search.of_one(x, wanted)
         if found is not None:
             action, lowest = found
@@ -101,7 +101,7 @@ class PlanFilter:
         lost = np.flatnonzero(~found)
         if lost.size:
             last, rows = self._search.last_resort(tuple([c[lost] for c in at])), rows[lost]
-            _put((*action, *margin, *slack), rows, (*last.action, *last.lowest, *last.slack))
+            _put((*action, *margin, *slack), rows, (*last.action, *last.heights, *last.slack))
             feasible[rows] = last.good
         return FilterDecision(action, margin, (~kept,), feasible, slack, failed, u)
 

@@ -15,25 +15,25 @@ _CHUNK = 2048
 """States that are simulated at once: more of them no longer fit into a processor's cache."""
 
 
-class Kept(NamedTuple):
+class PlanVerdict(NamedTuple):
     """Whether plans stay safe until they enter a terminal set; arrays (M,) or of one plan.
 
     Attributes:
-        kept: whether one of the laws does.
-        lowest: smallest barrier on the plan that does; with none, on that of the first law up to
+        allowed: whether one of the laws does.
+        height: smallest barrier on the plan that does; with none, on that of the first law up to
             where it fails.
         failed: the barrier that the first law violates first, -1 where it merely takes too long.
     """
 
-    kept: Any
-    lowest: Any
+    allowed: Any
+    height: Any
     failed: Any
 
 
 class Plans(PlannedSystem):
     """Simulates the plans of backup laws, of one state in floats and of batches."""
 
-    def kept_after_one(self, x: Sequence[float], u: Sequence[float], floor: float) -> Kept:
+    def kept_after_one(self, x: Sequence[float], u: Sequence[float], floor: float) -> PlanVerdict:
         """Return whether some law keeps the state that an input leads to; see `kept_after`.
 
         Args:
@@ -41,37 +41,37 @@ class Plans(PlannedSystem):
             u: m components of the input.
             floor: which no barrier may be below.
         """
-        first: Kept | None = None
+        first: PlanVerdict | None = None
         try:
             reached = self.steps["floats"].step(tuple(x), u, self.still)
         except NO_VALUE:
-            return Kept(False, -np.inf, -1)
+            return PlanVerdict(False, -np.inf, -1)
         for reading in self.compiled["floats"]:
             found = self._followed_by_one(reading, reached, floor)
-            if found.kept:
+            if found.allowed:
                 return found
             first = first or found
         assert first is not None
         return first
 
-    def _followed_by_one(self, reading: Any, x: Components, floor: float) -> Kept:
+    def _followed_by_one(self, reading: Any, x: Components, floor: float) -> PlanVerdict:
         step, count, lowest = self.steps["floats"].step, self.count, np.inf
         for k in range(self.periods + 1):
             try:
                 values = reading(*x)
                 h, total = min(values[:count]), sum(values[:count])
                 if not h >= floor or total != total:
-                    return Kept(False, min(lowest, h), values.index(h))
+                    return PlanVerdict(False, min(lowest, h), values.index(h))
                 lowest = min(lowest, h)
                 if values[count] >= 0.0:
-                    return Kept(True, lowest, -1)
+                    return PlanVerdict(True, lowest, -1)
                 if k < self.periods:
                     x = step(x, self.clipped(values), self.still)
             except NO_VALUE:
-                return Kept(False, -np.inf, -1)
-        return Kept(False, lowest, -1)
+                return PlanVerdict(False, -np.inf, -1)
+        return PlanVerdict(False, lowest, -1)
 
-    def kept_after(self, x: Components, u: Components, floor: float) -> Kept:
+    def kept_after(self, x: Components, u: Components, floor: float) -> PlanVerdict:
         """Return whether some law keeps the states that inputs lead to.
 
         That is whether no barrier is below the floor there, nor at any later control instant of the
@@ -86,7 +86,7 @@ class Plans(PlannedSystem):
         if size > _CHUNK:
             parts = [slice(i, i + _CHUNK) for i in range(0, size, _CHUNK)]
             found = [self.kept_after(_at(x, part), _at(u, part), floor) for part in parts]
-            return Kept(*[np.concatenate(each) for each in zip(*found, strict=True)])
+            return PlanVerdict(*[np.concatenate(each) for each in zip(*found, strict=True)])
         reached = self.advanced(x, u)
         first, *others = self.compiled["arrays"]
         kept, lowest, failed = self._followed(first, reached, floor)
@@ -95,12 +95,12 @@ class Plans(PlannedSystem):
             if not rows.size:
                 break
             found = self._followed(reading, _at(reached, rows), floor)
-            now = rows[found.kept]
-            kept[now], lowest[now] = True, found.lowest[found.kept]
+            now = rows[found.allowed]
+            kept[now], lowest[now] = True, found.height[found.allowed]
         failed[kept] = -1
-        return Kept(kept, lowest, failed)
+        return PlanVerdict(kept, lowest, failed)
 
-    def _followed(self, reading: Any, x: Components, floor: float) -> Kept:
+    def _followed(self, reading: Any, x: Components, floor: float) -> PlanVerdict:
         """Follow a law from states, each as long as it is neither lost nor in the terminal set."""
         size, count = len(x[0]), self.count
         kept, lowest = np.zeros(size, dtype=bool), np.empty(size)
@@ -131,7 +131,7 @@ class Plans(PlannedSystem):
                 on = np.flatnonzero(open_)
                 rows, low, x, u = rows[on], low[on], _at(x, on), _at(u, on)
             x = self.advanced(x, u)
-        return Kept(kept, lowest, failed)
+        return PlanVerdict(kept, lowest, failed)
 
     def whole(self, law: int, x: Components, u: Components) -> tuple[np.ndarray, np.ndarray]:
         """Follow a law to its terminal set, or to the last period, whatever it violates.
@@ -144,17 +144,23 @@ class Plans(PlannedSystem):
         Returns:
             Whether the terminal set is reached, (M,), and each barrier's smallest value, (k, M).
         """
-        reading, count = self.compiled["arrays"][law], self.count
-        entered, lows = np.zeros(len(x[0]), dtype=bool), np.full((count, len(x[0])), np.inf)
+        reading, count, size = self.compiled["arrays"][law], self.count, len(x[0])
+        entered, lows = np.zeros(size, dtype=bool), np.empty((count, size))
+        rows, low = np.arange(size), np.full((count, size), np.inf)
         for k in range(self.periods + 1):
             x = self.advanced(x, u)
-            values = reading(*x)
-            h = np.array([filled(v, x[0].shape) for v in values[:count]])
-            lows = np.where(entered, lows, np.minimum(lows, h))
-            entered |= filled(values[count], x[0].shape) >= 0.0
-            if k == self.periods or entered.all():
+            values, shape = reading(*x), x[0].shape
+            low = np.minimum(low, np.array([filled(v, shape) for v in values[:count]]))
+            there = filled(values[count], shape) >= 0.0
+            over = np.flatnonzero(there)
+            entered[rows[over]], lows[:, rows[over]] = True, low[:, over]
+            if k == self.periods or over.size == rows.size:
+                lows[:, rows[~there]] = low[:, ~there]
                 break
             u = self.clipped_arrays(values, x)
+            if over.size:
+                on = np.flatnonzero(~there)
+                rows, low, x, u = rows[on], low[:, on], _at(x, on), _at(u, on)
         return entered, np.where(np.isnan(lows), -np.inf, lows)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.backup.plans import Plans
+from safe_envs.wrappers.backup.slope_search import aims
 
 _SHARES = (0.75, 0.5, 0.25, 0.0)
 """Points between a backup input, 0, and the proposed one, 1, that are tried at first."""
@@ -19,19 +20,22 @@ _PARTS = (0.75, 0.5, 0.25)
 _STAGES = (_SHARES, _PARTS, _PARTS)
 """The distance of two points is a quarter of that of the stage before."""
 
+_ON = (1.0, *_PARTS)
+"""Points that are tried from an allowed input on towards one that the slopes of the plans show."""
+
 
 class LastResort(NamedTuple):
     """The inputs of the laws with the best plans; arrays (B,).
 
     Attributes:
         action: m components.
-        lowest: the smallest value of each barrier on the plan.
+        heights: the smallest value of each barrier on the plan.
         slack: by how much each barrier is violated there.
         good: whether none is, and the terminal set is reached.
     """
 
     action: Components
-    lowest: Components
+    heights: Components
     slack: Components
     good: np.ndarray
 
@@ -60,14 +64,19 @@ class Search:
             The nearest input that was found to be allowed, and the smallest barrier on its plan;
             None where there is none.
         """
-        nearest, found = np.inf, None
-        for begin in self._plans.inputs_of_one(x):
+        nearest, found, law = np.inf, None, -1
+        for j, begin in enumerate(self._plans.inputs_of_one(x)):
             reached = self._on_segment(x, begin, wanted)
             if reached is not None:
                 away = sum((a - b) ** 2 for a, b in zip(reached[0], wanted, strict=True))
                 if away < nearest:
-                    nearest, found = away, reached
-        return found
+                    nearest, found, law = away, reached, j
+        if found is None or len(wanted) == 1:
+            return found
+        at, point, end = [_as_batch(each) for each in (x, found[0], wanted)]
+        with np.errstate(all="ignore"):
+            point, height = self._on(at, point, end, np.array([found[1]]), np.array([law]))
+        return [c.item() for c in point], height.item()
 
     def _on_segment(
         self, x: Sequence[float], begin: Sequence[float], end: Sequence[float]
@@ -81,8 +90,8 @@ class Search:
                     for a, b, low, high in zip(begin, end, *self._plans.bounds, strict=True)
                 ]
                 tried = self._plans.kept_after_one(x, point, self._floor)
-                if tried.kept:
-                    found, share = (point, tried.lowest), at
+                if tried.allowed:
+                    found, share = (point, tried.height), at
                     break
             if found is None:
                 break
@@ -91,7 +100,7 @@ class Search:
 
     def of_batch(
         self, x: Components, wanted: Components
-    ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    ) -> tuple[Components, np.ndarray, np.ndarray]:
         """Search for a batch, as `of_one` does.
 
         Args:
@@ -120,8 +129,45 @@ class Search:
         away = np.full(laws * size, np.inf)
         points = self._between(begin, end, share)
         away[rows] = sum((a - b)[rows] ** 2 for a, b in zip(points, end, strict=True))
-        chosen = away.reshape(laws, size).argmin(axis=0) * size + np.arange(size)
-        return [c[chosen] for c in points], lowest[chosen], away[chosen] < np.inf
+        law = away.reshape(laws, size).argmin(axis=0)
+        chosen = law * size + np.arange(size)
+        point, height, found = _at(points, chosen), lowest[chosen], away[chosen] < np.inf
+        if len(point) > 1:
+            point, height = self._on(x, point, wanted, height, np.where(found, law, -1))
+        return point, height, found
+
+    def _on(
+        self,
+        x: Components,
+        point: Components,
+        wanted: Components,
+        height: np.ndarray,
+        law: np.ndarray,
+    ) -> tuple[Components, np.ndarray]:
+        """Go on from allowed inputs as `slope_search` says.
+
+        Args:
+            x: p components (R,) of the states.
+            point: m components (R,) of the inputs.
+            wanted: m components (R,) of the proposed ones.
+            height: the smallest barriers on the plans of the inputs, (R,).
+            law: by which an input was found, -1 where it is not allowed, (R,).
+
+        Returns:
+            m components of inputs, and the smallest barriers on their plans.
+        """
+        table, height = np.array(point), height.copy()
+        for j in range(len(self._plans.laws)):
+            rows = np.flatnonzero(law == j)
+            if not rows.size:
+                continue
+            at, begin, end = [_at(each, rows) for each in (x, point, wanted)]
+            aim = aims(self._plans, j, at, (begin, end), self._floor)
+            kept, low, part = self._tried((at, begin, aim), np.zeros(rows.size), 1.0, _ON)
+            nearer = self._between(begin, aim, part)
+            table[:, rows[kept]] = np.array(nearer)[:, kept]
+            height[rows[kept]] = low[kept]
+        return tuple(table), height
 
     def _between(self, begin: Components, end: Components, share: np.ndarray) -> Components:
         """Return the points of segments at shares of them."""
@@ -153,7 +199,7 @@ class Search:
         at, begin, end = [_repeated(each, count) for each in segments]
         shares = np.concatenate([share + width * part for part in parts])
         found = self._plans.kept_after(at, self._between(begin, end, shares), self._floor)
-        kept, low = found.kept.reshape(count, size), found.lowest.reshape(count, size)
+        kept, low = found.allowed.reshape(count, size), found.height.reshape(count, size)
         which = kept.argmax(axis=0)
         return kept.any(axis=0), low[which, np.arange(size)], np.array(parts)[which]
 
@@ -185,3 +231,7 @@ def _repeated(components: Components, count: int) -> Components:
 
 def _at(components: Components, rows: np.ndarray) -> Components:
     return tuple([c[rows] for c in components])
+
+
+def _as_batch(components: Sequence[float]) -> Components:
+    return tuple([np.array([c]) for c in components])

@@ -21,6 +21,8 @@ from safe_envs.dynamics.interval_arithmetic import Interval
 _ULP = 2.0**-52
 _TINY = 1e-290
 _MORE = 1.0 + 1e-13
+_QUIET = np.errstate(invalid="ignore", over="ignore")
+"""What is infinite or NaN says that nothing is known."""
 
 
 class BallMatrix(NamedTuple):
@@ -30,34 +32,41 @@ class BallMatrix(NamedTuple):
     radius: np.ndarray
 
 
+@_QUIET
 def enclosing(a: Interval) -> BallMatrix:
     """Return the ball matrix that holds an interval of matrices; NaN where nothing is known."""
-    with np.errstate(invalid="ignore"):
-        center = 0.5 * a.low + 0.5 * a.high
-        radius = np.maximum(a.high - center, center - a.low) * _MORE
-        return BallMatrix(center, radius + _ULP * np.abs(center) + _TINY)
+    center = 0.5 * a.low + 0.5 * a.high
+    radius = np.maximum(a.high - center, center - a.low) * _MORE
+    return BallMatrix(center, radius + _ULP * np.abs(center) + _TINY)
 
 
+@_QUIET
 def interval_of(a: BallMatrix) -> Interval:
-    """Return the interval that holds a ball matrix."""
+    """Return the interval that holds a ball matrix; the whole line where nothing is known."""
     radius = a.radius * _MORE + _ULP * np.abs(a.center) + _TINY
-    return Interval(a.center - radius, a.center + radius)
+    unknown = np.isnan(a.center + radius)
+    return Interval(
+        np.where(unknown, -np.inf, a.center - radius), np.where(unknown, np.inf, a.center + radius)
+    )
 
 
+@_QUIET
 def plus(a: BallMatrix, b: BallMatrix) -> BallMatrix:
     """Return a + b."""
     center = a.center + b.center
     return BallMatrix(center, (a.radius + b.radius) * _MORE + _ULP * np.abs(center) + _TINY)
 
 
+@_QUIET
 def scaled(factor: float, a: BallMatrix) -> BallMatrix:
     """Return the product of a float and a."""
     center = factor * a.center
     return BallMatrix(center, abs(factor) * a.radius * _MORE + _ULP * np.abs(center) + _TINY)
 
 
+@_QUIET
 def times(a: BallMatrix, b: BallMatrix) -> BallMatrix:
-    """Return the matrix product a b."""
+    """Return the matrix product a b; NaN where nothing is known of a factor."""
     center = a.center @ b.center
     sizes = np.abs(a.center), np.abs(b.center)
     rounding = 4 * a.center.shape[-1] * _ULP * (sizes[0] @ sizes[1])
@@ -70,6 +79,7 @@ def exactly(a: np.ndarray) -> BallMatrix:
     return BallMatrix(a, np.zeros_like(a))
 
 
+@_QUIET
 def norm_bound(a: BallMatrix) -> np.ndarray:
     """Return an upper bound of the largest singular value of every matrix in a.
 
@@ -82,18 +92,19 @@ def norm_bound(a: BallMatrix) -> np.ndarray:
     Returns:
         Shape (...); infinite where a is not finite.
     """
-    finite = (np.isfinite(a.center) & np.isfinite(a.radius)).all(axis=(-2, -1))
-    center = np.where(finite[..., None, None], a.center, 0.0)
+    finite = np.asarray(np.isfinite(a.center + a.radius).all(axis=(-2, -1), keepdims=True))
+    center = np.where(finite, a.center, 0.0)
     left, s, right = np.linalg.svd(center, full_matrices=False)
     product = times(exactly(left * s[..., None, :]), exactly(right))
     rest = plus(exactly(center), scaled(-1.0, product))
     slack = rest.radius + 4 * _ULP * np.abs(left * s[..., None, :]) @ np.abs(right)
     of_rest = frobenius(BallMatrix(rest.center, slack))
     bound = s.max(axis=-1) * _stretch(left) * _stretch(np.swapaxes(right, -1, -2)) + of_rest
-    with np.errstate(invalid="ignore"):
-        return np.where(finite, (bound + frobenius(a, of_radius=True)) * _MORE + _TINY, np.inf)
+    bound = (bound + frobenius(a, of_radius=True)) * _MORE + _TINY
+    return np.where(finite[..., 0, 0], bound, np.inf)
 
 
+@_QUIET
 def frobenius(a: BallMatrix, of_radius: bool = False) -> np.ndarray:
     """Return an upper bound of the Frobenius norm of every matrix in a.
 

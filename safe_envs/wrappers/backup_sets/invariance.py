@@ -1,15 +1,15 @@
 """The proof that a level set of a quadratic form is kept by a held law, safely and unclipped.
 
 Let E = {y : |L'(y - e)|^2 <= c} with L invertible, F_d the map of a control period under the law k
-while the blocks before move as d, for d in their bounds, and q_1, q_2, ... functions of y and d that
-are to be >= 0: barriers, and the distances of k from the input bounds.
+while the blocks before move as d, for d in their bounds, and q_1, q_2, ... functions of y and d
+that are to be >= 0: barriers, and the distances of k from the input bounds.
 
 **Theorem.** Let |L' J L'^-1| <= rho for the Jacobians J of F_d on E, and |L'(F_d(e) - e)| <= s. If
 rho sqrt(c) + s <= sqrt(c), then F_d maps E into E. If q_i(e, d) >= sqrt(c) |L^-1 b| for the
 gradients b of q_i by y on E, then q_i >= 0 on E.
 
-*Proof.* E is convex. For y in E the segment from e to y is in E, so that F_d(y) - F_d(e) = A (y - e)
-with the average A of the Jacobian over it (the integral form of the mean value theorem). |L' A
+*Proof.* E is convex. For y in E the segment from e to y is in E, so that F_d(y) - F_d(e) = A (y -
+e) with the average A of the Jacobian over it (the integral form of the mean value theorem). |L' A
 L'^-1| <= rho, since the norm of an average is at most the largest norm. Hence |L'(F_d(y) - e)| <=
 rho |L'(y - e)| + s <= sqrt(c). Likewise q_i(y, d) = q_i(e, d) + b'(y - e) with the average b of the
 gradient, and |b'(y - e)| = |(L^-1 b)' L'(y - e)| <= |L^-1 b| sqrt(c). QED
@@ -173,7 +173,7 @@ def is_kept(block: Block, conditions: Conditions, e: Ellipsoid, disturbed: Distu
 def _has_kinks_in(e: Any, symbols: Sequence[sp.Symbol]) -> bool:
     """Return whether a function has kinks in some of its symbols."""
     return any(
-        part.free_symbols & set(symbols) and has_kinks(part.func(*[sp.Dummy()] * len(part.args)))
+        part.free_symbols & set(symbols) and has_kinks(part.func(*(sp.Dummy() for _ in part.args)))
         for part in e.atoms(sp.Function, sp.Max, sp.Min)
     )
 

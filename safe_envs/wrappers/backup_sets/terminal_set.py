@@ -3,11 +3,11 @@
 The shape of a set comes from a Lyapunov equation, its size from the proof: the largest level that
 `safe_envs.wrappers.backup_sets.invariance` proves, within the extent that the law gives.
 
-**Shape.** With the Jacobian A of a block's control period at the equilibrium, and the extents w,
-P = LL' = sum_k (A/r)'^k Q (A/r)^k with Q = diag(1/w^2). As (A/r)' P (A/r) = P - Q <= P, A contracts by
-r < 1 in the norm of P. Several r between the spectral radius of A and 1 are tried. Where A has a
-basis of eigenvectors, P = sum_i |a_i|^2/s_i^2 is tried too, with a_i the parts of y along them and s_i
-how far each reaches within the extents: slow directions are not cut short there. The set of the
+**Shape.** With the Jacobian A of a block's control period at the equilibrium, and the extents w, P
+= LL' = sum_k (A/r)'^k Q (A/r)^k with Q = diag(1/w^2). As (A/r)' P (A/r) = P - Q <= P, A contracts
+by r < 1 in the norm of P. Several r between the spectral radius of A and 1 are tried. Where A has a
+basis of eigenvectors, P = sum_i |a_i|^2/s_i^2 is tried too, with a_i the parts of y along them and
+s_i how far each reaches within the extents: it does not cut slow directions short. The set of the
 largest volume is taken.
 """
 
@@ -191,6 +191,8 @@ def _largest(
             f" equilibrium: held for control periods, deviations are multiplied by {radius:.4g} in"
             " each; give a law that brings them back, or a shorter dt"
         )
+    if (conditions.least(point, disturbed) < 0.0).any():
+        return None
     best: tuple[float, Ellipsoid] | None = None
     for p in _shapes(a, radius, widths):
         root = np.linalg.cholesky(p)

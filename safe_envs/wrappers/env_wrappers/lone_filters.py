@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.backup import BackupFilter, BackupSettings
@@ -33,6 +33,16 @@ def settings_of(text: str) -> FilterSettings | None:
     """
     name = name_by_itself(text)
     return _READERS[name](text) if name else None
+
+
+def settings_among(texts: Iterable[str]) -> dict[str, FilterSettings]:
+    """Return the settings among texts of filters, by these texts; see `settings_of`.
+
+    Args:
+        texts: of filters.
+    """
+    found = {text: settings_of(text) for text in texts}
+    return {text: settings for text, settings in found.items() if settings is not None}
 
 
 def lone_filter_for(

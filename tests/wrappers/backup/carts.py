@@ -84,3 +84,42 @@ def drawn(count, seed=0):
 
 def settings(**given):
     return BackupSettings(**given)
+
+
+y, w, b = sp.symbols("y w b", real=True)
+
+
+def table(noise=0.0):
+    """A cart that also moves along the wall: x'' = a, y'' = b."""
+    return ControlAffineSDE(
+        states=(x, v, y, w),
+        inputs=(a, b),
+        drift=sp.Matrix([v, 0, w, 0]),
+        input_matrix=sp.Matrix([[0, 0], [1, 0], [0, 0], [0, 1]]),
+        diffusion=sp.Matrix([0, sp.Float(noise), 0, 0]),
+    )
+
+
+STOP = BackupLaw(
+    "stop",
+    (sp.Float(-STRONGEST), sp.Float(-STRONGEST)),
+    terminal=sp.Min(-v, 1 - x, -w, 4 - y),
+)
+"""It brakes in both directions."""
+
+
+def table_problem(**options):
+    return state_problem(
+        table(),
+        (1 - x, sp.Float(4) - y),
+        **{
+            "box": (-STRONGEST, STRONGEST),
+            "start": [(-0.5, 0.0), (-0.5, 0.5), 0.0, (-0.5, 0.5)],
+            "dt": DT,
+            "horizon": 3.0,
+            "name": "table",
+            "nominal": [STRONGEST, 0.3],
+            "backup": Backup((STOP,), 4.0),
+            **options,
+        },
+    )

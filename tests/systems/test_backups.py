@@ -1,0 +1,179 @@
+"""Backups of the shipped systems: their terminal sets are kept, and as large as exact kernels."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.integrate import quad
+
+from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.integrators import Integrator
+from safe_envs.problem.backup import backup_of
+from safe_envs.registry import make_problem
+from safe_envs.systems._turning import circle_radius
+from safe_envs.wrappers.backup_sets.terminal_set import with_terminal_sets
+
+RNG = np.random.default_rng(0)
+
+
+class Simulated:
+    """The backup laws of a problem, executed as an env would, without noise."""
+
+    def __init__(self, name, **options):
+        self.problem = make_problem(f"safe_envs/{name}-v0", **options)
+        plant, self.laws = self.problem.plant, with_terminal_sets(self.problem, self.problem.plant)
+        self.step = Integrator(plant, self.problem.dt, self.problem.substeps, "arrays")
+        self.safe = compile_function(
+            plant.states, [b.expression for b in self.problem.barriers], "arrays"
+        )
+
+    def terminal(self, law, x):
+        known = compile_function(self.problem.plant.states, [law.terminal], "arrays")
+        return stacked(known(*x), x.shape[1])[:, 0]
+
+    def stays(self, law, x, steps):
+        """Return the smallest barrier at control instants under a law, shape (N,)."""
+        known = compile_function(self.problem.plant.states, law.law, "arrays")
+        low, high = np.array(self.problem.box).T
+        smallest = np.full(x.shape[1], np.inf)
+        for _ in range(steps):
+            smallest = np.minimum(smallest, stacked(self.safe(*x), x.shape[1]).min(axis=1))
+            u = np.clip(stacked(known(*x), x.shape[1]), low, high).T
+            x = np.stack(self.step.step(tuple(x), tuple(u), ()))
+        return smallest, x
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "low", "high"),
+    [
+        ("DubinsDisk", {}, (-1, -1, -4), (1, 1, 4)),
+        ("DubinsDisk", {"dt": 0.2, "box": (-2, 5)}, (-1, -1, -4), (1, 1, 4)),
+        ("DubinsDisk", {"radius": 3.0, "substeps": 3}, (-3, -3, -4), (3, 3, 4)),
+        ("ACCGap", {"noise": 0.0}, (0, 10), (50, 200)),
+        ("ACCGap", {"noise": 0.0, "dt": 0.2, "distance": 30.0}, (0, 30), (50, 200)),
+        ("ACCGap", {"noise": 0.0, "plant": {"v_f": 5.0, "M": 900.0}}, (0, 10), (50, 200)),
+        ("ACC", {"noise": 0.0}, (0, 0, 0), (50, 50, 300)),
+        ("ACC", {"noise": 0.0, "tau": 0.5, "dt": 0.2}, (0, 0, 0), (50, 50, 300)),
+    ],
+)
+def test_a_terminal_set_is_safe_and_kept(name, options, low, high):
+    known = Simulated(name, **options)
+    for law in known.laws.laws:
+        x = RNG.uniform(low, high, (5000, len(low))).T
+        x = x[:, known.terminal(law, x) >= 0.0]
+        assert x.shape[1] > 200
+        smallest, after = known.stays(law, x, 100)
+        assert (smallest >= 0.0).all()
+        assert (known.terminal(law, after) >= -1e-9).all()
+
+
+def test_a_held_turn_makes_the_circle_that_is_said():
+    known = Simulated("DubinsDisk", dt=0.3)
+    rate, v = 3.0, known.problem.plant.parameter_values["v"]
+    radius = circle_radius(v, rate, 0.3)
+    x = np.array([[0.2], [-0.1], [0.7]])
+    center = x[:2, 0] + radius * np.array([-math.sin(0.7), math.cos(0.7)])
+    for _ in range(20):
+        x = np.stack(known.step.step(tuple(x), (np.array([rate]),), ()))
+        assert math.hypot(*(x[:2, 0] - center)) == pytest.approx(radius, rel=1e-12)
+    assert circle_radius(v, rate, 1e-3) == pytest.approx(v / rate, rel=1e-12)
+    assert 0 < radius - v / rate < v / rate * 0.45**4 / 100
+
+
+def test_no_turns_of_a_vehicle_in_a_disk_better_the_circles():
+    known = Simulated("DubinsDisk")
+    radius = circle_radius(0.8, math.pi, 0.05)
+    x = RNG.uniform((-1, -1, -math.pi), (1, 1, math.pi), (4000, 3)).T
+
+    def outwards(x):
+        return x[0] * np.cos(x[2]) + x[1] * np.sin(x[2]) > 0.0
+
+    def reach(x):
+        sides = [
+            np.hypot(x[0] - s * radius * np.sin(x[2]), x[1] + s * radius * np.cos(x[2]))
+            for s in (1, -1)
+        ]
+        return np.minimum(*sides) + radius
+
+    x = x[:, (np.hypot(x[0], x[1]) < 1.0) & outwards(x) & (reach(x) > 1.002)]
+    # Each of 3^6 sequences of left, straight and right, of two periods each.
+    rates = np.array(list(itertools.product((-math.pi, 0.0, math.pi), repeat=6))).T
+    x = np.repeat(x[:, :40], rates.shape[1], axis=1)
+    rates = np.tile(rates, 40)
+    inside, turned = np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1], dtype=bool)
+    for period in range(12):
+        x = np.stack(known.step.step(tuple(x), (rates[period // 2],), ()))
+        inside &= np.hypot(x[0], x[1]) <= 1.0
+        turned |= inside & ~outwards(x)
+    assert not turned.any()
+
+
+def test_the_laws_of_a_vehicle_in_a_disk_reach_nearly_all_of_the_kernel():
+    known = Simulated("DubinsDisk")
+    x = RNG.uniform((-1, -1, -math.pi), (1, 1, math.pi), (20000, 3)).T
+    x = x[:, np.hypot(x[0], x[1]) <= 1.0]
+    outwards = x[0] * np.cos(x[2]) + x[1] * np.sin(x[2])
+    kept, fits = np.zeros(x.shape[1], dtype=bool), np.zeros(x.shape[1], dtype=bool)
+    for law in known.laws.laws:
+        smallest, after = known.stays(law, x, round(known.laws.horizon / 0.05))
+        kept |= (smallest >= 0) & (known.terminal(law, after) >= -1e-9)
+        fits |= known.terminal(law, x) >= 0
+    kernel = fits | (outwards <= 0)
+    assert not (kept & ~kernel & (outwards > 0.05)).any()
+    assert kept[kernel].mean() > 0.99
+
+
+def stopping_distance(v, lead, force):
+    """Return the distance that full braking with drag takes from v to the speed of the lead."""
+    drag = lambda s: 0.1 + 5.0 * s + 0.25 * s**2  # noqa: E731
+    return quad(lambda s: (s - lead) * 1650.0 / (force + drag(s)), lead, v)[0]
+
+
+def test_braking_reaches_the_exact_kernel_of_a_car():
+    known = Simulated("ACCGap", noise=0.0)
+    (law,) = known.laws.laws
+    force = known.problem.box[0][1]
+    speeds = np.linspace(21.0, 50.0, 15)
+    exact = np.array([stopping_distance(v, 20.0, force) for v in speeds])
+    for excess, kept in ((1e-3, True), (-1e-3, False)):
+        x = np.stack([speeds, 10.0 + exact * (1 + excess)])
+        smallest, _ = known.stays(law, x, 1200)
+        assert ((smallest >= 0.0) == kept).all()
+
+
+def test_the_double_integrator_is_the_car_without_drag():
+    known = Simulated("ACCGap", noise=0.0, plant={"f_0": 0.0, "f_1": 0.0, "f_2": 0.0, "M": 1.0})
+    (law,) = known.laws.laws
+    u = known.problem.box[0][1]
+    gap, speed = sp.Symbol("z", real=True), sp.Symbol("v", real=True)
+    b = law.terminal.args if isinstance(law.terminal, sp.Min) else (law.terminal,)
+    expected = gap - 10 - sp.Max(0, speed - 20) ** 2 / (2 * u)
+    values = {gap: 30.0, speed: 25.0}
+    assert any(abs(float((e - expected).subs(values))) < 1e-9 for e in b)
+
+
+def test_numbers_that_allow_no_backup_leave_no_terminal_set():
+    for name, options in (
+        ("DubinsDisk", {"box": (-0.1, 0.1)}),
+        ("DubinsDisk", {"dt": 2.0}),
+        ("ACCGap", {"box": (0.0, 4000.0), "noise": 0.0}),
+        ("ACCGap", {"plant": {"v_f": 0.01}, "model": {"v_f": 0.01}, "noise": 0.0}),
+    ):
+        known = Simulated(name, **options)
+        x = RNG.uniform(-1, 1, (known.problem.plant.n, 500)) * 20
+        for law in known.laws.laws:
+            assert (known.terminal(law, x) < 0.0).all()
+
+
+def test_every_stated_backup_fits_its_plant_and_its_model():
+    for name in ("DubinsDisk", "ACC", "ACCGap", "QuadrotorLimits"):
+        problem = make_problem(f"safe_envs/{name}-v0")
+        for system in (problem.plant, problem.model):
+            for law in with_terminal_sets(problem, system).laws:
+                symbols = set().union(*(e.free_symbols for e in (*law.law, law.terminal)))
+                assert symbols <= set(problem.plant.states)
+        assert backup_of(problem) is not None
