@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.wrappers.learning.data.files import load
+from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 
 pytestmark = pytest.mark.slow
