@@ -161,7 +161,11 @@ def leaderboard_markdown(report: LeaderboardReport, pictures: Mapping[str, str])
             picture = f"\n\n![Return against violations on {name}]({pictures[env_id]})"
         heading = f"### {name}\n\nFilter: `{_filter(report, env_id)}`."
         parts.append(f"{heading}{picture}\n\n{_markdown(titles, rows)}")
-    reasons = [f"- {', '.join(envs)}: {reason}." for reason, envs in report.reasons().items()]
+    # What to do about it comes after the first sentence.
+    reasons = [
+        f"- {', '.join(envs)}: {reason.split('. ')[0]}."
+        for reason, envs in report.reasons().items()
+    ]
     if reasons:
         parts.append("### What is missing\n\n" + "\n".join(reasons))
     return "\n\n".join(parts)
