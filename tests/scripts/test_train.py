@@ -1,4 +1,4 @@
-"""`safe-envs train` and `safe-envs leaderboard` as a person types them."""
+"""`safe-envs train` as a person types it."""
 
 from __future__ import annotations
 
@@ -119,48 +119,6 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(
     assert "Traceback" not in err
     assert message in " ".join(err.split())
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
-    monkeypatch.setattr(
-        "safe_envs.agents.training.leaderboard._QUICK",
-        {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4},
-    )
-    arguments = (
-        "leaderboard",
-        "Scalar-v0",
-        "safe_envs/Scalar-v0",
-        "--quick",
-        "--episodes",
-        8,
-        "--out",
-        "board",
-    )
-    status, out, err = safe_envs_command(*arguments)
-    assert (status, err) == (0, "")
-    rows = strictly("board/results/Scalar-v0.json")["rows"]
-    assert [(row["policy"], row["filter"]) for row in rows] == [
-        ("nominal", "none"),
-        ("nominal", "scbf"),
-        ("ppo", "none"),
-        ("ppo", "scbf"),
-        ("ppo, filter in the loop", "scbf"),
-    ]
-    assert "Scalar-v0" in out
-    again = safe_envs_command(*arguments, "--markdown")
-    assert again[0] == 0
-    first, _, row = again[1].splitlines()
-    assert (
-        first
-        == "| env | filter | nominal | nominal + filter | ppo | ppo + filter | ppo, filter in the"
-        " loop | processor time |"
-    )
-    assert row.startswith("| Scalar | scbf | ")
-    assert strictly("board/results/Scalar-v0.json")["rows"] == rows
-    status, _, err = safe_envs_command(*arguments, "--seed", 1)
-    assert status == 2
-    assert "give another --out" in err
 
 
 def test_an_agent_under_a_limit_is_told_to_keep_it_or_not(safe_envs_command):
