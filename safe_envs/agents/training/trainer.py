@@ -257,6 +257,7 @@ class TrainingSession:
             seed=seed,
             knowledge=training.knowledge,
             bounds=False,
+            best=False,
             # Policies that cannot be compiled can be trained behind compiled envs.
             engine="numpy" if training.engine == "numpy" else "auto",
         )
