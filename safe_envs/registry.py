@@ -91,5 +91,9 @@ def make_problem(env_id: str, **options: Any) -> SafetyProblem:
         raise ConfigurationError(
             "max_episode_steps is not part of a problem; shorten its episodes by horizon"
         )
+    if options.get("terminate_on_violation"):
+        raise ConfigurationError(
+            "terminate_on_violation is not part of a problem; give it to gym.make or make_sb3_env"
+        )
     given = {name: value for name, value in options.items() if value is not None}
     return found.make_problem(**{**gym.spec(full_id(env_id)).kwargs, **given})

@@ -37,7 +37,7 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
     as float32, `state` the exact state. The keys of `info` are those of `safe_envs.envs.info`.
 
     The episode is terminated when the goal is reached or the state leaves the workspace, and
-    truncated after `horizon`. A violation does not end it.
+    truncated after `horizon`. A violation does not end it, unless that is asked for.
 
     Attributes:
         sent: the physical input that the last step was given.
@@ -50,6 +50,7 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
         render_mode: "rgb_array" for pictures by `render()`, "human" for a window that every step is
             drawn to, or None.
+        terminate_on_violation: whether the first step to an unsafe state terminates the episode.
 
     Raises:
         ConfigurationError: an argument is out of range.
@@ -66,6 +67,7 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         problem: SafetyProblem,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        terminate_on_violation: bool = False,
     ) -> None:
         self.viewer = open_viewer(problem, render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_a_second(problem)}
@@ -78,6 +80,7 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         self._scales = list(zip(center, half, strict=True))
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
+        self._ends_on_violation = terminate_on_violation
         self._spec: EnvSpec | None = None
         self._noise = NoiseStream(self._simulation.integrator.channels, self._limit)
         self._reader = StreamReader()
@@ -124,7 +127,9 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
             InvalidInputError: the state has another shape, is not finite, or outside the workspace.
             ResetNeeded: there is no episode yet.
         """
-        return _read_only(self.components)
+        found = np.array(self.components)
+        found.flags.writeable = False
+        return found
 
     @state.setter
     def state(self, given: Any) -> None:
@@ -291,10 +296,5 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         info = episode.count(barriers, h)
         if self._actuators is not None:
             info |= self._actuators.report()
-        return observation, reward, left or goal >= 0.0, info
-
-
-def _read_only(x: Sequence[float]) -> np.ndarray:
-    found = np.array(x)
-    found.flags.writeable = False
-    return found
+        unsafe = self._ends_on_violation and h < 0.0
+        return observation, reward, left or goal >= 0.0 or unsafe, info

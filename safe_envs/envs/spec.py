@@ -24,6 +24,7 @@ _NOT_OF_PROBLEMS = {
     "autoreset_mode",
     "engine",
     "render_mode",
+    "terminate_on_violation",
     *inspect.signature(registration.make).parameters,
     *inspect.signature(registration.make_vec).parameters,
 }

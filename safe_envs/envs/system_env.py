@@ -18,6 +18,7 @@ class SystemEnv(SafeEnv):
     Args:
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
         render_mode: "rgb_array", "human" or None; see `SafeEnv`.
+        terminate_on_violation: see `SafeEnv`.
         **options: fields of `safe_envs.problem.options.ProblemOptions`; arguments of the barrier
             may also be given by themselves.
 
@@ -38,9 +39,11 @@ class SystemEnv(SafeEnv):
         *,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
+        terminate_on_violation: bool = False,
         **options: Any,
     ) -> None:
-        super().__init__(type(self).make_problem(**options), max_episode_steps, render_mode)
+        problem = type(self).make_problem(**options)
+        super().__init__(problem, max_episode_steps, render_mode, terminate_on_violation)
 
     @classmethod
     def make_problem(cls, **options: Any) -> SafetyProblem:
@@ -57,6 +60,7 @@ class SystemVectorEnv(SafeVectorEnv):
         max_episode_steps: see `SafeVectorEnv`.
         render_mode: see `SafeVectorEnv`.
         engine: see `SafeVectorEnv`.
+        terminate_on_violation: see `SafeEnv`.
         **options: as for `SystemEnv`.
     """
 
@@ -69,7 +73,15 @@ class SystemVectorEnv(SafeVectorEnv):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         engine: str = "numpy",
+        terminate_on_violation: bool = False,
         **options: Any,
     ) -> None:
-        problem = self.env_class.make_problem(**options)
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode, engine)
+        super().__init__(
+            self.env_class.make_problem(**options),
+            num_envs,
+            autoreset_mode,
+            max_episode_steps,
+            render_mode,
+            engine,
+            terminate_on_violation,
+        )

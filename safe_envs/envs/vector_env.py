@@ -22,7 +22,6 @@ from safe_envs.envs.seeding import Seeds
 from safe_envs.envs.vector_interface import VectorInterface
 from safe_envs.errors import InvalidInputError, require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rendering.viewer import open_viewer
 
 _Stepper = ArrayBatch | CompiledBatch | BatchStepper
 
@@ -37,7 +36,6 @@ class SafeVectorEnv(VectorInterface):
 
     Attributes:
         engine: that was asked for.
-        viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
         problem: what to simulate.
@@ -51,6 +49,7 @@ class SafeVectorEnv(VectorInterface):
         engine: "numpy"; "compiled" for one function that Numba compiles, several times faster for
             small batches and up to twice for thousands of envs, with results that differ by
             rounding; or "auto" for that where it can be had.
+        terminate_on_violation: see `SafeEnv`.
 
     Raises:
         ConfigurationError: an argument is out of range, or Numba is missing.
@@ -64,11 +63,11 @@ class SafeVectorEnv(VectorInterface):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         engine: str = "numpy",
+        terminate_on_violation: bool = False,
     ) -> None:
         require_whole("num_envs", num_envs, 1)
-        self.viewer = open_viewer(problem, render_mode, num_envs)
-        self.render_mode = render_mode
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps)
+        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
+        self._ends_on_violation = terminate_on_violation
         self.episodes = Episodes(num_envs)
         self._reset_options = ResetOptions(problem, self._limit, num_envs)
         require_engine(engine)
@@ -226,25 +225,6 @@ class SafeVectorEnv(VectorInterface):
         batch = self._batch
         return compiled_or_none(self.engine, math.inf, lambda: batch.filtered(batch_filter))
 
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """Draw every env, with the trail of its episode and what a filter decided.
-
-        Returns:
-            For each env uint8 of shape (height, width, 3); None, with a warning, without a render
-            mode.
-
-        Raises:
-            gymnasium.error.DependencyNotInstalled: pygame is missing.
-            ResetNeeded: there is no state yet.
-        """
-        if self.viewer is None:
-            gym.logger.warn(
-                "render() draws nothing without a render mode; make the envs with"
-                ' render_mode="rgb_array"'
-            )
-            return None
-        return self.viewer.frames() if self.components else None
-
     def _points(self, requested: RequestedStart, mask: np.ndarray) -> StartingPoints:
         """Return where the envs of a mask begin."""
         states, streams = requested.states, self._streams
@@ -272,7 +252,11 @@ class SafeVectorEnv(VectorInterface):
     ) -> VectorStep:
         """Return what a step tells, with autoreset."""
         observation, reward, terminated, truncated, info = found
-        episodes, ended = self.episodes, terminated | truncated
+        episodes = self.episodes
+        if self._ends_on_violation:
+            # A step that begins an episode is none of it, wherever it begins.
+            terminated = terminated | (info["violation"] & ~episodes.begun)
+        ended = terminated | truncated
         last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):

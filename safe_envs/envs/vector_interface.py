@@ -19,7 +19,7 @@ from safe_envs.envs.spec import SystemSpec
 from safe_envs.errors import ConfigurationError
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second
+from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
 
 class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -27,12 +27,14 @@ class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.nda
 
     Attributes:
         problem: that is simulated.
+        viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
         problem: see above.
         num_envs: size of the batch.
         autoreset_mode: when ended episodes restart.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: "rgb_array" or None.
 
     Raises:
         ConfigurationError: an argument is out of range.
@@ -44,7 +46,10 @@ class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.nda
         num_envs: int,
         autoreset_mode: str | AutoresetMode,
         max_episode_steps: int | None,
+        render_mode: str | None,
     ) -> None:
+        self.viewer = open_viewer(problem, render_mode, num_envs)
+        self.render_mode = render_mode
         self._autoreset = _mode(autoreset_mode)
         self._limit = steps_until(problem, max_episode_steps)
         self._spec: EnvSpec | None = None
@@ -81,6 +86,30 @@ class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.nda
         """The seed of each env."""
         self._streams.seed([None] * self.num_envs)
         return tuple(self._streams.seeds)
+
+    @property
+    def components(self) -> Components:
+        """The exact states: for each state an array (num_envs,), not to be written to."""
+        raise NotImplementedError
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw every env, with the trail of its episode and what a filter decided.
+
+        Returns:
+            For each env uint8 of shape (height, width, 3); None, with a warning, without a render
+            mode.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ResetNeeded: there is no state yet.
+        """
+        if self.viewer is None:
+            gym.logger.warn(
+                "render() draws nothing without a render mode; make the envs with"
+                ' render_mode="rgb_array"'
+            )
+            return None
+        return self.viewer.frames() if self.components else None
 
     def physical_action(self, actions: Any) -> Components:
         """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""

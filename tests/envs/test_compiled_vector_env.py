@@ -90,6 +90,14 @@ def test_episodes_that_end_at_different_steps(condition, mode, plain):
     assert {0, 1, 5} & set(ends) >= {0, 1}
 
 
+@pytest.mark.parametrize("condition", [None, "scbf"])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_violations_that_end_episodes(condition, mode, plain):
+    envs = pair(SCALAR, condition, mode, 5, start=[0.95], noise=1.0, terminate_on_violation=True)
+    ends = assert_same_steps(envs, 40)
+    assert sum(ends) > 5
+
+
 def test_disabled_autoreset_and_masked_resets(plain):
     envs = pair(DUBINS, "scbf", "Disabled", 4, horizon=0.2)
     assert_same_steps(envs, 4)

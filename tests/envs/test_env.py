@@ -94,6 +94,25 @@ def test_an_episode_lasts_for_the_horizon():
     ]
 
 
+def test_a_violation_ends_the_episode_where_that_is_asked_for():
+    env = gym.make("safe_envs/Scalar-v0", start=[0.5], noise=0.0, terminate_on_violation=True)
+    env.reset(seed=0)
+    ends = []
+    while not any(ends[-1:]):
+        _, _, terminated, truncated, info = env.step(np.ones(1, dtype=np.float32))
+        ends.append(terminated)
+        assert info["violation"] == terminated
+        assert not truncated
+    assert len(ends) > 2
+    assert info["episode_cost"] == info["cost"] == 1.0
+    # An unsafe start ends nothing: only steps do.
+    _, info = env.reset(options={"state": [1.5]})
+    assert info["violation"]
+    _, _, terminated, _, info = env.step(np.ones(1, dtype=np.float32))
+    assert terminated
+    assert info["episode_cost"] == 2.0
+
+
 def test_violation_costs_and_does_not_end_the_episode():
     env = gym.make("safe_envs/Scalar-v0", start=[0.999], noise=0.0)
     _, info = env.reset(seed=0)

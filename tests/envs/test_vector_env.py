@@ -107,6 +107,28 @@ def test_equals_sync_vector_env_when_episodes_end_at_different_steps():
 
 
 @pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize("start", [[0.9], [1.1]])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_equals_sync_vector_env_when_violations_end_episodes(mode, start, filtered):
+    # Reset does not end an episode, wherever it begins.
+    ours, theirs = pair(
+        "safe_envs/Scalar-v0", mode, filtered, start=start, noise=1.0, terminate_on_violation=True
+    )
+    assert_same(*[e.reset(seed=3)[0] for e in (ours, theirs)], "reset")
+    ends = 0
+    for step in range(60):
+        actions = np.linspace(0.2, 1.0, NUM_ENVS, dtype=np.float32)[:, None]
+        *mine, my_info = ours.step(actions)
+        *other, other_info = theirs.step(actions)
+        for a, b in zip(mine, other, strict=True):
+            assert_same(a, b, f"step {step}")
+        assert_same(only_where_present(my_info), only_where_present(other_info), f"step {step}")
+        ends += mine[2].sum()
+    # Behind the filter there are fewer.
+    assert ends >= NUM_ENVS
+
+
+@pytest.mark.parametrize("filtered", [False, True])
 def test_disabled_autoreset_waits_for_a_masked_reset(filtered):
     ours, theirs = pair(
         "safe_envs/StochasticDubins-v0", AutoresetMode.DISABLED, filtered, horizon=0.5

@@ -97,6 +97,32 @@ def test_equals_dummy_vec_env_when_episodes_end_at_different_steps():
     assert any(dones.any() and not dones.all() for dones, _ in shown)
 
 
+@pytest.mark.parametrize("filter_text", [None, "scbf"])
+def test_equals_dummy_vec_env_when_violations_end_episodes(filter_text):
+    ours, theirs = pair(
+        "safe_envs/Scalar-v0",
+        filter_text,
+        start=[0.8],
+        noise=1.0,
+        horizon=0.1,
+        terminate_on_violation=True,
+    )
+    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
+    ends = [
+        (info["TimeLimit.truncated"], info["violation"], info["cost"])
+        for dones, infos in shown
+        for done, info in zip(dones, infos, strict=True)
+        if done
+    ]
+    assert {(True, False, 0.0), (False, True, 1.0)} == set(ends)
+    assert not any(
+        info["violation"]
+        for dones, infos in shown
+        for done, info in zip(dones, infos, strict=True)
+        if not done
+    )
+
+
 def test_an_end_in_the_last_control_period_is_no_truncation():
     dt = problem_of(DUBINS).dt
     ours, theirs = pair(DUBINS, None, start=[6.0, 0.0, 0.0], noise=0.0, horizon=dt)

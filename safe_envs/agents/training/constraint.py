@@ -1,0 +1,179 @@
+"""A limit on the expected cost of an episode, with the multiplier that enforces it in training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.training.multiplier import PIDMultiplier, require_at_least_zero
+from safe_envs.errors import ConfigurationError, shown
+
+_COUNTS = ("running", "ended", "cost", "violated")
+
+
+class EpisodeConstraint:
+    """The constraint E[sum of the costs of an episode] <= limit, undiscounted.
+
+    Where an episode ends at its first violation, with cost 1, the expected cost is the probability
+    of any violation. Elsewhere it is the expected number of unsafe steps, and `violation_rate` is
+    only reported.
+
+    The cost is measured as the mean over the episodes that ended since the last measurement, once
+    every env has ended one: the first episodes to end are those that a violation has cut short, so
+    that a mean over these alone would be too high. Until then the last measurement stays, and the
+    multiplier with it.
+
+    The multiplier sees the excess in units of max(limit, unit), and at most 1 of them, so that the
+    same gains serve any limit, and the many unsafe steps of an untrained policy do not wind it up.
+
+    Attributes:
+        limit: see above.
+        multiplier: that each measurement moves.
+        episode_cost: mean cost of an episode at the last measurement; None before the first.
+        violation_rate: share of its episodes with any cost; None before the first.
+
+    Args:
+        limit: see above.
+        num_envs: copies of the env.
+        unit: of the excess, positive.
+        gains: of the multiplier, see `PIDMultiplier`: kp, ki, kd, smoothing and most.
+
+    Raises:
+        ConfigurationError: a number is out of range.
+    """
+
+    def __init__(
+        self, limit: float, num_envs: int, *, unit: float = 1.0, gains: Mapping[str, float]
+    ) -> None:
+        require_at_least_zero("the limit of the cost", limit)
+        require_at_least_zero("the unit of the cost", unit)
+        self._unit = max(float(limit), float(unit))
+        if self._unit == 0.0:
+            raise ConfigurationError("the unit of the cost is 0; give a positive number")
+        self.limit = float(limit)
+        self.multiplier = PIDMultiplier(self.limit / self._unit, **gains)
+        self.episode_cost: float | None = None
+        self.violation_rate: float | None = None
+        # Of the episodes that go on, and of those that ended since the last measurement.
+        self._running, self._cost, self._violated = (np.zeros(num_envs) for _ in range(3))
+        self._ended = np.zeros(num_envs, dtype=np.int64)
+
+    @property
+    def value(self) -> float:
+        """The multiplier, from 0."""
+        return self.multiplier.value
+
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        """Count a step of every env.
+
+        Args:
+            costs: of the step, shape (num_envs,).
+            dones: whether the episode ended with it, shape (num_envs,).
+        """
+        self._running += costs
+        if dones.any():
+            ended = np.where(dones, self._running, 0.0)
+            self._cost += ended
+            self._violated += ended > 0.0
+            self._ended += dones
+            self._running[dones] = 0.0
+
+    def update(self) -> bool:
+        """Move the multiplier if the episodes since the last measurement are enough for one.
+
+        Returns:
+            Whether they are.
+        """
+        if not self._ended.all():
+            return False
+        episodes = self._ended.sum()
+        self.episode_cost = float(self._cost.sum() / episodes)
+        self.violation_rate = float(self._violated.sum() / episodes)
+        for counts in (self._cost, self._violated, self._ended):
+            counts[:] = 0
+        excess = (self.episode_cost - self.limit) / self._unit
+        self.multiplier.update(self.multiplier.limit + min(excess, 1.0))
+        return True
+
+    def begin_episodes(self) -> None:
+        """Forget the episodes that go on: the envs were reset."""
+        self._running[:] = 0.0
+
+    def figures(self) -> dict[str, float]:
+        """Return what is logged, by name; the measured costs once there are some."""
+        found = {"multiplier": self.value, "limit": self.limit}
+        found |= {"multiplier_saturated": float(self.multiplier.saturated)}
+        if self.episode_cost is not None and self.violation_rate is not None:
+            found |= {"episode_cost": self.episode_cost, "violation_rate": self.violation_rate}
+        return found
+
+    def state(self) -> dict[str, Any]:
+        """Return all that changes, JSON-able."""
+        return {
+            "multiplier": self.multiplier.state(),
+            "measured": [self.episode_cost, self.violation_rate],
+            **{name: getattr(self, f"_{name}").tolist() for name in _COUNTS},
+        }
+
+    def restore(self, state: Any) -> None:
+        """Go on from the `state` of a constraint with the same arguments.
+
+        Raises:
+            ValueError: it is not such a state.
+        """
+        if not isinstance(state, Mapping) or set(state) != {"multiplier", "measured", *_COUNTS}:
+            raise ValueError(f"the state of the constraint is {shown(state)}")
+        measured = state["measured"]
+        if measured != [None, None]:
+            _require_numbers("measured", measured, 2, float)
+        for name in _COUNTS:
+            counts = getattr(self, f"_{name}")
+            _require_numbers(name, state[name], len(counts), type(counts[0].item()))
+        self.multiplier.restore(state["multiplier"])
+        self.episode_cost, self.violation_rate = measured
+        for name in _COUNTS:
+            getattr(self, f"_{name}")[:] = state[name]
+
+
+def costs_of(infos: Sequence[Any]) -> np.ndarray:
+    """Return the cost of each env's last step, float64 of shape (num_envs,).
+
+    Args:
+        infos: with the entry "cost"; infos of a `SafeVecEnv` are read at once.
+
+    Raises:
+        ConfigurationError: an info has no cost, or one that is negative or not finite.
+    """
+    batch = getattr(infos[0], "batch", None)
+    if batch is not None and all(getattr(info, "batch", None) is batch for info in infos):
+        costs = batch.get("cost")
+        costs = None if costs is None else costs[[info.index for info in infos]]
+    else:
+        each = [info.get("cost") for info in infos]
+        costs = None if any(cost is None for cost in each) else each
+    if costs is None:
+        raise ConfigurationError(
+            "the infos have no entry 'cost', on which a constrained algorithm learns; give an env"
+            " that reports one, or wrap it so that it does"
+        )
+    costs = np.asarray(costs, dtype=np.float64)
+    if not ((costs >= 0.0) & np.isfinite(costs)).all():
+        raise ConfigurationError(
+            f"info['cost'] = {shown(costs.tolist())}; costs are numbers from 0"
+        )
+    return costs
+
+
+def _require_numbers(name: str, given: Any, count: int, kind: type) -> None:
+    """Raise ValueError unless a list has so many finite numbers from 0 of one type."""
+    if (
+        not isinstance(given, list)
+        or len(given) != count
+        or not all(
+            type(number) is kind and math.isfinite(number) and number >= 0 for number in given
+        )
+    ):
+        raise ValueError(f"the constraint's {name} is {shown(given)}")

@@ -1,0 +1,182 @@
+"""PPO under a limit on the expected cost of an episode."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+
+from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of
+from safe_envs.agents.training.cost_critic import CostCritic
+from safe_envs.errors import ConfigurationError
+
+_LEAST_SPREAD = 1e-6
+
+
+class PPOLagrangian(PPO):
+    """PPO with a critic of the costs, and a Lagrange multiplier l that a PID controller moves.
+
+    The policy learns on the advantage (A_r - l s A_c)/(1 + l), where s is the ratio of the standard
+    deviations of the advantages A_r of rewards and A_c of costs in the rollout: so the same gains
+    serve rewards and costs of any unit. With l = 0 it is PPO, bit for bit.
+
+    The costs are `info["cost"]`, of any env; a `SafeVecEnv` gives those of a step at once. Like the
+    rewards, the costs of an episode that only time ended are continued by the critic's value. The
+    constraint is on the undiscounted cost of whole episodes, see `EpisodeConstraint`; its discount
+    is for the advantages alone.
+
+    Sources: Ray, Achiam, Amodei, "Benchmarking Safe Exploration in Deep Reinforcement Learning",
+        2019, on PPO-Lagrangian; Stooke, Achiam, Abbeel, "Responsive Safety in Reinforcement
+        Learning by PID Lagrangian Methods", 2020, arXiv:2007.03964, on the multiplier and the
+        factor 1/(1 + l), which keeps the size of the steps.
+
+    Attributes:
+        constraint: the limit, the multiplier and what was measured.
+        cost_critic: see `CostCritic`.
+
+    Args:
+        *args: those of PPO.
+        cost_limit: greatest expected cost of an episode.
+        cost_unit: unit of the excess that the multiplier sees, see `EpisodeConstraint`.
+        cost_gamma: discount of the costs.
+        cost_gae_lambda: trade-off of bias and variance of their advantages.
+        multiplier_kp: proportional gain of the multiplier, see `PIDMultiplier`.
+        multiplier_ki: integral gain.
+        multiplier_kd: derivative gain.
+        multiplier_smoothing: of the measured costs.
+        multiplier_most: greatest multiplier.
+        **kwargs: those of PPO.
+
+    Raises:
+        ConfigurationError: an argument is out of range, or the env has observations of several
+            parts.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        cost_limit: float = 0.0,
+        cost_unit: float = 1.0,
+        cost_gamma: float = 0.99,
+        cost_gae_lambda: float = 0.95,
+        multiplier_kp: float = 1.0,
+        multiplier_ki: float = 0.5,
+        multiplier_kd: float = 1.0,
+        multiplier_smoothing: float = 0.0,
+        multiplier_most: float = 100.0,
+        **kwargs: Any,
+    ) -> None:
+        for name, number in {"cost_gamma": cost_gamma, "cost_gae_lambda": cost_gae_lambda}.items():
+            if not 0.0 <= number <= 1.0:
+                raise ConfigurationError(f"{name} = {number!r}; give a number from 0 to 1")
+        self.cost_limit, self.cost_unit = cost_limit, cost_unit
+        self.cost_gamma, self.cost_gae_lambda = cost_gamma, cost_gae_lambda
+        self.multiplier_gains = {
+            "kp": multiplier_kp,
+            "ki": multiplier_ki,
+            "kd": multiplier_kd,
+            "smoothing": multiplier_smoothing,
+            "most": multiplier_most,
+        }
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ConfigurationError(
+                "the observations have several parts; flatten them, as with"
+                " gymnasium.wrappers.FlattenObservation"
+            )
+        known: EpisodeConstraint | None = vars(self).get("constraint")
+        self.constraint = EpisodeConstraint(
+            self.cost_limit, self.n_envs, unit=self.cost_unit, gains=self.multiplier_gains
+        )
+        if known is not None:  # of a file that is being loaded
+            self.constraint.multiplier.restore(known.multiplier.state())
+        seed = np.random.SeedSequence().entropy if self.seed is None else self.seed
+        self.cost_critic = CostCritic(self.policy, self.lr_schedule(1.0), seed)
+        self._costs = RolloutBuffer(
+            self.n_steps,
+            self.observation_space,
+            self.action_space,
+            gamma=self.cost_gamma,
+            gae_lambda=self.cost_gae_lambda,
+            n_envs=self.n_envs,
+        )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: Any = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+    ) -> Any:
+        if reset_num_timesteps or self._last_obs is None:
+            self.constraint.begin_episodes()
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
+        """Take the costs of a step, for whose place Stable-Baselines3 has no other method."""
+        super()._update_info_buffer(infos, dones)
+        costs = costs_of(infos)
+        self.constraint.observe(costs, dones)
+        cut = [
+            i
+            for i in np.flatnonzero(dones)
+            if infos[i].get("TimeLimit.truncated", False)
+            and infos[i].get("terminal_observation") is not None
+        ]
+        if cut:
+            ends = np.stack([infos[i]["terminal_observation"] for i in cut])
+            costs[cut] += self.cost_gamma * self.cost_critic.values(ends)
+        self._costs.rewards[self.rollout_buffer.pos] = costs
+
+    def train(self) -> None:
+        """Update the multiplier, the policy on the weighted advantages, and the critics."""
+        rollout, costs = self.rollout_buffer, self._costs
+        # `get` flattens the rollout's arrays in another order.
+        observations, costs.episode_starts = rollout.observations, rollout.episode_starts
+        self._estimate_costs(observations)
+        self.constraint.update()
+        rollout.advantages = self._weighted(rollout.advantages, costs.advantages)
+        super().train()
+        self._update_learning_rate(self.cost_critic.optimizer)
+        clip_range: Any = self.clip_range_vf
+        found = self.cost_critic.fit(
+            observations,
+            costs,
+            steps=self.num_timesteps,
+            epochs=self.n_epochs,
+            batch_size=self.batch_size,
+            clip_range=clip_range and clip_range(self._current_progress_remaining),
+            max_grad_norm=self.max_grad_norm,
+        )
+        for name, value in found.items():
+            self.logger.record(f"train/{name}", value)
+        for name, value in self.constraint.figures().items():
+            self.logger.record(f"constraint/{name}", value)
+
+    def _estimate_costs(self, observations: np.ndarray) -> None:
+        """Fill in the values, returns and advantages of the costs of the rollout."""
+        critic, costs = self.cost_critic, self._costs
+        rows = observations.reshape(-1, *observations.shape[2:])
+        costs.values = critic.values(rows).reshape(costs.rewards.shape)
+        last: Any = self._last_obs
+        dones: Any = self._last_episode_starts
+        costs.compute_returns_and_advantage(critic(critic._tensor(last)).detach(), dones)
+
+    def _weighted(self, rewards: np.ndarray, costs: np.ndarray) -> np.ndarray:
+        """Return the advantages that the policy learns on, float32 of the arguments' shape."""
+        weight = self.constraint.value
+        scale = rewards.std() / max(costs.std(), _LEAST_SPREAD)
+        return ((rewards - weight * scale * costs) / (1.0 + weight)).astype(np.float32)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_costs"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        states, variables = super()._get_torch_save_params()
+        return [*states, "cost_critic", "cost_critic.optimizer"], variables
