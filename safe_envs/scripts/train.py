@@ -80,6 +80,17 @@ def train(
             help="Taken from the reward for each unit by which the filter moves the action.",
         ),
     ] = 0.0,
+    promise_curriculum: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="p of the promise filter to begin with; it rises to that of --filter.",
+        ),
+    ] = None,
+    curriculum_part: Annotated[
+        float,
+        typer.Option(metavar="X", help="Part of the training over which p rises."),
+    ] = 0.5,
     knowledge: text_options.Knowledge = "model",
     eval_freq: Annotated[
         int | None,
@@ -131,6 +142,8 @@ def train(
         seed=seed,
         action=action,
         intervention_penalty=intervention_penalty,
+        promise_curriculum=promise_curriculum,
+        curriculum_part=curriculum_part,
         eval_freq=eval_freq,
         eval_episodes=eval_episodes,
         threads=threads,

@@ -14,6 +14,7 @@ from safe_envs.agents.training.hyperparameters import (
     hyperparameters,
     whole_batches,
 )
+from safe_envs.agents.training.promise_curriculum import PromiseCurriculum
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.registry import full_id
@@ -51,6 +52,10 @@ class Training:
         action: on which an off-policy algorithm learns; see
             `safe_envs.agents.training.replay_buffer`.
         intervention_penalty: see `safe_envs.agents.training.vec_env.make_sb3_env`.
+        promise_curriculum: p of a promise filter with which the training begins, and which rises to
+            that of the filter; None for the filter's from the beginning. See
+            `safe_envs.agents.training.promise_curriculum`.
+        curriculum_part: of the training, over which it rises.
         eval_episodes: of each evaluation.
         threads: of torch and BLAS. Small networks are many times slower on several threads of a
             busy machine.
@@ -73,6 +78,8 @@ class Training:
     seed: int = 0
     action: str = ACTIONS[0]
     intervention_penalty: float = 0.0
+    promise_curriculum: float | None = None
+    curriculum_part: float = 0.5
     eval_episodes: int = 200
     threads: int = 1
     engine: str = "auto"
@@ -101,6 +108,15 @@ class Training:
                 "an intervention penalty is of the proposed action, and the executed one, on which"
                 " is learned, has none; give --action both or proposed too, or no penalty"
             )
+
+        self.curriculum  # noqa: B018  (which refuses what is out of range)
+
+    @property
+    def curriculum(self) -> PromiseCurriculum | None:
+        """The curriculum on p of the promise filter; None without one."""
+        return PromiseCurriculum.of(
+            self.promise_curriculum, self.curriculum_part, self.filter, self.n_timesteps
+        )
 
     @property
     def learns_on_executed(self) -> bool:

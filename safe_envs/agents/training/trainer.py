@@ -37,6 +37,7 @@ from safe_envs.agents.training.checkpoints import (
 )
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.hyperparameters import OFF_POLICY
+from safe_envs.agents.training.promise_curriculum import CurriculumCallback
 from safe_envs.agents.training.run_folder import (
     BEST,
     EVALUATIONS,
@@ -210,16 +211,22 @@ class TrainingSession:
             progress(min(model.num_timesteps / training.n_timesteps, 1.0))
             return True  # anything else would end the training
 
+        callbacks = [self._figures, ConvertCallback(note)]
+
         # Schedules refer to the whole training, not to its part.
         of_part = model._update_current_progress_remaining
         model._update_current_progress_remaining = lambda done, _: of_part(
             done, training.n_timesteps
         )
+        if training.curriculum is not None:
+            # Before the first reset of a training: its episodes begin there.
+            training.curriculum.ask(model.get_env(), model.num_timesteps)
+            callbacks.append(CurriculumCallback(training.curriculum))
         began = time.process_time()
         try:
             model.learn(
                 end - model.num_timesteps,
-                CallbackList([self._figures, ConvertCallback(note)]),
+                CallbackList(callbacks),
                 log_interval=4 if training.algorithm in OFF_POLICY else 1,
                 reset_num_timesteps=False,
             )
