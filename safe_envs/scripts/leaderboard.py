@@ -1,14 +1,15 @@
-"""`safe-envs leaderboard`: agents on every env, unfiltered and filtered, with what they cost."""
+"""`safe-envs leaderboard`: agents over several seeds, with and without filters, and their cost."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from safe_envs import ENV_IDS
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
@@ -20,18 +21,31 @@ from safe_envs.scripts.options.console import (
     write_result,
 )
 
+if TYPE_CHECKING:
+    from safe_envs.scripts.reports.leaderboard_report import LeaderboardReport
+
+FEW = ("safe_envs/Pendulum-v0", "safe_envs/StochasticDubins-v0", "safe_envs/QuadrotorLimits-v0")
+"""The envs of a leaderboard for which none is named: noise, noise and turns, several limits."""
+
+_QUICK_SEEDS, _SEEDS = 2, 5
+
 
 def leaderboard(
     env_ids: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ENV_ID]...", help="Envs; by default all.", autocompletion=completion.env_ids
+            metavar="[ENV_ID]...",
+            help=f"Envs; by default {', '.join(FEW)}.",
+            autocompletion=completion.env_ids,
         ),
     ] = None,
+    all_envs: Annotated[bool, typer.Option("--all", help="Every env.")] = False,
     algo: Annotated[
         str,
         typer.Option(
-            metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3."
+            metavar="NAME",
+            autocompletion=completion.algorithms,
+            help="ppo, a2c, sac, td3, ppo-lag or sac-lag.",
         ),
     ] = "ppo",
     out: Annotated[
@@ -41,72 +55,173 @@ def leaderboard(
             help="Where agents and results go. What is in it already is not done again.",
         ),
     ] = Path("leaderboard"),
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, help="Trainings of each variant; by default 5, or 2 with --quick."),
+    ] = None,
     episodes: Annotated[
         int | None,
         typer.Option(
             min=1, help="Episodes of each evaluation; by default 1000, or 100 with --quick."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="From which all seeds are derived.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes of this machine.")] = 2,
     quick: Annotated[
         bool,
         typer.Option(
             "--quick", help="Train for moments only: to see that it works, not how good agents get."
         ),
     ] = False,
-    markdown: Annotated[
-        bool,
-        typer.Option("--markdown", help="Print the table as Markdown, with a row for each env."),
-    ] = False,
     best: Annotated[
         bool,
         typer.Option(
             "--best",
             help=(
-                "Compute the best attainable safety of each env; without it the table has it where"
-                " that is in the cache."
+                "Compute the best attainable safety of each env, and the largest return at each"
+                " chance of a violation; without it those are shown that were computed before."
             ),
         ),
     ] = False,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Draw return against violations of each env, as DIR/ENV.png."
+        ),
+    ] = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print Markdown, with links to the pictures.")
+    ] = False,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the Markdown into a page, between its lines <!-- leaderboard --> and"
+            " <!-- end of leaderboard -->.",
+        ),
+    ] = None,
     json_file: Json = None,
 ) -> None:
-    """Train agents on each env, without and with its filter, and compare them with its controller.
+    """Train agents on envs, with and without filters, and compare safety, return and cost.
 
-    Each policy is evaluated without and with the filter, which knows the plant; the agent that was
-    trained with it only so. The table has the safety rates with their 95 % intervals, the
-    returns, and the processor time of the training. The intervals are of the episodes: there is one
-    training of each kind, and another seed gives another agent.
+    Each variant is trained with several seeds. The tables have the interquartile mean over seeds
+    with its bootstrap interval, the interval over the episodes of these agents, unsafe steps in the
+    training and the processor time of one. Variants are: the nominal controller, the agent, the
+    agent with a limit on violations in training, the agent under the env's filter, one trained
+    behind it, the agent under a promise filter, and one trained behind a backup, where envs have
+    such filters. All filters know the plant.
     """
+    from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.fingerprint import package_versions
-    from safe_envs.agents.training.leaderboard import (
-        LeaderboardOptions,
-        attainable_of,
-        leaderboard_rows,
-    )
-    from safe_envs.registry import full_id
+    from safe_envs.agents.training.leaderboard import board, require_no_older
+    from safe_envs.agents.training.study import run_study
+    from safe_envs.scripts.reports.leaderboard_page import put_into
     from safe_envs.scripts.reports.leaderboard_report import (
         leaderboard_markdown,
         leaderboard_notes,
-        leaderboard_table,
+        leaderboard_tables,
     )
 
     require_result(json_file)
-    ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))
-    options = LeaderboardOptions(algo, seed, quick, episodes or (100 if quick else 1000))
+    if all_envs and env_ids:
+        raise ConfigurationError(
+            f"--all and {', '.join(env_ids)} are given; leave one of the two out"
+        )
+    study = board(
+        ENV_IDS if all_envs else env_ids or FEW,
+        algo=algo,
+        seeds=seeds or (_QUICK_SEEDS if quick else _SEEDS),
+        seed=seed,
+        episodes=episodes or (100 if quick else 1000),
+        quick=quick,
+    )
+    require_no_older(out)
+    if page is not None:
+        put_into(page, None)
     with progress_bar("Leaderboard") as tell:
-        rows = leaderboard_rows(ids, options, out, tell or (lambda _: None))
-    with progress_bar("Best attainable safety") as tell:
-        found = attainable_of(ids, best, tell or (lambda _: None))
+        found = run_study(
+            study,
+            out,
+            Backend(jobs=jobs),
+            tell or (lambda _: None),
+            lambda text: print(text, file=sys.stderr, flush=True),
+        )
+    report = _report(found, out, best)
+    if pictures is not None:
+        _draw(report, pictures)
+    written = leaderboard_markdown(report, _links(report, pictures, page))
+    if page is not None:
+        put_into(page, written)
     if markdown:
-        say(stdout(), leaderboard_markdown(rows, found))
+        say(stdout(), written)
     else:
-        stdout().print(leaderboard_table(rows, found))
-    for note in leaderboard_notes(found):
-        say(stdout(), f"Note: {note}")
-    document = {"settings": asdict(options), "versions": package_versions()}
-    known = {key: each if isinstance(each, str) else each.as_dict() for key, each in found.items()}
-    document |= {"rows": [asdict(row) for row in rows], "best": known}
-    write_result(json_file, lambda: document)
+        for heading, table in leaderboard_tables(report):
+            say(stdout(), f"\n{heading}")
+            stdout().print(table)
+        for note in leaderboard_notes(report):
+            say(stdout(), f"Note: {note}")
+    settings = {"algo": algo, "seeds": study.seeds, "seed": seed, "episodes": study.episodes}
+    settings |= {"quick": quick, "knowledge": study.knowledge}
+    document = {"settings": settings, "versions": package_versions()}
+    write_result(json_file, lambda: document | report.document())
+
+
+def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
+    """Return the statistics of a study, with what is known of what could be had."""
+    from safe_envs.agents.training.leaderboard import (
+        attainable_of,
+        entry_of,
+        frontiers_of,
+        safety_over_envs,
+    )
+    from safe_envs.scripts.reports.leaderboard_report import LeaderboardReport
+
+    study = found.study
+    entries = [
+        entry_of(found, e, variant.name) for e in study.env_ids for variant in study.variants
+    ]
+    with progress_bar("Best attainable safety") as tell:
+        known = attainable_of(study.env_ids, best, tell or (lambda _: None))
+    with progress_bar("Largest returns") as tell:
+        frontiers = frontiers_of(study.env_ids, out, best, tell or (lambda _: None))
+    return LeaderboardReport(
+        found,
+        tuple(entry for entry in entries if entry is not None),
+        safety_over_envs(found),
+        known,
+        frontiers,
+    )
+
+
+def _draw(report: LeaderboardReport, folder: Path) -> None:
+    """Draw a picture for each env that has agents."""
+    from safe_envs.agents.jobs.store import make_folder
+    from safe_envs.scripts.figures.leaderboard_figure import draw
+    from safe_envs.scripts.reports.leaderboard_report import short_name
+
+    make_folder(folder)
+    study = report.found.study
+    variants = [variant.name for variant in study.variants]
+    for env_id in study.env_ids:
+        rows = [row for row in report.found.rows if row.env_id == env_id]
+        path = folder / f"{short_name(env_id)}.png"
+        if rows:
+            frontier = report.frontiers.get(env_id)
+            draw(short_name(env_id), report.of(env_id), rows, frontier, variants, path)
+
+
+def _links(report: LeaderboardReport, folder: Path | None, page: Path | None) -> dict[str, str]:
+    """Return links to the pictures, as they are written in a page."""
+    from safe_envs.scripts.reports.leaderboard_page import link_from
+    from safe_envs.scripts.reports.leaderboard_report import short_name
+
+    if folder is None:
+        return {}
+    return {
+        env_id: link_from(page, folder / f"{short_name(env_id)}.png")
+        for env_id in report.found.study.env_ids
+        if report.of(env_id)
+    }
 
 
 if __name__ == "__main__":

@@ -23,7 +23,9 @@ def train(
     algo: Annotated[
         str,
         typer.Option(
-            metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3."
+            metavar="NAME",
+            autocompletion=completion.algorithms,
+            help="ppo, a2c, sac, td3, ppo-lag or sac-lag.",
         ),
     ],
     out: Annotated[
@@ -91,6 +93,23 @@ def train(
         float,
         typer.Option(metavar="X", help="Part of the training over which p rises."),
     ] = 0.5,
+    cost_limit: Annotated[
+        float | None,
+        typer.Option(
+            metavar="X",
+            help="For ppo-lag and sac-lag: greatest mean number of unsafe steps of an episode.",
+        ),
+    ] = None,
+    violation_limit: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help=(
+                "In its place: greatest probability of any unsafe step of an episode, 0.01 by"
+                " default. The episodes of the training end at the first one."
+            ),
+        ),
+    ] = None,
     knowledge: text_options.Knowledge = "model",
     eval_freq: Annotated[
         int | None,
@@ -144,6 +163,8 @@ def train(
         intervention_penalty=intervention_penalty,
         promise_curriculum=promise_curriculum,
         curriculum_part=curriculum_part,
+        cost_limit=cost_limit,
+        violation_limit=violation_limit,
         eval_freq=eval_freq,
         eval_episodes=eval_episodes,
         threads=threads,

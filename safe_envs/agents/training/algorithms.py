@@ -23,13 +23,27 @@ if TYPE_CHECKING:
 MOST_SHOWN = 1000
 """Characters of hyperparameters, or of errors about them, at most, that a message repeats."""
 
+_GIVEN = ("self", "env", "seed", "device", "_init_setup_model")
+_OF_THE_LIMIT = ("cost_limit", "cost_unit")
 _OF_THE_ENV = ("normalize",)
 _OF_THE_NOISE = ("noise_type", "noise_std")
 _OF_THE_BUFFER = ("replay_buffer_class", "replay_buffer_kwargs")
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Return the class of "ppo", "a2c", "sac" or "td3"."""
+    """Return the class of an algorithm.
+
+    Args:
+        name: one of `safe_envs.agents.training.hyperparameters.ALGORITHMS`.
+    """
+    if name == "ppo-lag":
+        from safe_envs.agents.training.ppo_lagrangian import PPOLagrangian
+
+        return PPOLagrangian
+    if name == "sac-lag":
+        from safe_envs.agents.training.sac_lagrangian import SACLagrangian
+
+        return SACLagrangian
     import stable_baselines3
 
     return getattr(stable_baselines3, name.upper())
@@ -42,6 +56,7 @@ def new_model(
     settings: Mapping[str, Any],
     action: str | None,
     seed: int,
+    constraint: Mapping[str, float] | None = None,
 ) -> BaseAlgorithm:
     """Make an untrained algorithm, whose `get_env()` is `envs`, normalised if the settings say so.
 
@@ -53,6 +68,7 @@ def new_model(
         action: on which an off-policy algorithm learns with a filter in the loop; None without a
             filter, or on-policy.
         seed: of the algorithm.
+        constraint: `Training.constraint`.
 
     Raises:
         ConfigurationError: the algorithm does not take these settings, or its policy cannot be
@@ -72,6 +88,7 @@ def new_model(
             left |= _replay(problem, action, left)
         if isinstance(left.get("train_freq"), list):
             left["train_freq"] = tuple(left["train_freq"])
+        left |= constraint or {}
         model: Any = algorithm_class(name)(env=envs, seed=seed, device="cpu", **left)
     except SafeEnvsError:
         raise
@@ -94,11 +111,15 @@ def new_model(
 
 
 def _require_known(name: str, settings: Mapping[str, Any]) -> None:
-    given = ("self", "env", "seed", "device", "_init_setup_model")
-    parameters = inspect.signature(algorithm_class(name)).parameters
-    allowed = [key for key in parameters if key not in given]
+    parameters = _parameters(algorithm_class(name))
+    allowed = [key for key in parameters if key not in (*_GIVEN, *_OF_THE_LIMIT)]
     allowed += [*_OF_THE_ENV, *(_OF_THE_NOISE if name in OFF_POLICY else ())]
     for key, value in settings.items():
+        if key in _OF_THE_LIMIT and key in parameters:
+            raise ConfigurationError(
+                f"{shown(key)} is no hyperparameter; give the limit by --cost-limit, or by"
+                " --violation-limit"
+            )
         if key not in allowed:
             raise ConfigurationError(
                 f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}"
@@ -110,6 +131,14 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
             and type(parameters[key].default) in (int, float)
         ):
             raise ConfigurationError(f"{key} = {shown(value)}; give a number")
+
+
+def _parameters(kind: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
+    """Return the parameters of an algorithm by name, and those that it passes on to its base."""
+    found = dict(inspect.signature(kind).parameters)
+    passed_on = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    named = {key: value for key, value in found.items() if value.kind not in passed_on}
+    return named if named.keys() == found.keys() else {**_parameters(kind.__mro__[1]), **named}
 
 
 def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:

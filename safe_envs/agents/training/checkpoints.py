@@ -109,12 +109,15 @@ def keep_checkpoint(
 def _write(part: Path, model: Any, problem: SafetyProblem, state: dict[str, Any]) -> None:
     # Where a file cannot take what it writes, PyTorch does not say why.
     archive = io.BytesIO()
-    model.save(archive)
+    # Stable-Baselines3 reads its own classes only.
+    (model.plain() if hasattr(model, "plain") else model).save(archive)
     (part / _MODEL).write_bytes(archive.getvalue())
     scales, buffer = model.get_vec_normalize_env(), getattr(model, "replay_buffer", None)
     if scales is not None:
         scales.save(str(part / _SCALES))
     document = {"format": _FORMAT, "counters": counters(model), **state}
+    if hasattr(model, "constraint"):
+        document["constraint"] = model.constraint.state()
     if buffer is not None:
         (part / _BUFFER).write_bytes(serialized(buffer_arrays(buffer)))
         document["buffer"] = {"pos": buffer.pos, "full": buffer.full}
@@ -168,6 +171,8 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
                 document["buffer"]["pos"],
                 document["buffer"]["full"],
             )
+        if hasattr(model, "constraint"):
+            model.constraint.restore(document["constraint"])
         figures.restore(document["counts"])
         if type(document["seconds"]) is not float or not 0.0 <= document["seconds"] < math.inf:
             raise ValueError(f"it took {document['seconds']!r} seconds")

@@ -10,10 +10,13 @@ from typing import Any
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.hyperparameters import (
     ACTIONS,
+    CONSTRAINED,
     OFF_POLICY,
     hyperparameters,
     whole_batches,
 )
+from safe_envs.agents.training.limits import COST, DEFAULT_VIOLATION_LIMIT, UNITS, VIOLATION
+from safe_envs.agents.training.multiplier import require_at_least_zero
 from safe_envs.agents.training.promise_curriculum import PromiseCurriculum
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole
@@ -40,7 +43,7 @@ class Training:
 
     Attributes:
         env_id: full id.
-        algorithm: "ppo", "a2c", "sac" or "td3".
+        algorithm: one of `safe_envs.agents.training.hyperparameters.ALGORITHMS`.
         n_timesteps: control periods over all copies of the env.
         num_envs: number of copies.
         hyperparameters: of the algorithm, by the Zoo's names.
@@ -61,6 +64,10 @@ class Training:
             busy machine.
         engine: of the envs, see `SafeVectorEnv`; "auto" is NumPy for short trainings. Evaluations
             choose theirs by their own length, unless it is "numpy".
+        cost_limit: greatest expected number of unsafe steps of an episode, for "ppo-lag" and
+            "sac-lag".
+        violation_limit: in its place, greatest probability of any unsafe step of an episode; the
+            episodes of the training end at the first one.
 
     Raises:
         ConfigurationError: a value is not allowed.
@@ -83,6 +90,8 @@ class Training:
     eval_episodes: int = 200
     threads: int = 1
     engine: str = "auto"
+    cost_limit: float | None = None
+    violation_limit: float | None = None
 
     def __post_init__(self) -> None:
         try:
@@ -94,6 +103,8 @@ class Training:
         for name, least in _LEAST.items():
             require_whole(name, getattr(self, name), least)
         require_engine(self.engine)
+        self._require_limits()
+        self.curriculum  # noqa: B018  (which refuses what is out of range)
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
         if self.action not in ACTIONS:
@@ -109,14 +120,49 @@ class Training:
                 " is learned, has none; give --action both or proposed too, or no penalty"
             )
 
-        self.curriculum  # noqa: B018  (which refuses what is out of range)
-
     @property
     def curriculum(self) -> PromiseCurriculum | None:
         """The curriculum on p of the promise filter; None without one."""
         return PromiseCurriculum.of(
             self.promise_curriculum, self.curriculum_part, self.filter, self.n_timesteps
         )
+
+    def _require_limits(self) -> None:
+        given = {
+            name: limit
+            for name, limit in ((COST, self.cost_limit), (VIOLATION, self.violation_limit))
+            if limit is not None
+        }
+        for name, limit in given.items():
+            require_at_least_zero(name, limit)
+        if given.get(VIOLATION, 0.0) >= 1.0:
+            raise ConfigurationError(
+                f"violation_limit = {self.violation_limit!r} is a probability, and 1 no limit; give"
+                " a number below 1, such as 0.01"
+            )
+        if self.algorithm not in CONSTRAINED and given:
+            raise ConfigurationError(
+                f"{self.algorithm} has no {' and no '.join(given)}; leave it out, or choose"
+                f" {' or '.join(CONSTRAINED)}"
+            )
+        if self.algorithm in CONSTRAINED and len(given) != 1:
+            raise ConfigurationError(
+                f"{self.algorithm} was given {len(given)} limits; give one: cost_limit is on the"
+                " number of unsafe steps of an episode, violation_limit on the probability of any"
+            )
+
+    @property
+    def limit_kind(self) -> str | None:
+        """Name of the limit in force; None without one."""
+        if self.algorithm not in CONSTRAINED:
+            return None
+        return COST if self.violation_limit is None else VIOLATION
+
+    @property
+    def constraint(self) -> dict[str, float]:
+        """Arguments of a constrained algorithm; none for others."""
+        kind = self.limit_kind
+        return {} if kind is None else {"cost_limit": getattr(self, kind), "cost_unit": UNITS[kind]}
 
     @property
     def learns_on_executed(self) -> bool:
@@ -145,7 +191,8 @@ class Training:
             num_envs: by default the hyperparameters' `n_envs`.
             eval_freq: by default a tenth of the training.
             **attributes: other attributes of the class; options that are None are left out, and the
-                filter may be "none".
+                filter may be "none". A constrained algorithm without a limit gets
+                `safe_envs.agents.training.limits.DEFAULT_VIOLATION_LIMIT`.
 
         Raises:
             ConfigurationError: a value is not allowed.
@@ -157,7 +204,7 @@ class Training:
         copies = copies if num_envs is None else num_envs
         require_whole("n_timesteps", steps, 1)
         require_whole("num_envs", copies, 1)
-        if algorithm == "ppo":
+        if algorithm in ("ppo", "ppo-lag"):
             require_whole("n_steps", found["n_steps"], 1)
             found["batch_size"] = whole_batches(
                 found["batch_size"], found["n_steps"] * copies, "batch_size" in given
@@ -168,6 +215,9 @@ class Training:
             found.setdefault("buffer_size", min(_MOST_ROWS, rows))
         if attributes.get("filter") == UNFILTERED:
             attributes["filter"] = None
+        limits = [attributes.get(name) for name in (COST, VIOLATION)]
+        if algorithm in CONSTRAINED and limits == [None, None]:
+            attributes[VIOLATION] = DEFAULT_VIOLATION_LIMIT
         options = attributes.pop("options", None) or {}
         return cls(
             env_id=known,

@@ -11,7 +11,9 @@ import numpy as np
 from safe_envs.agents.training.multiplier import PIDMultiplier, require_at_least_zero
 from safe_envs.errors import ConfigurationError, shown
 
-_COUNTS = ("running", "ended", "cost", "violated")
+_COUNTS = ("running", "ended", "cost", "squares", "violated")
+_LEAST_EPISODES = 100
+"""Episodes, at least, that a judgement is made on, once there are as many."""
 
 
 class EpisodeConstraint:
@@ -34,6 +36,8 @@ class EpisodeConstraint:
         multiplier: that each measurement moves.
         episode_cost: mean cost of an episode at the last measurement; None before the first.
         violation_rate: share of its episodes with any cost; None before the first.
+        recent: episodes, sum of their costs, sum of the squares and number with any cost, of the
+            last measurements, as many as have 100 episodes together.
 
     Args:
         limit: see above.
@@ -50,6 +54,8 @@ class EpisodeConstraint:
     ) -> None:
         require_at_least_zero("the limit of the cost", limit)
         require_at_least_zero("the unit of the cost", unit)
+        for name, number in gains.items():
+            require_at_least_zero(f"multiplier_{name}", number)
         self._unit = max(float(limit), float(unit))
         if self._unit == 0.0:
             raise ConfigurationError("the unit of the cost is 0; give a positive number")
@@ -57,9 +63,11 @@ class EpisodeConstraint:
         self.multiplier = PIDMultiplier(self.limit / self._unit, **gains)
         self.episode_cost: float | None = None
         self.violation_rate: float | None = None
+        self.recent: list[list[float]] = []
         # Of the episodes that go on, and of those that ended since the last measurement.
-        self._running, self._cost, self._violated = (np.zeros(num_envs) for _ in range(3))
-        self._ended = np.zeros(num_envs, dtype=np.int64)
+        self._running, self._ended, self._cost, self._squares, self._violated = (
+            np.zeros(num_envs) for _ in _COUNTS
+        )
 
     @property
     def value(self) -> float:
@@ -77,6 +85,7 @@ class EpisodeConstraint:
         if dones.any():
             ended = np.where(dones, self._running, 0.0)
             self._cost += ended
+            self._squares += ended**2
             self._violated += ended > 0.0
             self._ended += dones
             self._running[dones] = 0.0
@@ -89,11 +98,14 @@ class EpisodeConstraint:
         """
         if not self._ended.all():
             return False
-        episodes = self._ended.sum()
-        self.episode_cost = float(self._cost.sum() / episodes)
-        self.violation_rate = float(self._violated.sum() / episodes)
-        for counts in (self._cost, self._violated, self._ended):
-            counts[:] = 0
+        pools = (self._ended, self._cost, self._squares, self._violated)
+        sums = [float(counts.sum()) for counts in pools]
+        for counts in pools:
+            counts[:] = 0.0
+        self.episode_cost, self.violation_rate = sums[1] / sums[0], sums[3] / sums[0]
+        self.recent.append(sums)
+        while sum(each[0] for each in self.recent[1:]) >= _LEAST_EPISODES:
+            del self.recent[0]
         excess = (self.episode_cost - self.limit) / self._unit
         self.multiplier.update(self.multiplier.limit + min(excess, 1.0))
         return True
@@ -115,6 +127,7 @@ class EpisodeConstraint:
         return {
             "multiplier": self.multiplier.state(),
             "measured": [self.episode_cost, self.violation_rate],
+            "recent": self.recent,
             **{name: getattr(self, f"_{name}").tolist() for name in _COUNTS},
         }
 
@@ -124,16 +137,23 @@ class EpisodeConstraint:
         Raises:
             ValueError: it is not such a state.
         """
-        if not isinstance(state, Mapping) or set(state) != {"multiplier", "measured", *_COUNTS}:
+        if not isinstance(state, Mapping) or set(state) != {
+            "multiplier",
+            "measured",
+            "recent",
+            *_COUNTS,
+        }:
             raise ValueError(f"the state of the constraint is {shown(state)}")
         measured = state["measured"]
         if measured != [None, None]:
-            _require_numbers("measured", measured, 2, float)
+            _require_numbers("measured", measured, 2)
         for name in _COUNTS:
-            counts = getattr(self, f"_{name}")
-            _require_numbers(name, state[name], len(counts), type(counts[0].item()))
+            _require_numbers(name, state[name], len(self._running))
+        for each in state["recent"]:
+            _require_numbers("last measurements", each, 4)
         self.multiplier.restore(state["multiplier"])
         self.episode_cost, self.violation_rate = measured
+        self.recent = [list(each) for each in state["recent"]]
         for name in _COUNTS:
             getattr(self, f"_{name}")[:] = state[name]
 
@@ -167,13 +187,13 @@ def costs_of(infos: Sequence[Any]) -> np.ndarray:
     return costs
 
 
-def _require_numbers(name: str, given: Any, count: int, kind: type) -> None:
-    """Raise ValueError unless a list has so many finite numbers from 0 of one type."""
+def _require_numbers(name: str, given: Any, count: int) -> None:
+    """Raise ValueError unless a list has so many finite numbers from 0."""
     if (
         not isinstance(given, list)
         or len(given) != count
         or not all(
-            type(number) is kind and math.isfinite(number) and number >= 0 for number in given
+            type(number) is float and math.isfinite(number) and number >= 0 for number in given
         )
     ):
         raise ValueError(f"the constraint's {name} is {shown(given)}")

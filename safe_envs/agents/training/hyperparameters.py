@@ -9,19 +9,24 @@ from typing import Any
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.number_text import real
 
-ALGORITHMS = ("ppo", "a2c", "sac", "td3")
-OFF_POLICY = ("sac", "td3")
+ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ppo-lag", "sac-lag")
+OFF_POLICY = ("sac", "td3", "sac-lag")
+CONSTRAINED = ("ppo-lag", "sac-lag")
+"""Algorithms with a limit on the cost of an episode, on which alone they differ from others."""
 
 ACTIONS = ("executed", "proposed", "both")
 """Actions on which an off-policy algorithm may learn with a filter in the loop; see
 `safe_envs.agents.training.replay_buffer`."""
 
 _LINEAR = "lin_"
+_EXTENDS = "extends"
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 
 
 def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     """Return the hyperparameters of an env in `hyperparams/ALGORITHM.yml`, or its defaults.
+
+    A file that extends the one of another algorithm adds to what that has for the env.
 
     Args:
         algorithm: one of `ALGORITHMS`.
@@ -30,14 +35,19 @@ def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     Raises:
         ConfigurationError: the algorithm is unknown.
     """
-    import yaml
-
     if algorithm not in ALGORITHMS:
         raise ConfigurationError(f"--algo {shortened(algorithm)}: {nearest(algorithm, ALGORITHMS)}")
-    table = yaml.safe_load(
+    table = _table(algorithm)
+    own = table.get(env_id, table["default"])
+    return {**(hyperparameters(table[_EXTENDS], env_id) if _EXTENDS in table else {}), **own}
+
+
+def _table(algorithm: str) -> dict[str, Any]:
+    import yaml
+
+    return yaml.safe_load(
         files("safe_envs.agents.training").joinpath("hyperparams", f"{algorithm}.yml").read_text()
     )
-    return dict(table.get(env_id, table["default"]))
 
 
 def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:

@@ -1,117 +1,212 @@
-"""Agents that are trained on an env without and with its filter, compared with its controller."""
+"""The leaderboard: agents with and without filters, and with a limit on violations in training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.frontier_results import Frontier
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import ResultStore, reading
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.trainer import train
+from safe_envs.agents.training.hyperparameters import ALGORITHMS
+from safe_envs.agents.training.seed_statistics import SeedEstimate, over_seeds
+from safe_envs.agents.training.study import DEFAULT, Study, StudyResult, Variant
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.systems import ENV_IDS
+from safe_envs.wrappers.value.frontier import price_violations
+from safe_envs.wrappers.value.priced_values import FrontierSettings
 
-_QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
-_STATISTICS = ("filter", "safety_rate", "ci_low", "ci_high", "return_mean", "intervention_rate")
+LIMIT = 0.01
+"""Chance of a violation that the constrained agent and the promise filter are asked to keep."""
+
+_PROMISE = f"promise:p={1.0 - LIMIT:g}"
+_BACKUP = "backup"
+_ALL: dict[str, Any] = {"eval_episodes": 20}
+"""Evaluations in the training choose nothing here."""
+
+_QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 20}
+
+
+def board(
+    env_ids: Sequence[str],
+    *,
+    algo: str = "ppo",
+    seeds: int = 5,
+    seed: int = 0,
+    episodes: int = 1000,
+    quick: bool = False,
+) -> Study:
+    """Return the study of the leaderboard.
+
+    The filters know the plant: with a wrong model they would have to be learned first, which is
+    another comparison.
+
+    Args:
+        env_ids: registered ids.
+        algo: name of an algorithm that is not constrained itself.
+        seeds: number of trainings of each variant.
+        seed: from which all seeds are derived.
+        episodes: of the evaluation of each agent.
+        quick: train for moments only.
+
+    Raises:
+        ConfigurationError: an id or the algorithm is unknown, or a number is out of range.
+    """
+    constrained, variants = f"{algo}-lag", [Variant("nominal"), Variant(algo, algo)]
+    if constrained in ALGORITHMS:
+        variants.append(Variant(constrained, constrained, training={"violation_limit": LIMIT}))
+    variants += [
+        Variant(f"{algo} + filter", algo, filter=DEFAULT),
+        Variant(f"{algo} behind filter", algo, training={"filter": DEFAULT}, filter=DEFAULT),
+        Variant(f"{algo} + promise", algo, filter=_PROMISE),
+        Variant(f"{algo} behind backup", algo, training={"filter": _BACKUP}, filter=_BACKUP),
+    ]
+    return Study(env_ids, variants, seeds, seed, episodes, training=_QUICK if quick else _ALL)
 
 
 @dataclass(frozen=True)
-class LeaderboardRow:
-    """The evaluation of a policy with a filter.
+class LeaderboardEntry:
+    """What the agents of a variant on an env are like.
 
     Attributes:
         env_id: full id.
-        policy: its name in the leaderboard.
-        filter: text of the filter, or "none".
-        safety_rate: share of the episodes without a violation.
-        ci_low: lower end of its 95 % interval.
-        ci_high: upper end.
-        return_mean: mean return of an episode.
-        intervention_rate: share of the steps at which the filter changed the action.
-        trained_in: processor time of the training in seconds; None without one.
-
-    Raises:
-        TypeError: an attribute is of another type.
+        variant: its name.
+        filter: text of the filter of the evaluations, or "none".
+        safety: share of safe episodes, over seeds.
+        safe: number of safe episodes of all agents together.
+        episodes: number of their episodes.
+        episodes_low: lower end of the 95 % interval of the rate of these agents over episodes.
+        episodes_high: upper end.
+        returns: mean return of an episode, over seeds.
+        violations: unsafe steps in the training, over seeds; None without a training.
+        minutes: processor time of a training, their mean; None without one.
     """
 
     env_id: str
-    policy: str
+    variant: str
     filter: str
-    safety_rate: float
-    ci_low: float
-    ci_high: float
-    return_mean: float
-    intervention_rate: float
-    trained_in: float | None
-
-    def __post_init__(self) -> None:
-        for name, kind in get_type_hints(type(self)).items():
-            if not isinstance(getattr(self, name), kind):
-                raise TypeError(f"{name} is {getattr(self, name)!r}")
-
-
-@dataclass(frozen=True)
-class LeaderboardOptions:
-    """What all rows of a leaderboard have in common.
-
-    Attributes:
-        algo: name of the algorithm.
-        seed: of all randomness.
-        quick: train for moments only.
-        episodes: of each evaluation.
-        knowledge: of the filters. With a wrong model they would have to be learned first, which is
-            another comparison.
-    """
-
-    algo: str
-    seed: int
-    quick: bool
+    safety: SeedEstimate
+    safe: int
     episodes: int
-    knowledge: str = "plant"
+    episodes_low: float
+    episodes_high: float
+    returns: SeedEstimate
+    violations: SeedEstimate | None
+    minutes: float | None
 
 
-def leaderboard_rows(
-    env_ids: Sequence[str],
-    options: LeaderboardOptions,
-    out: Path,
-    progress: Callable[[float], None],
-) -> list[LeaderboardRow]:
-    """Return five rows for each env, computed unless a previous run has kept them.
+def require_no_older(out: Path) -> None:
+    """Check that a folder has no results of the leaderboard of one seed.
+
+    Args:
+        out: folder of a leaderboard.
+
+    Raises:
+        ConfigurationError: it has.
+    """
+    for env_id in ENV_IDS:
+        path = out / "results" / f"{env_id.rpartition('/')[2]}.json"
+        if path.exists():
+            raise ConfigurationError(
+                f"{out} holds a leaderboard of an earlier version, of one seed ({path.name}), which"
+                " this one neither reads nor overwrites; give another --out"
+            )
+
+
+def entry_of(found: StudyResult, env_id: str, variant: str) -> LeaderboardEntry | None:
+    """Return the statistics of a variant on an env; None where it has no agent there.
+
+    Args:
+        found: of the study.
+        env_id: full id.
+        variant: its name.
+    """
+    rows = found.of(env_id, variant)
+    if not rows:
+        return None
+    safe, episodes = sum(row.safe for row in rows), sum(row.episodes for row in rows)
+    violations = [float(row.violations) for row in rows if row.violations is not None]
+    seconds = [row.seconds for row in rows if row.seconds is not None]
+    low, high = rate_interval(safe, episodes)
+    return LeaderboardEntry(
+        env_id=env_id,
+        variant=variant,
+        filter=rows[0].filter,
+        safety=over_seeds([[row.safety_rate for row in rows]]),
+        safe=safe,
+        episodes=episodes,
+        episodes_low=low,
+        episodes_high=high,
+        returns=over_seeds([[row.return_mean for row in rows]]),
+        violations=over_seeds([violations]) if violations else None,
+        minutes=sum(seconds) / len(seconds) / 60.0 if seconds else None,
+    )
+
+
+def safety_over_envs(found: StudyResult) -> dict[str, SeedEstimate]:
+    """Return the safety over all envs and seeds, of the variants that every env has.
+
+    Args:
+        found: of the study.
+    """
+    safety = {}
+    for variant in found.study.variants:
+        strata = [
+            [row.safety_rate for row in found.of(env_id, variant.name)]
+            for env_id in found.study.env_ids
+        ]
+        if all(strata):
+            safety[variant.name] = over_seeds(strata)
+    return safety
+
+
+def frontiers_of(
+    env_ids: Sequence[str], out: Path, compute: bool, progress: Callable[[float], None]
+) -> dict[str, Mapping[str, list[float]]]:
+    """Return the largest returns at each chance of a violation, of the envs that have such a curve.
 
     Args:
         env_ids: full ids.
-        options: of the leaderboard.
-        out: folder of the agents and of the results.
+        out: folder of the leaderboard, which keeps them.
+        compute: compute what is missing.
         progress: receives the part of the work that is done, from 0 to 1.
 
+    Returns:
+        By id "violations" and "returns", as `Frontier.curve` tells them.
+
     Raises:
-        ConfigurationError: the folder has results of other options, or files that are damaged.
+        ConfigurationError: the folder has a file that is damaged.
     """
-    store = ResultStore(out / "results")
-    store.require_same_options([_key(env_id) for env_id in ENV_IDS], asdict(options))
-    found, count = [], len(env_ids)
+    store, found = ResultStore(out / "frontiers"), {}
+    settings = FrontierSettings(policies=0, leaving="safe")
     for k, env_id in enumerate(env_ids):
-        rows = _kept(store, env_id, options)
-        if rows is None:
-            of_env = _rows_of_env(
-                env_id, options, out, lambda part, k=k: progress((k + part) / count)
-            )
-            rows = list(of_env)
-            store.keep(
-                _key(env_id),
-                _configuration(env_id, options),
-                {"rows": [asdict(row) for row in rows]},
-            )
-        found += rows
-        progress((k + 1) / count)
+        key = env_id.rpartition("/")[2]
+        configuration = {
+            "env_id": env_id,
+            "settings": asdict(settings),
+            "versions": package_versions(),
+        }
+        document = store.read(key, configuration)
+        if document is None and compute:
+            problem = make_problem(env_id)
+            try:
+                values = price_violations(
+                    problem, settings, lambda part, k=k: progress((k + part) / len(env_ids))
+                )
+            except ConfigurationError:
+                continue  # No grid serves it: `attainable_of` tells why.
+            chances, returns = Frontier(problem, values, [], [], {}, 0.95).curve()
+            document = {"violations": chances.tolist(), "returns": returns.tolist()}
+            store.keep(key, configuration, document)
+        if document is not None:
+            with reading(store.path(key)):
+                found[env_id] = {name: document[name] for name in ("violations", "returns")}
     return found
 
 
@@ -142,74 +237,3 @@ def attainable_of(
         if best is not None:
             found[env_id] = best
     return found
-
-
-def _key(env_id: str) -> str:
-    return env_id.rpartition("/")[2]
-
-
-def _configuration(env_id: str, options: LeaderboardOptions) -> dict[str, Any]:
-    return {"env_id": env_id, "options": asdict(options), "versions": package_versions()}
-
-
-def _kept(
-    store: ResultStore, env_id: str, options: LeaderboardOptions
-) -> list[LeaderboardRow] | None:
-    document = store.read(_key(env_id), _configuration(env_id, options))
-    if document is None:
-        return None
-    with reading(store.path(_key(env_id))):
-        return [LeaderboardRow(**row) for row in document["rows"]]
-
-
-def _rows_of_env(
-    env_id: str, options: LeaderboardOptions, out: Path, progress: Callable[[float], None]
-) -> Iterator[LeaderboardRow]:
-    """Yield the rows of the nominal controller, and of agents without and with the filter."""
-    default, algo = make_problem(env_id).filter, options.algo
-    yield from _evaluated(env_id, "nominal", "nominal", [UNFILTERED, default], options)
-    for i, (name, kind, in_loop, filters) in enumerate(
-        (
-            (algo, "unfiltered", None, [UNFILTERED, default]),
-            (f"{algo}, filter in the loop", "filtered", default, [default]),
-        )
-    ):
-        folder = out / f"{_key(env_id)}-{algo}-{kind}"
-        training = Training.of(
-            env_id,
-            algo,
-            filter=in_loop,
-            knowledge=options.knowledge,
-            seed=options.seed,
-            **(_QUICK if options.quick else {}),
-        )
-        seconds = train(
-            training,
-            folder,
-            resume=(folder / "config.json").exists(),
-            progress=lambda part, i=i: progress((i + part) / 2),
-        )
-        yield from _evaluated(env_id, name, str(folder), filters, options, seconds)
-
-
-def _evaluated(
-    env_id: str,
-    name: str,
-    policy: str,
-    filters: Sequence[str],
-    options: LeaderboardOptions,
-    seconds: float | None = None,
-) -> Iterator[LeaderboardRow]:
-    found = evaluate(
-        env_id,
-        policy,
-        filters,
-        episodes=options.episodes,
-        seed=options.seed,
-        knowledge=options.knowledge,
-        bounds=False,
-        best=False,
-    )
-    for row in found.rows:
-        statistics = {key: getattr(row, key) for key in _STATISTICS}
-        yield LeaderboardRow(env_id, name, **statistics, trained_in=seconds)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,16 @@ from safe_envs.agents.training.cost_critic import CostCritic
 from safe_envs.errors import ConfigurationError
 
 _LEAST_SPREAD = 1e-6
+_OF_THE_CONSTRAINT = (
+    "cost_limit",
+    "cost_unit",
+    "cost_gamma",
+    "cost_gae_lambda",
+    "multiplier_gains",
+    "constraint",
+    "cost_critic",
+    "_costs",
+)
 
 
 class PPOLagrangian(PPO):
@@ -55,7 +66,7 @@ class PPOLagrangian(PPO):
             parts.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (hyperparameters)
         self,
         *args: Any,
         cost_limit: float = 0.0,
@@ -96,7 +107,7 @@ class PPOLagrangian(PPO):
         )
         if known is not None:  # of a file that is being loaded
             self.constraint.multiplier.restore(known.multiplier.state())
-        seed = np.random.SeedSequence().entropy if self.seed is None else self.seed
+        seed: Any = np.random.SeedSequence().entropy if self.seed is None else self.seed
         self.cost_critic = CostCritic(self.policy, self.lr_schedule(1.0), seed)
         self._costs = RolloutBuffer(
             self.n_steps,
@@ -112,11 +123,14 @@ class PPOLagrangian(PPO):
         total_timesteps: int,
         callback: Any = None,
         reset_num_timesteps: bool = True,
-        *args: Any,
+        tb_log_name: str = "PPOLagrangian",
+        progress_bar: bool = False,
     ) -> Any:
         if reset_num_timesteps or self._last_obs is None:
             self.constraint.begin_episodes()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args)
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         """Take the costs of a step, for whose place Stable-Baselines3 has no other method."""
@@ -173,6 +187,14 @@ class PPOLagrangian(PPO):
         weight = self.constraint.value
         scale = rewards.std() / max(costs.std(), _LEAST_SPREAD)
         return ((rewards - weight * scale * costs) / (1.0 + weight)).astype(np.float32)
+
+    def plain(self) -> PPO:
+        """Return the same model as PPO, whose files Stable-Baselines3 reads by itself."""
+        twin: Any = copy.copy(self)
+        twin.__class__ = PPO
+        for name in _OF_THE_CONSTRAINT:
+            del vars(twin)[name]
+        return twin
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_costs"]

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numbers
 from dataclasses import dataclass
-from typing import Any
-
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from typing import TYPE_CHECKING, Any
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.value.promise_text import PromiseSettings
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 
 @dataclass(frozen=True)
@@ -79,25 +79,6 @@ class PromiseCurriculum:
         p = self.at(done)
         envs.env_method("ask_promise", p)
         return p
-
-
-class CurriculumCallback(BaseCallback):
-    """Goes on with a curriculum after each step, and records it as `train/promise`.
-
-    Args:
-        curriculum: to follow.
-    """
-
-    def __init__(self, curriculum: PromiseCurriculum) -> None:
-        super().__init__()
-        self._curriculum, self._asked = curriculum, curriculum.first
-
-    def _on_step(self) -> bool:
-        self._asked = self._curriculum.ask(self.training_env, self.num_timesteps)
-        return True
-
-    def _on_rollout_end(self) -> None:
-        self.logger.record("train/promise", self._asked)
 
 
 def _is_number(value: Any) -> bool:

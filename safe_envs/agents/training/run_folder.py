@@ -121,6 +121,8 @@ def read_evaluations(folder: Path) -> list[dict[str, Any]]:
         for row in rows:
             numbers = [row["timesteps"], *(row[name] for name in SHOWN)]
             numbers.append(row["training"]["violations"])
+            if (met := row.get("constraint", {}).get("met")) not in (None, True, False):
+                raise ValueError(f"its limit is met: {met!r}")
             if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
                 raise ValueError(f"its numbers are {numbers}")
     return rows

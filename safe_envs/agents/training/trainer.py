@@ -25,7 +25,7 @@ from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.store import make_folder
 from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
-from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
+from safe_envs.agents.training.callbacks import CurriculumCallback, ProgressLog, SafetyFigures
 from safe_envs.agents.training.checkpoints import (
     copy_policy,
     drop_replay_buffer,
@@ -37,7 +37,7 @@ from safe_envs.agents.training.checkpoints import (
 )
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.hyperparameters import OFF_POLICY
-from safe_envs.agents.training.promise_curriculum import CurriculumCallback
+from safe_envs.agents.training.limits import VIOLATION, judged, rank
 from safe_envs.agents.training.run_folder import (
     BEST,
     EVALUATIONS,
@@ -72,9 +72,9 @@ def train(
     The folder holds `config.json` with the versions, `progress.jsonl` with all that was logged,
     `evaluations.json`, the policy as `policy.npz` and as
     Stable-Baselines3's `model.zip` (with `normalization.pkl`, if observations are normalised),
-    in `best` those with the highest return in an evaluation, whatever their safety, and the last
-    checkpoint. Evaluations have episodes of their own, so that none of them is among those of
-    `safe-envs evaluate`.
+    in `best` those with the highest return in an evaluation, whatever their safety but for a limit
+    that they exceed, and the last checkpoint. Evaluations have episodes of their own, so that none
+    of them is among those of `safe-envs evaluate`.
 
     Args:
         training: what to do.
@@ -146,12 +146,19 @@ class TrainingSession:
                 knowledge=training.knowledge,
                 intervention_penalty=training.intervention_penalty,
                 engine=engine_for(training.engine, training.n_timesteps),
+                terminate_on_violation=training.limit_kind == VIOLATION or None,
                 **training.options,
             )
         )
         action = training.action if training.learns_on_executed else None
         self._model: Any = new_model(
-            training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed
+            training.algorithm,
+            envs,
+            self._problem,
+            training.hyperparameters,
+            action,
+            training.seed,
+            training.constraint,
         )
         checkpoint = last_checkpoint(folder) if resume else None
         if checkpoint is not None:
@@ -269,16 +276,17 @@ class TrainingSession:
             engine="numpy" if training.engine == "numpy" else "auto",
         )
         row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
-        best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
-        self._evaluations.append(
-            {
-                "timesteps": model.num_timesteps,
-                "seed": seed,
-                **row,
-                "training": self._figures.figures(),
-            }
-        )
-        if row["return_mean"] > best:
+        entry = {
+            "timesteps": model.num_timesteps,
+            "seed": seed,
+            **row,
+            "training": self._figures.figures(),
+        }
+        if training.limit_kind is not None:
+            entry["constraint"] = judged(model.constraint, training.limit_kind, row)
+        earlier = [rank(e) for e in self._evaluations]
+        self._evaluations.append(entry)
+        if not earlier or rank(entry) > max(earlier):
             copy_policy(checkpoint, self._folder / BEST)
         for key in SHOWN:
             model.logger.record(f"eval/{key}", row[key])

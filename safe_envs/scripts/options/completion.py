@@ -27,7 +27,7 @@ FILTERS = (
 POLICIES = ("nominal", "clf", "zero", "random", "best")
 """Names of policies, as `safe_envs.agents.policies.registry` knows them."""
 
-ALGORITHMS = ("ppo", "a2c", "sac", "td3")
+ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ppo-lag", "sac-lag")
 """Names of algorithms, as `safe_envs.agents.training.hyperparameters` knows them."""
 
 

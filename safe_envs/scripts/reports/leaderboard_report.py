@@ -1,87 +1,192 @@
-"""The leaderboard of agents, as a table and as Markdown."""
+"""The leaderboard of agents, as tables and as Markdown."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.rate_text import percent_in
-from safe_envs.agents.evaluation.yardstick import times_unavoidable
-from safe_envs.scripts.reports.best_text import best_notes, best_text, times_text
+from safe_envs.scripts.reports.best_text import best_notes, best_text
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
-    from safe_envs.agents.training.leaderboard import LeaderboardRow
+    from safe_envs.agents.training.leaderboard import LeaderboardEntry
+    from safe_envs.agents.training.seed_statistics import SeedEstimate
+    from safe_envs.agents.training.study import StudyResult
 
-Best = Mapping[str, AttainableSafety | str]
+_NONE = "-"
+_UNIT = " %"
+_DIGITS = 4
 
-_ROWS = 5
-"""Rows of each env: the first, third and last are those of a policy without another filter."""
 
+@dataclass(frozen=True)
+class LeaderboardReport:
+    """All that a leaderboard tells.
 
-def leaderboard_table(rows: Sequence[LeaderboardRow], best: Best) -> Table:
-    """Return a table with a row for each policy and filter.
-
-    Args:
-        rows: of the leaderboard.
+    Attributes:
+        found: of the study.
+        entries: of each variant on each env, in their order.
+        over_envs: safety over all envs, by variant.
         best: the best attainable safety of each env, or why there is none, as far as is known.
+        frontiers: largest returns at each chance of a violation, by env.
     """
-    compared = ("best", "times unavoidable") if best else ()
-    titles = ("safe [95 % interval]", *compared, "return", "processor time")
-    table = make_table("lllr", "env", "policy", "filter", *titles, tight=False)
-    for row in rows:
-        name, found = row.env_id.removeprefix("safe_envs/"), best.get(row.env_id)
-        known = None if isinstance(found, str) else found
-        times = times_text(times_unavoidable(known, row.ci_low, row.ci_high))
-        statistics = (f"{row.return_mean:.4g}", _time(row))
-        cells = (best_text(known), times)[: len(compared)]
-        table.add_row(name, row.policy, row.filter, _rate(row), *cells, *statistics)
-    return table
+
+    found: StudyResult
+    entries: tuple[LeaderboardEntry, ...]
+    over_envs: Mapping[str, SeedEstimate]
+    best: Mapping[str, AttainableSafety | str]
+    frontiers: Mapping[str, Mapping[str, list[float]]]
+
+    def of(self, env_id: str) -> list[LeaderboardEntry]:
+        """Return the entries of an env."""
+        return [entry for entry in self.entries if entry.env_id == env_id]
+
+    def best_of(self, env_id: str) -> AttainableSafety | None:
+        """Return the best attainable safety of an env, where it is known."""
+        found = self.best.get(env_id)
+        return None if isinstance(found, str) else found
+
+    def reasons(self) -> dict[str, list[str]]:
+        """Return why variants are missing, and whose best attainable safety is, with their envs."""
+        reasons: dict[str, list[str]] = {}
+        for (env_id, variant, k), reason in self.found.missing.items():
+            which = variant if k is None else f"{variant}, training {k}"
+            reasons.setdefault(f"{which}: {reason}", []).append(short_name(env_id))
+        for env_id, reason in self.best.items():
+            if isinstance(reason, str):
+                reasons.setdefault(f"best: {reason}", []).append(short_name(env_id))
+        return reasons
+
+    def document(self) -> dict[str, Any]:
+        """Return all as JSON-able data."""
+        return {
+            "rows": [asdict(row) for row in self.found.rows],
+            "entries": [asdict(entry) for entry in self.entries],
+            "over_envs": {name: asdict(each) for name, each in self.over_envs.items()},
+            "best": {
+                key: each if isinstance(each, str) else each.as_dict()
+                for key, each in self.best.items()
+            },
+            "frontiers": dict(self.frontiers),
+            "missing": [
+                {"env_id": env_id, "variant": variant, "k": k, "reason": reason}
+                for (env_id, variant, k), reason in self.found.missing.items()
+            ],
+        }
 
 
-def leaderboard_notes(best: Best) -> list[str]:
-    """Return what has to be known to read the best attainable safety.
+def short_name(env_id: str) -> str:
+    """Return the name of an env without its namespace and its version."""
+    return env_id.removeprefix("safe_envs/").removesuffix("-v0")
+
+
+def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]:
+    """Yield a heading and a table for each env, then those over all envs.
 
     Args:
-        best: of each env, or why there is none, as far as is known.
+        report: to tell.
     """
-    notes = dict.fromkeys(
-        note for found in best.values() if not isinstance(found, str) for note in best_notes(found)
-    )
-    missing = (f"{key}: {found}" for key, found in best.items() if isinstance(found, str))
-    return [*notes, *missing]
+    seeds = report.found.study.seeds
+    for env_id in report.found.study.env_ids:
+        titles = (
+            f"safe in %:\nIQM over {seeds}\nseeds [95 %]",
+            "\nin % of their\nepisodes [95 %]",
+            f"return:\nIQM over {seeds}\nseeds [95 %]",
+            "unsafe\nsteps in\ntraining",
+            "\n\nmin",
+        )
+        table = make_table("lr", "variant", *titles)
+        for entry in report.of(env_id):
+            table.add_row(entry.variant, *_cells(entry, unit=""))
+        best = report.best_of(env_id)
+        if best is not None:
+            safest = best_text(best).replace(_UNIT, "")
+            table.add_row("best", safest, *[_NONE] * (len(titles) - 1))
+        yield f"{short_name(env_id)}, filter {_filter(report, env_id)}", table
+    if len(report.found.study.env_ids) > 1 and report.over_envs:
+        table = make_table("lr", "variant", "safe: IQM, 95 %")
+        for name, estimate in report.over_envs.items():
+            table.add_row(name, _percent(estimate))
+        yield f"All {len(report.found.study.env_ids)} envs", table
 
 
-def leaderboard_markdown(rows: Sequence[LeaderboardRow], best: Best) -> str:
-    """Return a table in Markdown with a row for each env: safety and return of each policy.
+def leaderboard_notes(report: LeaderboardReport) -> list[str]:
+    """Return what has to be known to read the tables, and what is missing in them.
 
     Args:
-        rows: of the leaderboard.
-        best: see `leaderboard_table`.
+        report: to tell.
     """
-    policies = [
-        f"{row.policy} + filter" if k % 2 else row.policy for k, row in enumerate(rows[:_ROWS])
+    notes = [
+        "IQM is the interquartile mean; its interval is of the bootstrap over seeds, that of the"
+        " episodes is of these agents alone; min is the processor time of a training in minutes.",
     ]
-    compared = ["best"] * bool(best)
-    titles = ["env", "filter", *compared, *policies, "processor time"]
-    table = [titles, ["---"] * len(titles)]
-    for k in range(0, len(rows), _ROWS):
-        of_env = rows[k : k + _ROWS]
-        cells = [f"{_rate(row)}, {row.return_mean:.4g}" for row in of_env]
-        name = of_env[0].env_id.removeprefix("safe_envs/").removesuffix("-v0")
-        found = best.get(of_env[0].env_id)
-        known = [best_text(None if isinstance(found, str) else found)] * len(compared)
-        times = f"{_time(of_env[2])}, {_time(of_env[4])}"
-        table.append([name, of_env[1].filter, *known, *cells, times])
-    return "\n".join(f"| {' | '.join(line)} |" for line in table)
+    for found in report.best.values():
+        if not isinstance(found, str):
+            notes += best_notes(found)[:1]
+    missing = [f"{', '.join(envs)}: {reason}." for reason, envs in report.reasons().items()]
+    return [*dict.fromkeys(notes), *missing]
 
 
-def _rate(row: LeaderboardRow) -> str:
-    return percent_in(row.safety_rate, row.ci_low, row.ci_high)
+def leaderboard_markdown(report: LeaderboardReport, pictures: Mapping[str, str]) -> str:
+    """Return Markdown with a table, and a picture where there is one, for each env.
+
+    Args:
+        report: to tell.
+        pictures: links to them by env.
+    """
+    parts = []
+    if len(report.found.study.env_ids) > 1 and report.over_envs:
+        count = len(report.found.study.env_ids)
+        rows = [[name, _percent(each)] for name, each in report.over_envs.items()]
+        parts.append(f"### All {count} envs\n\n{_markdown(['variant', 'safe'], rows)}")
+    titles = ["variant", "safe", "of the episodes", "return", "unsafe steps", "min"]
+    for env_id in report.found.study.env_ids:
+        name, best = short_name(env_id), report.best_of(env_id)
+        rows = [[entry.variant, *_cells(entry)] for entry in report.of(env_id)]
+        if best is not None:
+            rows.append(["best", best_text(best), *[_NONE] * (len(titles) - 2)])
+        picture = ""
+        if env_id in pictures:
+            picture = f"\n\n![Return against violations on {name}]({pictures[env_id]})"
+        heading = f"### {name}\n\nFilter: `{_filter(report, env_id)}`."
+        parts.append(f"{heading}{picture}\n\n{_markdown(titles, rows)}")
+    reasons = [f"- {', '.join(envs)}: {reason}." for reason, envs in report.reasons().items()]
+    if reasons:
+        parts.append("### What is missing\n\n" + "\n".join(reasons))
+    return "\n\n".join(parts)
 
 
-def _time(row: LeaderboardRow) -> str:
-    return "-" if row.trained_in is None else f"{row.trained_in:.0f} s"
+def _markdown(titles: list[str], rows: list[list[str]]) -> str:
+    lines = [titles, ["---"] * len(titles), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _filter(report: LeaderboardReport, env_id: str) -> str:
+    """Return the text of the env's own filter."""
+    from safe_envs.registry import make_problem
+
+    return make_problem(env_id, **report.found.study.options).filter
+
+
+def _cells(entry: LeaderboardEntry, unit: str = _UNIT) -> list[str]:
+    pooled = percent_in(entry.safe / entry.episodes, entry.episodes_low, entry.episodes_high)
+    unsafe = _NONE if entry.violations is None else f"{entry.violations.value:,.0f}"
+    minutes = _NONE if entry.minutes is None else f"{entry.minutes:.2f}"
+    rates = [rate.replace(_UNIT, unit) for rate in (_percent(entry.safety), pooled)]
+    return [*rates, _number(entry.returns), unsafe, minutes]
+
+
+def _percent(estimate: SeedEstimate) -> str:
+    return percent_in(estimate.value, estimate.low, estimate.high)
+
+
+def _number(estimate: SeedEstimate) -> str:
+    """Return an estimate with its interval, all to the digits of the largest."""
+    ends = (estimate.value, estimate.low, estimate.high)
+    whole = len(f"{max(map(abs, ends)):.0f}")
+    value, low, high = (f"{end:.{max(_DIGITS - whole, 0)}f}" for end in ends)
+    return f"{value} [{low}, {high}]"

@@ -29,3 +29,40 @@ def print_evaluations(
         table.add_row(steps, rate_of(row), f"{row['return_mean']:.4g}", violations)
     say(console, f"Evaluations with the filter {filter_name}:")
     console.print(table)
+    if rows and "constraint" in rows[-1]:
+        _print_constraint(console, rows[-1])
+
+
+def _print_constraint(console: Console, row: Mapping[str, Any]) -> None:
+    """Print whether the agent keeps its limit."""
+    judgement = row["constraint"]
+    of_violations = judgement["kind"] == "violation_limit"
+    what = "P(any violation)" if of_violations else "unsafe steps of an episode"
+
+    def number(value: float) -> str:
+        return f"{100.0 * value:.3g} %" if of_violations else f"{value:.3g}"
+
+    limit = f"{what} <= {number(judgement['limit'])}"
+    if not judgement["episodes"]:
+        say(console, f"Limit: {limit}. No measurement: not every env has ended an episode.")
+        return
+    measured = (
+        f"{number(judgement['mean'])} [{number(judgement['low'])}, {number(judgement['high'])}] in"
+        f" the last {judgement['episodes']} episodes of the training, which explore"
+    )
+    if of_violations:
+        low, high = 1.0 - row["ci_high"], 1.0 - row["ci_low"]
+        measured += (
+            f"; {number(1.0 - row['safety_rate'])} [{number(low)}, {number(high)}] in the"
+            f" {row['episodes']} of the last evaluation, which do not"
+        )
+    multiplier = f"The multiplier is {judgement['multiplier']:.3g}"
+    multiplier += ", its greatest value." if judgement["saturated"] else "."
+    if judgement["met"]:
+        say(console, f"Limit: {limit}. Measured: {measured}. {multiplier}")
+        return
+    say(
+        console,
+        f"NOT MET: the limit {limit}. Measured: {measured}. {multiplier} Either the limit cannot be"
+        " reached, or the training is too short: give a larger limit, more steps, or a filter.",
+    )
