@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from safe_envs.errors import ConfigurationError, nearest, require_whole, shorten
 
 _SHIPPED = "studies"
 _MOST_BYTES = 100_000
+_MOST_VALUES = 10_000
 _EPISODES = 1000
 _NAMES = ("episodes", "variants")
 _OF_VARIANT = ("name", "algorithm", "policy", "training", "filters")
@@ -67,6 +68,25 @@ class StudyFile:
         """All variants, in the order of the file."""
         return [variant for agent in self.agents for variant in agent.variants.values()]
 
+    def shortened(self, training: Mapping[str, Any]) -> list[Variant]:
+        """Return all variants, with other arguments of their trainings.
+
+        Args:
+            training: in place of the file's.
+        """
+        return [
+            replace(each, training={**each.training, **training} if each.algorithm else {})
+            for each in self.variants
+        ]
+
+    def require_agent(self, name: str) -> None:
+        """Raise ConfigurationError where there are no agents of a name."""
+        names = [agent.name for agent in self.agents]
+        if name not in names:
+            raise ConfigurationError(
+                f"no agents {shown(name)} in the study; {nearest(name, names)}"
+            )
+
 
 def shipped_studies() -> list[str]:
     """Return the names of the studies that come with the package."""
@@ -100,11 +120,28 @@ def _parsed(path: Path) -> Any:
     import yaml
 
     try:
-        return yaml.safe_load(read_bytes(path, _MOST_BYTES))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        document = yaml.safe_load(read_bytes(path, _MOST_BYTES))
+        _require_few([document], path)
+        return document
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigurationError(
-            f"study {shortened(path)} is no YAML: {str(error)[:300]}"
+            f"study {shortened(path)} is no YAML file: {str(error)[:300]}"
         ) from error
+
+
+def _require_few(values: list[Any], path: Path) -> None:
+    """Raise ConfigurationError where aliases make a short file a very large study."""
+    count = 0
+    while values:
+        value, count = values.pop(), count + 1
+        if count > _MOST_VALUES:
+            raise ConfigurationError(
+                f"study {shortened(path)} has more than {_MOST_VALUES} values; give a smaller one"
+            )
+        if isinstance(value, Mapping):
+            values += value.values()
+        elif isinstance(value, list):
+            values += value
 
 
 def _study(document: Any, where: str) -> StudyFile:
