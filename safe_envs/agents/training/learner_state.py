@@ -20,7 +20,7 @@ Arrays = dict[str, np.ndarray]
 
 _OBSERVED = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
-_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "costs")
 _EPISODES = {"r": np.float32, "l": np.int32}
 """Entries of the last episodes that a VecMonitor reports, which the logged means are taken of in
 these types."""

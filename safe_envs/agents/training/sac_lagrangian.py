@@ -1,0 +1,275 @@
+"""Soft actor-critic with a limit on the expected cost of an episode.
+
+Stable-Baselines3 updates the actor, the critics and the entropy coefficient in one function, which
+is used here as it is. PyTorch's hooks add what a constraint needs, at the three places where that
+function calls a network or an optimizer:
+
+- the target critic is called with the next states and the actions that the policy takes there:
+  these are kept for the targets of the cost critics, which so need no random numbers;
+- the critic is called with the states and the policy's actions: first the cost critics take their
+  gradient step, and then l Q_c is subtracted from each Q_r that the critic returns;
+- before the actor's optimizer steps, the gradients are divided by 1 + l.
+
+So the actor descends on (alpha log pi - min Q_r + l max Q_c) / (1 + l), and with l = 0 all numbers
+are those of SAC, bit for bit. A loop of training with one gradient step each, the other way
+without a copy, would change SAC with a `target_update_interval` above 1.
+
+Sources: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018, arXiv:1812.05905;
+    Ha et al., "Learning to Walk in the Real World with Minimal Human Effort", 2020,
+    arXiv:2002.08550, section 4, on the constraint; Stooke, Achiam, Abbeel, "Responsive Safety in
+    Reinforcement Learning by PID Lagrangian Methods", 2020, arXiv:2007.03964, on the multiplier
+    and on the division by 1 + l.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.utils import polyak_update
+from torch.nn import functional
+
+from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of
+from safe_envs.agents.training.cost_replay_buffer import with_costs
+from safe_envs.errors import ConfigurationError
+
+_OF_THE_CRITICS = 0xC057
+"""Key of the random numbers of the first weights of cost critics."""
+
+_OF_THE_CONSTRAINT = (
+    "cost_limit",
+    "cost_unit",
+    "cost_gamma",
+    "multiplier_gains",
+    "constraint",
+    "cost_critic",
+    "cost_critic_target",
+    "_buffer_class",
+)
+
+
+class SACLagrangian(SAC):
+    """SAC under the constraint that the mean cost of an episode is at most a limit.
+
+    Twin critics learn the discounted cost, from `info["cost"]`, with an optimizer and with targets
+    of their own. Of both the larger value counts, as for rewards the smaller one does. The
+    multiplier l of their value in the actor's loss follows the undiscounted cost of the episodes
+    that end in training, see `EpisodeConstraint`: those of the policy with its random actions.
+
+    Attributes:
+        constraint: the limit, the multiplier and what was measured.
+        cost_critic: the critics of the cost.
+        cost_critic_target: their targets.
+
+    Args:
+        *args: those of SAC.
+        cost_limit: greatest expected cost of an episode.
+        cost_unit: unit of the excess that the multiplier sees, see `EpisodeConstraint`.
+        cost_gamma: discount of the costs; that of the rewards by default.
+        multiplier_kp: proportional gain of the multiplier, see `PIDMultiplier`.
+        multiplier_ki: integral gain.
+        multiplier_kd: derivative gain.
+        multiplier_smoothing: of the measured costs.
+        multiplier_most: greatest multiplier.
+        **kwargs: those of SAC. The replay buffer is `replay_buffer_class` with costs.
+
+    Raises:
+        ConfigurationError: an argument is out of range, or the buffer cannot hold costs.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        cost_limit: float = 0.0,
+        cost_unit: float = 1.0,
+        cost_gamma: float | None = None,
+        multiplier_kp: float = 0.5,
+        multiplier_ki: float = 0.5,
+        multiplier_kd: float = 0.0,
+        multiplier_smoothing: float = 0.0,
+        multiplier_most: float = 100.0,
+        **kwargs: Any,
+    ) -> None:
+        if cost_gamma is not None and not 0.0 <= cost_gamma <= 1.0:
+            raise ConfigurationError(f"cost_gamma = {cost_gamma!r}; give a number from 0 to 1")
+        if kwargs.get("n_steps", 1) != 1:
+            raise ConfigurationError(
+                f"n_steps = {kwargs['n_steps']!r}: costs have targets of one step; set n_steps=1"
+            )
+        self.cost_limit, self.cost_unit, self.cost_gamma = cost_limit, cost_unit, cost_gamma
+        self.multiplier_gains = {
+            "kp": multiplier_kp,
+            "ki": multiplier_ki,
+            "kd": multiplier_kd,
+            "smoothing": multiplier_smoothing,
+            "most": multiplier_most,
+        }
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        given = vars(self).get("_buffer_class") or self.replay_buffer_class or ReplayBuffer
+        self._buffer_class, self.replay_buffer_class = given, with_costs(given)
+        super()._setup_model()
+        known: EpisodeConstraint | None = vars(self).get("constraint")
+        self.constraint = EpisodeConstraint(
+            self.cost_limit, self.n_envs, unit=self.cost_unit, gains=self.multiplier_gains
+        )
+        if known is not None:  # of a file that is being loaded
+            self.constraint.multiplier.restore(known.multiplier.state())
+        # The policy begins, and explores, as it does without a constraint.
+        with th.random.fork_rng(devices=[]):
+            if self.seed is not None:
+                seed = np.random.SeedSequence(self.seed, spawn_key=(_OF_THE_CRITICS,))
+                th.manual_seed(int(seed.generate_state(1)[0]))
+            self.cost_critic = self.policy.make_critic()
+            self.cost_critic_target = self.policy.make_critic()
+        self.cost_critic_target.load_state_dict(self.cost_critic.state_dict())
+        self.cost_critic_target.set_training_mode(False)
+        self.cost_critic.optimizer = self.policy.optimizer_class(
+            self.cost_critic.parameters(),
+            lr=self.lr_schedule(1),  # pyright: ignore[reportCallIssue]
+            **self.policy.optimizer_kwargs,
+        )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: Any = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> Any:
+        if reset_num_timesteps or self._last_obs is None:
+            self.constraint.begin_episodes()
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
+        """Take the costs of a step, for whose place Stable-Baselines3 has no other method."""
+        super()._update_info_buffer(infos, dones)
+        self.constraint.observe(costs_of(infos), dones)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update the multiplier, and then everything else at each gradient step.
+
+        Args:
+            gradient_steps: number of them.
+            batch_size: of each.
+        """
+        self.constraint.update()
+        self.cost_critic.set_training_mode(True)
+        self._update_learning_rate(self.cost_critic.optimizer)
+        update = _Update(self)
+        with (
+            self.critic_target.register_forward_hook(update.keep_next_actions),
+            self.critic.register_forward_hook(update.price),
+            self.actor.optimizer.register_step_pre_hook(update.shrink),
+        ):
+            super().train(gradient_steps, batch_size)
+        self.cost_critic.set_training_mode(False)
+        self.logger.record("train/cost_critic_loss", np.mean(update.losses))
+        for name, value in self.constraint.figures().items():
+            self.logger.record(f"constraint/{name}", value)
+
+    def plain(self) -> SAC:
+        """Return the same model as SAC, whose files Stable-Baselines3 reads by itself."""
+        twin: Any = copy.copy(self)
+        twin.__class__ = SAC
+        twin.replay_buffer_class = self._buffer_class
+        for name in _OF_THE_CONSTRAINT:
+            del vars(twin)[name]
+        return twin
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        states, variables = super()._get_torch_save_params()
+        added = ["cost_critic", "cost_critic_target", "cost_critic.optimizer"]
+        return [*states, *added], variables
+
+
+class _Update:
+    """The part of a constraint in the gradient steps of one call of `SAC.train`.
+
+    Attributes:
+        losses: of the cost critics, at each gradient step.
+
+    Args:
+        model: that is trained.
+    """
+
+    def __init__(self, model: SACLagrangian) -> None:
+        self.losses: list[float] = []
+        self._model, self._weight = model, model.constraint.value
+        self._next_actions = th.empty(0)
+
+    def keep_next_actions(self, _: Any, inputs: tuple[Any, ...], __: Any) -> None:
+        """Keep the actions of the policy in the next states, of which the targets are taken.
+
+        Args:
+            _: the target critic.
+            inputs: that it was called with: next states and actions.
+            __: what it returned.
+        """
+        self._next_actions = inputs[1]
+
+    def price(self, _: Any, inputs: tuple[Any, ...], values: Any) -> Any:
+        """Subtract the priced cost from the values of the policy's actions.
+
+        Args:
+            _: the critic.
+            inputs: that it was called with: states and actions.
+            values: of each critic, shape (batch, 1).
+
+        Returns:
+            The values less l Q_c; None for the values as they are.
+        """
+        # Those of the replay buffer have no gradient.
+        if not inputs[1].requires_grad:
+            return None
+        self._step()
+        # 0 times a cost that has diverged is no number.
+        if self._weight == 0.0:
+            return None
+        price = self._weight * _larger(self._model.cost_critic(*inputs))
+        return tuple(value - price for value in values)
+
+    def shrink(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        """Divide the gradients of the actor by 1 + l.
+
+        Args:
+            optimizer: of the actor.
+            *_: what its step was called with.
+        """
+        if self._weight == 0.0:
+            return
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    parameter.grad.div_(1.0 + self._weight)
+
+    def _step(self) -> None:
+        """Take a gradient step of the cost critics, and move their targets."""
+        model, critic = self._model, self._model.cost_critic
+        buffer: Any = model.replay_buffer
+        steps, costs = buffer.last_sample()
+        gamma = model.gamma if model.cost_gamma is None else model.cost_gamma
+        with th.no_grad():
+            ahead = _larger(model.cost_critic_target(steps.next_observations, self._next_actions))
+            wanted = costs + (1.0 - steps.dones) * gamma * ahead
+        found = critic(steps.observations, steps.actions)
+        loss = th.stack([functional.mse_loss(values, wanted) for values in found]).sum() / 2.0
+        critic.optimizer.zero_grad()
+        loss.backward()
+        critic.optimizer.step()
+        if len(self.losses) % model.target_update_interval == 0:
+            polyak_update(critic.parameters(), model.cost_critic_target.parameters(), model.tau)
+        self.losses.append(loss.item())
+
+
+def _larger(values: tuple[th.Tensor, ...]) -> th.Tensor:
+    """Return the largest of the critics' values, shape (batch, 1)."""
+    return th.cat(values, dim=1).max(dim=1, keepdim=True).values
