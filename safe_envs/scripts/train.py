@@ -72,7 +72,10 @@ def train(
         str,
         typer.Option(
             metavar="executed|proposed|both",
-            help="On which action an off-policy algorithm learns with a filter in the loop.",
+            help=(
+                "On which action an off-policy algorithm learns with a filter in the loop;"
+                " Stable-Baselines3 by itself does on the proposed one."
+            ),
         ),
     ] = "executed",
     intervention_penalty: Annotated[
