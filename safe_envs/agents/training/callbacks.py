@@ -106,7 +106,7 @@ class SafetyFigures(BaseCallback):
 
 
 class CurriculumCallback(BaseCallback):
-    """Goes on with a curriculum after each step, and records it as `train/promise`.
+    """Goes on with a curriculum after each step, and records it as `train/probability`.
 
     Args:
         curriculum: to follow.
@@ -121,7 +121,7 @@ class CurriculumCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        self.logger.record("train/promise", self._asked)
+        self.logger.record("train/probability", self._asked)
 
 
 class ProgressLog(KVWriter):

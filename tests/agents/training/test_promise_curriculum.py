@@ -164,7 +164,7 @@ def test_it_resumes_bitwise(tmp_path, monkeypatch):
     assert (tmp_path / "without" / "policy.npz").read_bytes() != one
     log = (tmp_path / "parts" / "progress.jsonl").read_text()
     logged = [json.loads(x) for x in log.splitlines()]
-    values = [line["train/promise"] for line in logged if "train/promise" in line]
+    values = [line["train/probability"] for line in logged if "train/probability" in line]
     assert values == sorted(values)
     assert values[-1] == 0.97
 
