@@ -24,7 +24,7 @@ _TITLES = {
     "seconds": "s",
 }
 _PERCENT = ("safety", "interventions", "safety_alone")
-_WITHOUT_INTERVAL = ("seconds",)
+_WITHOUT_INTERVAL = ("violations", "seconds")
 
 
 def study_table(rows: Sequence[AgentSummary], differences: bool = False) -> Table:
@@ -73,7 +73,7 @@ def _text(name: str, estimate: SeedEstimate | None, differences: bool) -> str:
         return "-"
     factor = 100.0 if name in _PERCENT else 1.0
     ends = [factor * end for end in (estimate.value, estimate.low, estimate.high)]
-    digits = 0 if name in ("violations", *_WITHOUT_INTERVAL) else 1
+    digits = 0 if name in _WITHOUT_INTERVAL else 1
     sign = "+" if differences else ""
     value, low, high = (f"{end:{sign},.{digits}f}" for end in ends)
     return value if name in _WITHOUT_INTERVAL else f"{value} [{low}, {high}]"
