@@ -104,6 +104,14 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
             "promise_curriculum = 0.9",
         ),
         (("--algo", "ppo", "--resume"), "holds no training"),
+        (("--algo", "ppo", "--cost-limit", 1), "ppo has no cost_limit; leave it out, or choose"),
+        (("--algo", "sac-lag", "--violation-limit", 1), "is a probability"),
+        (("--algo", "ppo-lag", "--cost-limit", "nan"), "cost_limit = nan; give a finite number"),
+        (("--algo", "ppo-lag", "--cost-limit", 1, "--violation-limit", 0.1), "give one"),
+        (("--algo", "ppo-lag", "--set", "cost_limit=1"), "give the limit by --cost-limit"),
+        (("--algo", "ppo-lag", "--set", "multiplier_kq=1"), "did you mean 'multiplier_kp'"),
+        (("--algo", "ppo-lag", "--set", "multiplier_ki=-1"), "multiplier_ki = -1"),
+        (("--algo", "ppo-lag", "--set", "cost_gamma=soon"), "cost_gamma = 'soon'; give a number"),
     ],
 )
 def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(
@@ -158,6 +166,24 @@ def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command
     status, _, err = safe_envs_command(*arguments, "--seed", 1)
     assert status == 2
     assert "give another --out" in err
+
+
+def test_an_agent_under_a_limit_is_told_to_keep_it_or_not(safe_envs_command):
+    Path("own.py").write_text(SYSTEM)
+    given = ("--algo", "ppo-lag", "--num-envs", 4, "--eval-episodes", 8, "--set", "n_steps=32")
+    arguments = ("train", "--system", "own.py:problem", *given, "--n-timesteps", 1024)
+    limit = ("--eval-freq", 1024, "--out", "run", "--violation-limit")
+    status, out, err = safe_envs_command(*arguments, *limit, 0.2, "--json", "run.json")
+    assert (status, err) == (0, "")
+    assert "P(any violation) <= 20 %. Measured:" in " ".join(out.split())
+    last = strictly("run.json")["evaluations"][-1]
+    assert last["constraint"]["limit"] == 0.2
+    evaluated = ("--policy", "run", "--filter", "none", "--episodes", 8)
+    assert safe_envs_command("evaluate", "--system", "own.py:problem", *evaluated)[::2] == (0, "")
+    assert safe_envs_command(*arguments, *limit, 0.2, "--resume")[0] == 0
+    status, _, err = safe_envs_command(*arguments, *limit, 0.3, "--resume")
+    assert status == 2
+    assert "violation_limit = 0.2, not 0.3" in err
 
 
 def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_command):

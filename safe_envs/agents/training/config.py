@@ -94,6 +94,7 @@ class Training:
     violation_limit: float | None = None
 
     def __post_init__(self) -> None:
+        self._require_limits()
         try:
             json.dumps(asdict(self), allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -103,7 +104,6 @@ class Training:
         for name, least in _LEAST.items():
             require_whole(name, getattr(self, name), least)
         require_engine(self.engine)
-        self._require_limits()
         self.curriculum  # noqa: B018  (which refuses what is out of range)
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
@@ -157,6 +157,12 @@ class Training:
         if self.algorithm not in CONSTRAINED:
             return None
         return COST if self.violation_limit is None else VIOLATION
+
+    @property
+    def env_options(self) -> dict[str, Any]:
+        """Arguments of the envs of the training, of which those of the evaluations are a part."""
+        ends = {"terminate_on_violation": True} if self.limit_kind == VIOLATION else {}
+        return {**self.options, **ends}
 
     @property
     def constraint(self) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Replay buffers that hold the cost of each step beside its reward."""
+"""Replay buffers that hold the cost of each step in addition to its reward."""
 
 from __future__ import annotations
 

@@ -7,12 +7,16 @@ function calls a network or an optimizer:
 - the target critic is called with the next states and the actions that the policy takes there:
   these are kept for the targets of the cost critics, which so need no random numbers;
 - the critic is called with the states and the policy's actions: first the cost critics take their
-  gradient step, and then l Q_c is subtracted from each Q_r that the critic returns;
+  gradient step, and then l s Q_c is subtracted from each Q_r that the critic returns;
 - before the actor's optimizer steps, the gradients are divided by 1 + l.
 
-So the actor descends on (alpha log pi - min Q_r + l max Q_c) / (1 + l), and with l = 0 all numbers
-are those of SAC, bit for bit. A loop of training with one gradient step each, the other way
+So the actor descends on (alpha log pi - min Q_r + l s max Q_c) / (1 + l), and with l = 0 all
+numbers are those of SAC, bit for bit. A loop of training with one gradient step each, the other way
 without a copy, would change SAC with a `target_update_interval` above 1.
+
+The scale s is the mean of |min Q_r| over the batch, or a given number. With the former the same
+gains of the multiplier serve rewards of any unit: at l = 1 a cost of 1 weighs as much as the
+discounted rewards ahead.
 
 Sources: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018, arXiv:1812.05905;
     Ha et al., "Learning to Walk in the Real World with Minimal Human Effort", 2020,
@@ -24,6 +28,7 @@ Sources: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018,
 from __future__ import annotations
 
 import copy
+import math
 from typing import Any
 
 import numpy as np
@@ -44,6 +49,7 @@ _OF_THE_CONSTRAINT = (
     "cost_limit",
     "cost_unit",
     "cost_gamma",
+    "cost_scale",
     "multiplier_gains",
     "constraint",
     "cost_critic",
@@ -70,6 +76,7 @@ class SACLagrangian(SAC):
         cost_limit: greatest expected cost of an episode.
         cost_unit: unit of the excess that the multiplier sees, see `EpisodeConstraint`.
         cost_gamma: discount of the costs; that of the rewards by default.
+        cost_scale: s, positive; by default the mean of |min Q_r| over each batch.
         multiplier_kp: proportional gain of the multiplier, see `PIDMultiplier`.
         multiplier_ki: integral gain.
         multiplier_kd: derivative gain.
@@ -81,12 +88,13 @@ class SACLagrangian(SAC):
         ConfigurationError: an argument is out of range, or the buffer cannot hold costs.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (hyperparameters)
         self,
         *args: Any,
         cost_limit: float = 0.0,
         cost_unit: float = 1.0,
         cost_gamma: float | None = None,
+        cost_scale: float | None = None,
         multiplier_kp: float = 0.5,
         multiplier_ki: float = 0.5,
         multiplier_kd: float = 0.0,
@@ -96,11 +104,14 @@ class SACLagrangian(SAC):
     ) -> None:
         if cost_gamma is not None and not 0.0 <= cost_gamma <= 1.0:
             raise ConfigurationError(f"cost_gamma = {cost_gamma!r}; give a number from 0 to 1")
+        if cost_scale is not None and not 0.0 < cost_scale < math.inf:
+            raise ConfigurationError(f"cost_scale = {cost_scale!r}; give a positive number")
         if kwargs.get("n_steps", 1) != 1:
             raise ConfigurationError(
                 f"n_steps = {kwargs['n_steps']!r}: costs have targets of one step; set n_steps=1"
             )
-        self.cost_limit, self.cost_unit, self.cost_gamma = cost_limit, cost_unit, cost_gamma
+        self.cost_limit, self.cost_unit = cost_limit, cost_unit
+        self.cost_gamma, self.cost_scale = cost_gamma, cost_scale
         self.multiplier_gains = {
             "kp": multiplier_kp,
             "ki": multiplier_ki,
@@ -225,7 +236,7 @@ class _Update:
             values: of each critic, shape (batch, 1).
 
         Returns:
-            The values less l Q_c; None for the values as they are.
+            The values less l s Q_c; None for the values as they are.
         """
         # Those of the replay buffer have no gradient.
         if not inputs[1].requires_grad:
@@ -234,7 +245,10 @@ class _Update:
         # 0 times a cost that has diverged is no number.
         if self._weight == 0.0:
             return None
-        price = self._weight * _larger(self._model.cost_critic(*inputs))
+        scale: Any = self._model.cost_scale
+        if scale is None:
+            scale = th.cat(values, dim=1).detach().min(dim=1).values.abs().mean()
+        price = self._weight * scale * _larger(self._model.cost_critic(*inputs))
         return tuple(value - price for value in values)
 
     def shrink(self, optimizer: th.optim.Optimizer, *_: Any) -> None:

@@ -37,7 +37,7 @@ from safe_envs.agents.training.checkpoints import (
 )
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.hyperparameters import OFF_POLICY
-from safe_envs.agents.training.limits import VIOLATION, judged, rank
+from safe_envs.agents.training.limits import judged, rank
 from safe_envs.agents.training.run_folder import (
     BEST,
     EVALUATIONS,
@@ -146,8 +146,7 @@ class TrainingSession:
                 knowledge=training.knowledge,
                 intervention_penalty=training.intervention_penalty,
                 engine=engine_for(training.engine, training.n_timesteps),
-                terminate_on_violation=training.limit_kind == VIOLATION or None,
-                **training.options,
+                **training.env_options,
             )
         )
         action = training.action if training.learns_on_executed else None

@@ -55,7 +55,8 @@ def make_sb3_env(
         seed: Env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later
             and replaces it.
         engine: "numpy", "compiled" or "auto"; see `SafeVectorEnv`.
-        **options: arguments of `gym.make`; those that are None are left out.
+        **options: arguments of `gym.make`, also `terminate_on_violation`; those that are None are
+            left out.
 
     Raises:
         ConfigurationError: an id, a filter or an argument is unknown or out of range.

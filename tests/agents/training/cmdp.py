@@ -64,7 +64,8 @@ def best(limit):
     """Solve the linear program over occupation measures x(s, a), expected visits of an episode.
 
     Returns:
-        The return, the probability of boldness in each state, and the multiplier.
+        The return, the probability of boldness in each state (0 where it never is), and the
+        multiplier.
 
     Source: Altman, "Constrained Markov Decision Processes", 1999, chapter 3.
     """
@@ -77,7 +78,8 @@ def best(limit):
         b_eq=START,
     )
     visits = found.x.reshape(3, 2)
-    return -found.fun, visits[:, BOLD] / visits.sum(axis=1), -found.ineqlin.marginals[0]
+    bold = visits[:, BOLD] / np.maximum(visits.sum(axis=1), 1e-12)
+    return -found.fun, bold, -found.ineqlin.marginals[0]
 
 
 def value_of(bold):

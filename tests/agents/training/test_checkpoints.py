@@ -38,7 +38,9 @@ PPO = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_ar
 
 def training(algorithm="ppo", changes=None, **arguments):
     """Two parts of a few steps; episodes of 10 steps do not end where they do."""
-    known = {"ppo": PPO, "a2c": {"policy_kwargs": {"net_arch": [8]}}}.get(algorithm, SAC)
+    known = {"ppo": PPO, "ppo-lag": PPO, "a2c": {"policy_kwargs": {"net_arch": [8]}}}.get(
+        algorithm, SAC
+    )
     given = {
         "filter": "scbf",
         "num_envs": 2,
@@ -100,6 +102,10 @@ def outcome(folder):
             },
             {},
         ),
+        ("ppo-lag", {"normalize": True}, {"filter": None}),
+        ("ppo-lag", {"use_sde": True, "multiplier_smoothing": 0.5}, {"cost_limit": 0.5}),
+        ("sac-lag", {}, {"action": "both"}),
+        ("sac-lag", {"buffer_size": 40}, {"filter": None, "cost_limit": 0.5}),
     ],
     ids=[
         "normalised",
@@ -109,6 +115,10 @@ def outcome(folder):
         "n-step-full-buffer",
         "small-memory",
         "noise",
+        "violation-limit",
+        "cost-limit",
+        "off-policy-violation-limit",
+        "off-policy-cost-limit",
     ],
 )
 def test_a_stopped_training_ends_as_one_that_was_not(algorithm, changes, arguments, tmp_path):

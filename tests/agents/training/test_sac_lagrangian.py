@@ -94,9 +94,10 @@ def test_a_multiplier_changes_the_policy_and_only_after_its_first_update():
     assert not torch.equal(constrained.policy.actor.mu.weight, learned(SAC).policy.actor.mu.weight)
 
 
-def test_the_actor_descends_on_the_weighted_loss(monkeypatch):
-    """Against the loss (alpha log pi - min Q_r + l max Q_c)/(1 + l), written out here."""
-    model = learned(SACLagrangian)
+@pytest.mark.parametrize("scale", [None, 3.0])
+def test_the_actor_descends_on_the_weighted_loss(scale, monkeypatch):
+    """Against the loss (alpha log pi - min Q_r + l s max Q_c)/(1 + l), written out here."""
+    model = learned(SACLagrangian, cost_scale=scale)
     weight, alpha = model.constraint.value, model.log_ent_coef.exp().item()
     assert weight > 0.0
     before = copy.deepcopy(model.actor)
@@ -113,7 +114,8 @@ def test_the_actor_descends_on_the_weighted_loss(monkeypatch):
     actions, log_prob = before.action_log_prob(states)
     rewards = torch.minimum(*model.critic(states, actions))
     costs = torch.maximum(*model.cost_critic(states, actions))
-    loss = (alpha * log_prob[:, None] - rewards + weight * costs).mean() / (1.0 + weight)
+    weighted = weight * (rewards.detach().abs().mean() if scale is None else scale) * costs
+    loss = (alpha * log_prob[:, None] - rewards + weighted).mean() / (1.0 + weight)
     wanted = torch.autograd.grad(loss, list(before.parameters()))
     for found, gradient in zip(gradients, wanted, strict=True):
         torch.testing.assert_close(found, gradient, rtol=1e-4, atol=1e-7)
@@ -176,6 +178,7 @@ def test_random_numbers_of_the_cost_critics_follow_from_the_seed():
     ("arguments", "message"),
     [
         ({"cost_gamma": 1.5}, "cost_gamma = 1.5"),
+        ({"cost_scale": 0.0}, "cost_scale = 0.0"),
         ({"cost_limit": -1.0}, "limit of the cost"),
         ({"multiplier_ki": -1.0}, "ki = -1.0"),
         ({"n_steps": 3}, "n_steps=1"),
