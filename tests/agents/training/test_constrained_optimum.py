@@ -31,7 +31,7 @@ class Values(BaseCallback):
         self.found.append(value_of(boldness(self.model)))
 
 
-def trained(kind, steps, seed, count=32, **settings):
+def trained(kind, steps, seed, count, **settings):
     """Return the mean return and cost of the second half of a training, and the model."""
     torch.set_num_threads(1)
     envs = DummyVecEnv([IcyRoad] * count)
@@ -50,14 +50,18 @@ def trained(kind, steps, seed, count=32, **settings):
 
 
 PPO = {
+    "count": 64,
     "n_steps": 32,
-    "batch_size": 1024,
+    "batch_size": 2048,
     "learning_rate": 0.03,
+    # Without it the random actions die out, and with them what is learned about others.
+    "ent_coef": 0.02,
     "policy_kwargs": {"net_arch": []},
     "multiplier_kp": 1.0,
-    "multiplier_ki": 0.1,
+    "multiplier_ki": 0.5,
 }
 SAC = {
+    "count": 32,
     "train_freq": 4,
     "gradient_steps": 4,
     "batch_size": 128,
@@ -127,7 +131,10 @@ QUICK_SAC = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "settings", "steps"),
-    [(PPOLagrangian, PPO, 20_000), (SACLagrangian, SAC | QUICK_SAC, 12_000)],
+    [
+        (PPOLagrangian, PPO | {"count": 32, "batch_size": 1024}, 20_000),
+        (SACLagrangian, SAC | QUICK_SAC, 12_000),
+    ],
 )
 def test_learners_come_near_the_best_policy(kind, settings, steps):
     # Without a constraint the best policy has a return of 8.45 and a cost of 1.81.
@@ -138,9 +145,12 @@ def test_learners_come_near_the_best_policy(kind, settings, steps):
 
 @pytest.mark.oracle
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize(("kind", "settings"), [(PPOLagrangian, PPO), (SACLagrangian, SAC)])
-def test_learners_find_the_best_policy_within_two_percent(kind, settings, seed):
-    (value, cost), model = trained(kind, 300_000, seed, **settings)
+@pytest.mark.parametrize(
+    ("kind", "settings", "steps"),
+    [(PPOLagrangian, PPO, 500_000), (SACLagrangian, SAC, 300_000)],
+)
+def test_learners_find_the_best_policy_within_two_percent(kind, settings, steps, seed):
+    (value, cost), model = trained(kind, steps, seed, **settings)
     assert value == pytest.approx(best(LIMIT)[0], rel=0.02)
     assert cost == pytest.approx(LIMIT, rel=0.02)
     if kind is SACLagrangian:
