@@ -19,6 +19,7 @@ from safe_envs.errors import (
     shown,
 )
 from safe_envs.problem.actuators import Limits, rate_limits, require_delay
+from safe_envs.problem.backup import BackupSource, require_backup
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
@@ -73,6 +74,7 @@ class SafetyProblem:
         slew_limit: bounds of the rates of the plant's actuators, see `ProblemOptions`; () without.
         rates: bounds of the rates of inputs that have become states, see
             `safe_envs.problem.rate_limits`; () without.
+        backup: laws that bring the system to a set that is safe for good, if any; see `Backup`.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -106,6 +108,7 @@ class SafetyProblem:
     model_delay: int | None = None
     slew_limit: Limits = ()
     rates: Limits = ()
+    backup: BackupSource | None = None
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -156,6 +159,7 @@ class SafetyProblem:
             self.clf.require_known(model, model.states)
         if self.frame is not None:
             self.frame.require_known(plant)
+        require_backup(self.backup, plant)
         for i in self.inputs:
             if not -_WIDEST <= i.low < i.high <= _WIDEST:
                 raise ConfigurationError(

@@ -66,6 +66,7 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
       relative degree 1 gives way to "szcbf" with noise, "hocbf" without.
     - The reward, an expression of the executed input, takes the one that a period ends with.
     - The goal of the joint QP is left out: of its V, one derivative does not hold the rate.
+    - The backup is left out: its laws give the input, not the rate.
 
     Args:
         problem: a `SafetyProblem` without limits.
@@ -102,6 +103,7 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
         "gains": _extended(problem.gains, 1.0 / problem.dt),
         "filter": problem.filter if problem.filter in _DEGREE_FREE else suitable,
         "clf": None,
+        "backup": None,
         "sampling": _sampling(problem.sampling, ranges),
         "frame": _framed(problem.frame, problem.inputs),
         "rates": limits,

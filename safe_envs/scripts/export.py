@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from safe_envs.errors import require_whole
+from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
@@ -72,7 +72,7 @@ def export(
     """
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.export_report import ExportAnswer, print_export
-    from safe_envs.wrappers.conditions.text_parts import names_promise
+    from safe_envs.wrappers.conditions.text_parts import names_backup, names_promise
     from safe_envs.wrappers.export import ExportOptions
     from safe_envs.wrappers.value.promise_text import PromiseSettings
 
@@ -85,6 +85,11 @@ def export(
     units = {v.symbol.name: v.unit for v in (*problem.states, *problem.inputs)}
     options = ExportOptions(name, units, problem.sampling_domain.region)
     tried = (states, seed) if compare else None
+    if names_backup(text):
+        raise ConfigurationError(
+            f"the filter {text} has no form in C: it simulates plans. Export a condition, such as"
+            f" {problem.filter}, or the promise filter"
+        )
     if names_promise(text):
         settings = PromiseSettings.of_text(text)
         settings.require_fit(problem, objective)

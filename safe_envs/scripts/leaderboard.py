@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 FEW = ("safe_envs/Pendulum-v0", "safe_envs/StochasticDubins-v0", "safe_envs/QuadrotorLimits-v0")
 """The envs of a leaderboard for which none is named: noise, noise and turns, several limits."""
 
+QUICK = ("safe_envs/Pendulum-v0", "safe_envs/Scalar-v0", "safe_envs/QuadrotorLimits-v0")
+"""Those of --quick, whose tables take seconds."""
+
 _QUICK_SEEDS, _SEEDS = 2, 5
 
 
@@ -35,7 +38,7 @@ def leaderboard(
         list[str] | None,
         typer.Argument(
             metavar="[ENV_ID]...",
-            help=f"Envs; by default {', '.join(FEW)}.",
+            help=f"Envs; by default {', '.join(FEW)}, and with --quick {', '.join(QUICK)}.",
             autocompletion=completion.env_ids,
         ),
     ] = None,
@@ -79,7 +82,8 @@ def leaderboard(
             "--best",
             help=(
                 "Compute the best attainable safety of each env, and the largest return at each"
-                " chance of a violation; without it those are shown that were computed before."
+                " chance of a violation; without it those are shown that were computed before,"
+                " with --quick by this command."
             ),
         ),
     ] = False,
@@ -128,7 +132,7 @@ def leaderboard(
             f"--all and {', '.join(env_ids)} are given; leave one of the two out"
         )
     study = board(
-        ENV_IDS if all_envs else env_ids or FEW,
+        ENV_IDS if all_envs else env_ids or (QUICK if quick else FEW),
         algo=algo,
         seeds=seeds or (_QUICK_SEEDS if quick else _SEEDS),
         seed=seed,
@@ -146,7 +150,7 @@ def leaderboard(
             tell or (lambda _: None),
             lambda text: print(text, file=sys.stderr, flush=True),
         )
-    report = _report(found, out, best)
+    report = _report(found, out, best or (False if quick else None))
     if pictures is not None:
         _draw(report, pictures)
     written = leaderboard_markdown(report, _links(report, pictures, page))
@@ -166,7 +170,7 @@ def leaderboard(
     write_result(json_file, lambda: document | report.document())
 
 
-def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
+def _report(found: Any, out: Path, best: bool | None) -> LeaderboardReport:
     """Return the statistics of a study, with what is known of what could be had."""
     from safe_envs.agents.training.leaderboard import (
         attainable_of,
@@ -181,9 +185,9 @@ def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
         entry_of(found, e, variant.name) for e in study.env_ids for variant in study.variants
     ]
     with progress_bar("Best attainable safety") as tell:
-        known = attainable_of(study.env_ids, best, tell or (lambda _: None))
+        known = attainable_of(study.env_ids, out, best, tell or (lambda _: None))
     with progress_bar("Largest returns") as tell:
-        frontiers = frontiers_of(study.env_ids, out, best, tell or (lambda _: None))
+        frontiers = frontiers_of(study.env_ids, out, bool(best), tell or (lambda _: None))
     return LeaderboardReport(
         found,
         tuple(entry for entry in entries if entry is not None),

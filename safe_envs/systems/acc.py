@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -14,6 +15,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
+from safe_envs.systems._braking import braking_backup
 from safe_envs.systems._common import positive
 
 u = sp.Symbol("u", real=True)
@@ -28,12 +30,17 @@ _DESIRED_SPEED = 22
 LEAD_SPEED = 20.0
 
 
-def own_acceleration(speed: sp.Symbol) -> sp.Expr:
-    """Return -F_r/M, without engine force, with the drag F_r = f_0 + f_1 v + f_2 v^2.
+def drag(speed: sp.Expr) -> sp.Expr:
+    """Return F_r = f_0 + f_1 v + f_2 v^2, in N.
 
     Source: thesis Sec. 4.3.1.
     """
-    return -(f_0 + f_1 * speed + f_2 * speed**2) / M
+    return f_0 + f_1 * speed + f_2 * speed**2
+
+
+def own_acceleration(speed: sp.Symbol) -> sp.Expr:
+    """Return -F_r/M, without engine force."""
+    return -drag(speed) / M
 
 
 def near_desired_speed(speed: sp.Symbol) -> sp.Expr:
@@ -105,6 +112,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
 
     Source: thesis Sec. 4.3.1.
     """
+    headway = positive("tau", tau)
     return cruise(
         "ACC",
         system=headway_system(),
@@ -112,7 +120,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         rate=rate,
         slack_weight=slack_weight,
         reward=near_desired_speed(x_1),
-        barriers=(Barrier(x_3 - positive("tau", tau) * x_1),),
+        barriers=(Barrier(x_3 - headway * x_1),),
         states=(
             Variable(x_1, 0.0, 50.0, "m/s"),
             Variable(x_2, 0.0, 50.0, "m/s"),
@@ -127,6 +135,15 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         scene="road",
         sampling=SamplingDomain(
             region=((10.0, 25.0), (15.0, 25.0), (20.0, 200.0)), inputs=((-4000.0,), (4000.0,))
+        ),
+        backup=partial(
+            braking_backup,
+            speed=x_1,
+            lead=x_2,
+            distance=x_3 - headway * x_1,
+            headway=headway,
+            drag=drag,
+            mass=M,
         ),
     )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
@@ -12,12 +14,14 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
+from safe_envs.systems._braking import braking_backup
 from safe_envs.systems._common import positive
 from safe_envs.systems.acc import (
     CAR,
     LEAD_SPEED,
     M,
     cruise,
+    drag,
     near_desired_speed,
     own_acceleration,
     sigma_1,
@@ -67,6 +71,7 @@ def acc_gap(
             f"power = {shown(power)}; give an odd whole number from 1, so that h changes its sign"
             " at the distance"
         )
+    gap = positive("distance", distance)
     return cruise(
         "ACCGap",
         system=gap_system(),
@@ -74,7 +79,7 @@ def acc_gap(
         rate=rate,
         slack_weight=slack_weight,
         reward=near_desired_speed(v) * _CLOSENESS,
-        barriers=(Barrier((z - positive("distance", distance)) ** power),),
+        barriers=(Barrier((z - gap) ** power),),
         states=(Variable(v, 0.0, 50.0, "m/s"), Variable(z, 0.0, 500.0, "m")),
         features=(
             Feature("v", v, 0.0, 50.0),
@@ -89,6 +94,9 @@ def acc_gap(
         plane=("v", "z"),
         scene="road",
         sampling=SamplingDomain(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
+        backup=partial(
+            braking_backup, speed=v, lead=v_f, distance=z - gap, headway=0.0, drag=drag, mass=M
+        ),
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -18,6 +19,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import in_disk, positive, uniforms
+from safe_envs.systems._turning import turning_backup
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
 v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
@@ -191,6 +193,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
         horizon=50.0,
         gains=gains,
         filter="hocbf",
+        backup=partial(turning_backup, speed=v, radius=r),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import sympy as sp
 
@@ -13,6 +14,7 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME, Feature
 from safe_envs.systems._common import around, uniforms
+from safe_envs.systems._levelling import levelling_backup
 from safe_envs.systems.quadrotor import (
     LARGEST_TILT,
     phi,
@@ -88,6 +90,9 @@ def quadrotor_limits(
             )
         },
         gains=((2.0, 8.0), (2.0, 8.0), (3.0, 12.0)),
+        backup=partial(
+            levelling_backup, middle=(low + high) / 2, reach=(high - low) / 2, tilt=angle
+        ),
     )
 
 

@@ -50,7 +50,7 @@ _LEFT_OUT = (
     "timing",
     "seconds",
     "learning_seconds",
-    "trained_in",
+    "minutes",
     "steps_per_second",
     "sha256",
     "key",

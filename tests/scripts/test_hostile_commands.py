@@ -65,7 +65,9 @@ LONG = "x" * 100_000
         (("sweep-report", "."), "holds no sweep"),
         (("benchmark", "--compare", "pipe"), "it is a pipe or a device"),
         (("benchmark", "--compare", "deep.json"), "is no JSON"),
-        (("leaderboard", "Scalar-v0", "--out", "."), "results/Scalar-v0.json cannot be read"),
+        (("leaderboard", "Scalar-v0", "--out", "."), "holds a leaderboard of an earlier version"),
+        (("leaderboard", "Scalar-v0", "--out", "b", "--page", "deep.json"), "needs the line"),
+        (("leaderboard", "Scalar-v0", "--out", "b", "--page", "pipe"), "cannot be read"),
     ],
     ids=lambda given: " ".join(map(str, given))[:40] if isinstance(given, tuple) else "",
 )

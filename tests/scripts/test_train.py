@@ -1,4 +1,4 @@
-"""`safe-envs train` and `safe-envs leaderboard` as a person types them."""
+"""`safe-envs train` as a person types it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from safe_envs.wrappers.learning.data.files import load
-from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 
 pytestmark = pytest.mark.slow
@@ -124,66 +123,6 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(
     assert "Traceback" not in err
     assert message in " ".join(err.split())
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
-    monkeypatch.setattr(
-        "safe_envs.agents.training.leaderboard._QUICK",
-        {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4},
-    )
-    arguments = (
-        "leaderboard",
-        "Scalar-v0",
-        "safe_envs/Scalar-v0",
-        "--quick",
-        "--episodes",
-        8,
-        "--out",
-        "board",
-    )
-    status, out, err = safe_envs_command(*arguments)
-    assert (status, err) == (0, "")
-    rows = strictly("board/results/Scalar-v0.json")["rows"]
-    assert [(row["policy"], row["filter"]) for row in rows] == [
-        ("nominal", "none"),
-        ("nominal", "scbf"),
-        ("ppo", "none"),
-        ("ppo", "scbf"),
-        ("ppo, filter in the loop", "scbf"),
-    ]
-    assert "Scalar-v0" in out
-    again = safe_envs_command(*arguments, "--markdown")
-    assert again[0] == 0
-    first, _, row = again[1].splitlines()
-    assert (
-        first
-        == "| env | filter | nominal | nominal + filter | ppo | ppo + filter | ppo, filter in the"
-        " loop | processor time |"
-    )
-    assert row.startswith("| Scalar | scbf | ")
-    assert strictly("board/results/Scalar-v0.json")["rows"] == rows
-    status, _, err = safe_envs_command(*arguments, "--seed", 1)
-    assert status == 2
-    assert "give another --out" in err
-
-
-def test_an_agent_under_a_limit_is_told_to_keep_it_or_not(safe_envs_command):
-    Path("own.py").write_text(SYSTEM)
-    given = ("--algo", "ppo-lag", "--num-envs", 4, "--eval-episodes", 8, "--set", "n_steps=32")
-    arguments = ("train", "--system", "own.py:problem", *given, "--n-timesteps", 1024)
-    limit = ("--eval-freq", 1024, "--out", "run", "--violation-limit")
-    status, out, err = safe_envs_command(*arguments, *limit, 0.2, "--json", "run.json")
-    assert (status, err) == (0, "")
-    assert "P(any violation) <= 20 %. Measured:" in " ".join(out.split())
-    last = strictly("run.json")["evaluations"][-1]
-    assert last["constraint"]["limit"] == 0.2
-    evaluated = ("--policy", "run", "--filter", "none", "--episodes", 8)
-    assert safe_envs_command("evaluate", "--system", "own.py:problem", *evaluated)[::2] == (0, "")
-    assert safe_envs_command(*arguments, *limit, 0.2, "--resume")[0] == 0
-    status, _, err = safe_envs_command(*arguments, *limit, 0.3, "--resume")
-    assert status == 2
-    assert "violation_limit = 0.2, not 0.3" in err
 
 
 def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_command):

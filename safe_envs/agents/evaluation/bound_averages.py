@@ -9,10 +9,7 @@ from safe_envs.agents.evaluation.guarantees import GuaranteeAverager
 from safe_envs.agents.evaluation.held_input import HeldAverager, held_averager_of
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.wrappers.value.promise_text import PromiseSettings
-
-STEPS_ONLY = "its table is of the env's own steps"
-"""Why a promise filter has no bound for continuous control."""
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 
 
 class BoundAverager:
@@ -28,14 +25,16 @@ class BoundAverager:
         self, of: FilteredPolicy, monitoring: str = "discrete", why_not: str | None = None
     ) -> None:
         self._held: HeldAverager = held_averager_of(of, monitoring, why_not)
-        self._continuous: GuaranteeAverager | None = None
-        if not isinstance(of.parts, PromiseSettings):
+        self._continuous: GuaranteeAverager | str
+        if isinstance(of.parts, FilterSettings):
+            self._continuous = of.parts.only_of_steps
+        else:
             self._continuous = GuaranteeAverager(of.parts, of.problem, of.knowledge, why_not)
 
     def add(self, starts: np.ndarray) -> None:
         """Add the starts of a batch, shape (E, n)."""
         self._held.add(starts)
-        if self._continuous is not None:
+        if not isinstance(self._continuous, str):
             self._continuous.add(starts)
 
     def summary(self, visited: VisitedStates) -> BoundSummary:
@@ -45,8 +44,8 @@ class BoundAverager:
             visited: states of the episodes; bounds that they contradict are withheld.
         """
         found = (
-            BoundSummary(continuous_note=STEPS_ONLY)
-            if self._continuous is None
+            BoundSummary(continuous_note=self._continuous)
+            if isinstance(self._continuous, str)
             else self._continuous.summary(visited)
         )
         return self._held.put_in(found, visited)

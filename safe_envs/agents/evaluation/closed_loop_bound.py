@@ -10,13 +10,13 @@ from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shown
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.value.closed_loop import ClosedLoop, ClosedLoopTable
 from safe_envs.wrappers.value.closed_loop_cache import (
     closed_loop_at_hand,
     closed_loop_for,
     is_any_at_hand,
 )
-from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 _FORMULAS = ("nominal", "zero")
 """Policies that are formulas of the state."""
@@ -74,10 +74,9 @@ def closed_loop_bound(of: FilteredPolicy) -> ClosedLoopBound | None:
         of: the policy and the filter, or the policy alone.
 
     Returns:
-        None for a promise filter, which has a table of its own, and where no table was asked for
-        and none is kept.
+        None for a filter that acts by itself, and where no table was asked for and none is kept.
     """
-    if of.closed_loop is False or isinstance(of.parts, PromiseSettings):
+    if of.closed_loop is False or isinstance(of.parts, FilterSettings):
         return None
     if not (of.closed_loop or is_any_at_hand()):
         return None
@@ -108,7 +107,7 @@ def compute_closed_loop(
         is none, as `closed_loop_bound` says.
     """
     table = None
-    if not isinstance(of.parts, PromiseSettings):
+    if not isinstance(of.parts, FilterSettings):
         try:
             table = closed_loop_for(_loop_of(of), progress)
         except SafeEnvsError:
@@ -120,7 +119,7 @@ def compute_closed_loop(
 
 def _loop_of(of: FilteredPolicy) -> ClosedLoop:
     """Return the closed loop of a policy under a filter; raise SafeEnvsError if it is not one."""
-    assert not isinstance(of.parts, PromiseSettings)
+    assert not isinstance(of.parts, FilterSettings)
     policy = of.policy if of.policy in _FORMULAS else "any"
     if not of.parts and policy == "any":
         raise ConfigurationError(

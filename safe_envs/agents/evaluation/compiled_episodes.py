@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.bridge_source import bridge_draws, bridge_source
+from safe_envs.agents.evaluation.decision_source import Decider, decision_source
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.episode_kernel import play_episodes
 from safe_envs.agents.evaluation.rounding import touching
@@ -25,8 +26,6 @@ from safe_envs.dynamics.philox import key_of
 from safe_envs.envs.world_source import noise_channels, world_source
 from safe_envs.errors import NotCompilableError, shortened
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.filter_qp import FilterQP
-from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
 
 _PARTS = 8
 """Parts for each thread at least, so that all threads end at about the same time."""
@@ -41,7 +40,7 @@ class CompiledEpisodes:
     Args:
         problem: what to simulate.
         policy: who acts.
-        qp: of the filter; None without one.
+        decider: of the filter; None without one.
         continuous: whether to monitor h between control instants.
 
     Raises:
@@ -49,13 +48,13 @@ class CompiledEpisodes:
     """
 
     def __init__(
-        self, problem: SafetyProblem, policy: Any, qp: FilterQP | None, continuous: bool
+        self, problem: SafetyProblem, policy: Any, decider: Decider | None, continuous: bool
     ) -> None:
         data = Data()
         source = (
             world_source(problem, data)
             + policy_source(policy, problem, data)
-            + (unfiltered_source(len(problem.inputs)) if qp is None else filter_source(qp, data))
+            + decision_source(decider, len(problem.inputs), data)
             + bridge_source(problem, continuous, data)
         )
         self._problem, self._data, self._work = problem, data.array(), max(source.work, 1)
@@ -64,7 +63,7 @@ class CompiledEpisodes:
         ahead = 4 * math.ceil(problem.steps / (4 * parts))
         self._sizes = problem.steps, ahead, channels, draws
         self._uniforms = len(problem.starts[problem.start].uniforms)
-        what = "episodes" if qp is None else "filtered episodes"
+        what = "episodes" if decider is None else "filtered episodes"
         self.program = Program(f"{what} of {problem.name}", (play_episodes,), source)
 
     def compiled(self) -> Functions:

@@ -13,7 +13,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.certificates.certificate import HeldCertificate
 from safe_envs.wrappers.certificates.matching import system_differences
 from safe_envs.wrappers.conditions import Certified, Condition
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
 from safe_envs.wrappers.verification.held_check import stated_bound, why_not_proved
 
@@ -80,7 +80,7 @@ def held_certificate_bound(of: FilteredPolicy) -> HeldCertificateBound | None:
     Args:
         of: a policy, which does not matter, and the filter.
     """
-    if isinstance(of.parts, PromiseSettings):
+    if isinstance(of.parts, FilterSettings):
         return None
     certificates = (c.certificate for c in of.parts if isinstance(c, Certified))
     held = next((c for c in certificates if isinstance(c, HeldCertificate)), None)

@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from safe_envs.agents.evaluation.backup_bound import backup_bound
 from safe_envs.agents.evaluation.closed_loop_bound import closed_loop_bound
 from safe_envs.agents.evaluation.contradiction import without_held
 from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
@@ -59,7 +60,7 @@ class HeldInputBound(Protocol):
 Maker = Callable[[FilteredPolicy], HeldInputBound | None]
 """From a policy under a filter to its bound; None where such a bound is not for such filters."""
 
-MAKERS: tuple[Maker, ...] = (closed_loop_bound, held_certificate_bound, promise_bound)
+MAKERS: tuple[Maker, ...] = (closed_loop_bound, held_certificate_bound, promise_bound, backup_bound)
 """All that makes such bounds, the best one first."""
 
 NO_FILTER = "there is no filter"

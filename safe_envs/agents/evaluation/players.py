@@ -8,6 +8,7 @@ from functools import cached_property, partial
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
+from safe_envs.agents.evaluation.decision_source import decider_of
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation
 from safe_envs.agents.evaluation.rollout import play, play_in_processes
@@ -17,8 +18,6 @@ from safe_envs.agents.evaluation.trajectories import EpisodeRecorder
 from safe_envs.agents.jobs.threads import available_threads
 from safe_envs.compiled.engine import compiled_or_none
 from safe_envs.errors import NotCompilableError
-from safe_envs.wrappers import SafetyFilter
-from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
 class NumpyPlayer:
@@ -118,24 +117,13 @@ class CompiledPlayer:
             raise NotCompilableError(
                 f"{resolved.target.title} is a third-party env, which only its own code can step"
             )
-        if isinstance(conditions, PromiseSettings):
-            raise NotCompilableError(
-                f"the filter {conditions.text} looks up a table, which the engine 'numpy' alone can"
-            )
         if settings.record:
             raise NotCompilableError(
                 "trajectories for pictures are kept by the engine 'numpy' alone"
             )
-        problem = resolved.problem
-        safety_filter = (
-            SafetyFilter.for_problem(problem, conditions, spec.knowledge, spec.objective)
-            if conditions
-            else None
-        )
+        decider = decider_of(resolved, conditions)
         continuous = spec.monitoring == "continuous"
-        self._episodes = CompiledEpisodes(
-            problem, resolved.policy, safety_filter and safety_filter.qp, continuous
-        )
+        self._episodes = CompiledEpisodes(resolved.problem, resolved.policy, decider, continuous)
         self._functions = self._episodes.compiled()
         self.engine = "compiled"
         self.jobs = min(settings.jobs or available_threads(), os.cpu_count() or 1)

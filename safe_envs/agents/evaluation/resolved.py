@@ -30,15 +30,19 @@ from safe_envs.wrappers import (
     require_readable,
     spec_of,
 )
-from safe_envs.wrappers.conditions.text_parts import learned_parts, names_promise, require_known
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
+from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
+from safe_envs.wrappers.env_wrappers.lone_filters import (
+    LoneFilter,
+    lone_filter_for,
+    settings_of,
+)
 from safe_envs.wrappers.value.closed_loop import require_few_states
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_tables import promise_filter_for
-from safe_envs.wrappers.value.promise_text import PromiseSettings
 from safe_envs.wrappers.value.reduction import reduced
 
-FilterParts = tuple[Condition, ...] | PromiseSettings
-"""The conditions of a filter, none for the unfiltered env, or the settings of a promise filter."""
+FilterParts = tuple[Condition, ...] | FilterSettings
+"""The conditions of a filter, none for the unfiltered env, or the settings of a filter that acts by
+itself."""
 
 
 class ResolvedEvaluation:
@@ -79,10 +83,11 @@ class ResolvedEvaluation:
             if not isinstance(each, str)
         }
         texts = [name for name in self.names if name not in self._given]
-        self._promises = {t: PromiseSettings.of_text(t) for t in texts if names_promise(t)}
-        for settings in self._promises.values():
+        read = {text: settings_of(text) for text in texts}
+        self._alone = {text: found for text, found in read.items() if found is not None}
+        for settings in self._alone.values():
             settings.require_fit(self.problem, spec.objective)
-        self._tables: list[PromiseFilter] = []
+        self._in_use: list[LoneFilter] = []
         self._texts = {name: _checked(name, self.problem) for name in texts}
         self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
         if self.target.filter_spec is not None and self.learning.missing():
@@ -103,7 +108,7 @@ class ResolvedEvaluation:
     @property
     def parts(self) -> int:
         """Number of parts of the work of `learn`, without the policy's."""
-        return len(self.learning.missing()) + len(self._promises)
+        return len(self.learning.missing()) + len(self._alone)
 
     def learn(self, part: Callable[[], Progress | None]) -> None:
         """Prepare the policy, learn what is missing, have tables computed, and read the filters.
@@ -116,9 +121,9 @@ class ResolvedEvaluation:
         for method, repeat in self.learning.missing():
             self.learning.learn(method, repeat, part())
         # The envs of the filters find the tables as long as they are in use here.
-        self._tables = [
-            promise_filter_for(self.problem, settings, self.spec.knowledge, part())
-            for settings in self._promises.values()
+        self._in_use = [
+            lone_filter_for(self.problem, settings, self.spec.knowledge, part())
+            for settings in self._alone.values()
         ]
         for name in self.names:
             self.filters[name] = [
@@ -132,8 +137,8 @@ class ResolvedEvaluation:
     def _conditions(self, name: str, repeat: int) -> FilterParts:
         if name == UNFILTERED:
             return ()
-        if name in self._promises:
-            return self._promises[name]
+        if name in self._alone:
+            return self._alone[name]
         return self._given.get(name) or self.learning.conditions(name, repeat)
 
     def _fitted(self, conditions: tuple[Condition, ...]) -> tuple[Condition, ...]:
@@ -213,12 +218,12 @@ class ResolvedEvaluation:
 
 
 def conditions_of(parts: FilterParts) -> tuple[Condition, ...]:
-    """Return the conditions of a filter; none for the unfiltered env and for a promise filter."""
-    return () if isinstance(parts, PromiseSettings) else parts
+    """Return the conditions of a filter; none for the unfiltered env and a filter by itself."""
+    return () if isinstance(parts, FilterSettings) else parts
 
 
 def _text_of(parts: FilterParts) -> str:
-    return parts.text if isinstance(parts, PromiseSettings) else spec_of(parts)
+    return parts.text if isinstance(parts, FilterSettings) else spec_of(parts)
 
 
 class WorkParts:
@@ -269,8 +274,9 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
             " alone or leave it out"
         )
     require_known(name, UNFILTERED)
-    if names_promise(name):
-        return PromiseSettings.of_text(name).text
+    settings = settings_of(name)
+    if settings is not None:
+        return settings.text
     if learned_parts(name):
         require_readable(name, problem)
         return None

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import reached_by_noise
+from safe_envs.agents.evaluation.decision_source import Decider, decision_source
 from safe_envs.agents.policies.policy_source import policy_source
 from safe_envs.agents.rare_events.heights import Heights
 from safe_envs.agents.rare_events.particles import PathPlayer
@@ -22,8 +23,6 @@ from safe_envs.compiled.program import Functions, Program
 from safe_envs.envs.world_source import noise_channels, world_source
 from safe_envs.errors import NotCompilableError, shortened
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.filter_qp import FilterQP
-from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
 
 _AHEAD = 16
 """Control periods for which noise is drawn ahead at most; a path may end at any time."""
@@ -39,7 +38,7 @@ class PathProgram:
     Args:
         problem: what to simulate.
         policy: who acts.
-        qp: of the filter; None without one.
+        decider: of the filter; None without one.
         continuous: whether to look at h between control instants too.
 
     Attributes:
@@ -52,14 +51,14 @@ class PathProgram:
     """
 
     def __init__(
-        self, problem: SafetyProblem, policy: Any, qp: FilterQP | None, continuous: bool
+        self, problem: SafetyProblem, policy: Any, decider: Decider | None, continuous: bool
     ) -> None:
         data = Data()
         bridged = continuous and any(reached_by_noise(problem))
         source = (
             world_source(problem, data)
             + policy_source(policy, problem, data)
-            + (unfiltered_source(len(problem.inputs)) if qp is None else filter_source(qp, data))
+            + decision_source(decider, len(problem.inputs), data)
             + path_source(problem, bridged, data)
         )
         self.problem = problem

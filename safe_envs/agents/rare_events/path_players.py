@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safe_envs.agents.evaluation.decision_source import decider_of
 from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation
 from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.jobs.threads import available_threads
@@ -16,8 +17,7 @@ from safe_envs.agents.rare_events.particles import PathPlayer
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from safe_envs.compiled.engine import compiled_or_none
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers import Condition, SafetyFilter
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 
 
 class ChosenPlayer(NamedTuple):
@@ -55,10 +55,10 @@ def player_of(
             and Numba is missing.
         NotCompilableError: It was asked for, and cannot do this.
     """
-    if isinstance(conditions, PromiseSettings):
+    if isinstance(conditions, FilterSettings) and conditions.of_paths:
         raise ConfigurationError(
-            f"the filter {conditions.text} remembers what was kept on the whole path, and paths"
-            " that are split go on from states alone; evaluate it with more episodes instead"
+            f"the filter {conditions.text} remembers {conditions.of_paths}, and paths that are"
+            " split go on from states alone; evaluate it with more episodes instead"
         )
     continuous = resolved.spec.monitoring == "continuous"
     reference = NumpyPaths(
@@ -74,23 +74,18 @@ def player_of(
     return compiled or ChosenPlayer(reference, "numpy", 1)
 
 
-def _tilted_env(
-    resolved: ResolvedEvaluation, conditions: tuple[Condition, ...], lengths: np.ndarray
-) -> Env:
+def _tilted_env(resolved: ResolvedEvaluation, conditions: FilterParts, lengths: np.ndarray) -> Env:
     return resolved.filtered(TiltedNoiseEnv(resolved.problem, lengths), conditions)
 
 
 def _compiled(
     resolved: ResolvedEvaluation,
-    conditions: tuple[Condition, ...],
+    conditions: FilterParts,
     continuous: bool,
     reference: PathPlayer,
 ) -> ChosenPlayer:
-    problem, spec = resolved.problem, resolved.spec
-    qp = None
-    if conditions:
-        qp = SafetyFilter.for_problem(problem, conditions, spec.knowledge, spec.objective).qp
-    program = PathProgram(problem, resolved.policy, qp, continuous)
+    decider = decider_of(resolved, conditions)
+    program = PathProgram(resolved.problem, resolved.policy, decider, continuous)
     threads = available_threads()
     functions = program.compiled()
     player = CompiledPaths(program, functions, reference, threads)

@@ -18,6 +18,7 @@ from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, SafeEnvsError
 from safe_envs.wrappers import LEARNED, SafetyFilter
+from safe_envs.wrappers.conditions.text_parts import name_by_itself
 
 _NO_PART = ("seed", "episodes", "bounds")
 """Settings that need no check other than that of their kind."""
@@ -174,5 +175,5 @@ def _check_cell(cell: Cell, derive: bool) -> None:
     found = ResolvedEvaluation(cell.spec)
     (name,) = found.names
     needs_learning = any(part.split(":")[0] in LEARNED for part in name.split("+"))
-    if derive and name != UNFILTERED and not needs_learning:
+    if derive and name != UNFILTERED and not (needs_learning or name_by_itself(name)):
         SafetyFilter.for_problem(found.problem, name, cell.spec.knowledge, cell.spec.objective)

@@ -10,7 +10,11 @@ from typing import Any
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.frontier_results import Frontier
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for
+from safe_envs.agents.evaluation.yardstick import (
+    best_at_hand,
+    best_for,
+    evaluation_settings,
+)
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.hyperparameters import ALGORITHMS
@@ -64,7 +68,7 @@ def board(
     variants += [
         Variant(f"{algo} + filter", algo, filter=DEFAULT),
         Variant(f"{algo} behind filter", algo, training={"filter": DEFAULT}, filter=DEFAULT),
-        Variant(f"{algo} + promise", algo, filter=_PROMISE),
+        Variant(f"{algo} + promise filter", algo, filter=_PROMISE),
         Variant(f"{algo} behind backup", algo, training={"filter": _BACKUP}, filter=_BACKUP),
     ]
     return Study(env_ids, variants, seeds, seed, episodes, training=_QUICK if quick else _ALL)
@@ -211,29 +215,49 @@ def frontiers_of(
 
 
 def attainable_of(
-    env_ids: Sequence[str], compute: bool, progress: Callable[[float], None]
+    env_ids: Sequence[str], out: Path, compute: bool | None, progress: Callable[[float], None]
 ) -> dict[str, AttainableSafety | str]:
     """Return the best attainable safety of envs, counted as the rows of the leaderboard are.
 
     Args:
         env_ids: full ids.
-        compute: compute what is missing; without it only tables in the cache are read.
+        out: folder of the leaderboard, which keeps it.
+        compute: compute what is missing; None to look for its table in the cache; False for
+            neither.
         progress: receives the part of the work that is done, from 0 to 1.
 
     Returns:
         By id what is known, or why a table cannot be had.
+
+    Raises:
+        ConfigurationError: the folder has a file that is damaged.
     """
-    found: dict[str, AttainableSafety | str] = {}
+    store, found = ResultStore(out / "best"), {}
     for k, env_id in enumerate(env_ids):
-        problem = make_problem(env_id)
+        problem, key = make_problem(env_id), env_id.rpartition("/")[2]
+        settings = evaluation_settings(problem)
+        configuration = {
+            "env_id": env_id,
+            "settings": asdict(settings),
+            "versions": package_versions(),
+        }
+        document = store.read(key, configuration)
+        if document is not None:
+            with reading(store.path(key)):
+                found[env_id] = AttainableSafety(**document["best"])
+            continue
         try:
             best = (
                 best_for(problem, lambda part, k=k: progress((k + part) / len(env_ids)))
                 if compute
                 else best_at_hand(problem)
+                if compute is None
+                else None
             )
         except ConfigurationError as error:
-            best = str(error)
+            found[env_id] = str(error)
+            continue
         if best is not None:
+            store.keep(key, configuration, {"best": vars(best)})
             found[env_id] = best
     return found

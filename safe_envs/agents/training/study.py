@@ -109,7 +109,12 @@ class StudyResult:
     missing: Mapping[tuple[str, str, int | None], str]
 
     def of(self, env_id: str, variant: str) -> list[StudyRow]:
-        """Return the rows of a variant on an env, in the order of their seeds."""
+        """Return the rows of a variant on an env, in the order of their seeds.
+
+        Args:
+            env_id: full id.
+            variant: its name.
+        """
         return [r for r in self.rows if (r.env_id, r.variant) == (env_id, variant)]
 
 
@@ -148,13 +153,17 @@ def run_study(
         progress: receives the part of the work that is done, from 0 to 1.
         report: receives what the user should know meanwhile.
 
+    Returns:
+        The rows of all agents, and what is missing.
+
     Raises:
         ConfigurationError: the folder cannot be written, or has files that are damaged.
     """
+    missing: dict[tuple[str, str, int | None], str] = {}
+    # Before a folder is made: the arguments may be refused.
+    planned = list(_plans(study, out, missing))
     store = ResultStore(out / _RESULTS)
     store.remove_unfinished()
-    missing: dict[tuple[str, str, int | None], str] = {}
-    planned = list(_plans(study, out, missing))
     kept = {each.key: row for each in planned if (row := _kept(store, each)) is not None}
     jobs = _jobs([each for each in planned if each.key not in kept])
     work = {key: job.work for key, job in jobs.items()}
@@ -184,10 +193,9 @@ def _plans(
     for env_id in study.env_ids:
         default = make_problem(env_id, **study.options).filter
         for variant in study.variants:
+            seeds = range(study.seeds)
+            of_seeds = [_planned(study, env_id, variant, k, default) for k in seeds]
             try:
-                of_seeds = [
-                    _planned(study, env_id, variant, k, default) for k in range(study.seeds)
-                ]
                 for name in {of_seeds[0].filter, of_seeds[0].in_loop}:
                     _require_suitable(study, env_id, name)
             except SafeEnvsError as error:

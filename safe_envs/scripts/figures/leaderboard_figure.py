@@ -26,7 +26,7 @@ _LOOKS = (
     (COLORS[3], "P"),
     (COLORS[4], "v"),
 )
-"""Colours and markers in the order of the variants; none is told by its colour alone."""
+"""Colours and markers in the order of the variants; none depends on its colour alone."""
 
 _LEAST = 1e-4
 _MARGIN = 0.06
@@ -53,7 +53,7 @@ def draw(
     """
     with mpl.rc_context(STYLE):
         # Of the width of a column of a phone: letters keep their size there.
-        figure = Figure(figsize=(5.4, 4.4))
+        figure = Figure(figsize=(5.4, 4.4), dpi=150)
         axes = figure.add_subplot()
         low, high = _range_of_returns(entries, rows, frontier)
         if frontier is not None:
@@ -84,7 +84,7 @@ def draw(
         axes.set(xlabel="episodes with a violation", ylabel="mean return", title=title)
         axes.grid(alpha=0.25, linewidth=0.6)
         add_legend(figure, axes.get_legend_handles_labels()[0], most=3)
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+        write_atomically(path, lambda part: figure.savefig(part))
 
 
 def _draw_entry(axes: Axes, entry: LeaderboardEntry, color: str, marker: str) -> None:
@@ -132,7 +132,7 @@ def _scale(
     least = min((chance for chance in found if chance > _LEAST), default=0.1)
     threshold = 10.0 ** min(math.floor(math.log10(least)), -1)
     axes.set_xscale("symlog", linthresh=threshold)
-    axes.set_xlim(-0.15 * threshold, 1.25)
+    axes.set_xlim(-0.15 * threshold, 1.6)
     exponents = range(round(math.log10(threshold)), 1)
     axes.set_xticks([0.0, *(10.0**k for k in exponents)])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100.0 * value:g} %"))

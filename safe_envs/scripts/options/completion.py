@@ -21,6 +21,7 @@ FILTERS = (
     "bayesian-scbf",
     "certified",
     "promise",
+    "backup",
 )
 """Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""
 

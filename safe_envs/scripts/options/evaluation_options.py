@@ -26,7 +26,8 @@ Filters = Annotated[
             "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf,"
             " ddscbf, bayesian-scbf; certified:file=FILE, of a barrier certificate; with "
             "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1; a condition of"
-            " your own: FILE.py:NAME; promise:p=0.99, which keeps a probability of being safe."
+            " your own: FILE.py:NAME; promise:p=0.99, which keeps a probability of being safe;"
+            " backup, which lets pass what a backup law of the env can make good."
             " Repeatable. By default none and the env's own. "
             f"Parameters of learned ones: {LEARNED_PARAMETERS}."
         ),

@@ -16,7 +16,7 @@ from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.scripts.reports.best_text import outwards
 from safe_envs.scripts.reports.promise_notes import computed_notes
-from safe_envs.wrappers.conditions.text_parts import names_promise
+from safe_envs.wrappers.conditions.text_parts import name_by_itself, names_promise
 
 CHAIN = (
     "from left to right, for the env's own steps: the bound for held input, the measured rate, and"
@@ -89,7 +89,9 @@ def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
     notes = _why_none("held input", ((r, r.held_note) for r in none if r.held_note != NO_FILTER))
     without = ((r, r.continuous_note) for r in known if r.continuous_bound is None)
     # What a table of steps has no bound for, its name says.
-    notes += _why_none("continuous control", (w for w in without if not names_promise(w[0].filter)))
+    notes += _why_none(
+        "continuous control", (w for w in without if not name_by_itself(w[0].filter))
+    )
     notes += [
         f"continuous control, {row.filter}: {row.continuous_note}"
         for row in filtered

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from safe_envs.atomic_io import write_atomically
+from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError
 
 BEGIN, END = "<!-- leaderboard -->", "<!-- end of leaderboard -->"
@@ -24,7 +25,7 @@ def put_into(page: Path, markdown: str | None) -> None:
             order.
     """
     try:
-        text = page.read_text()
+        text = read_bytes(page).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"--page {page} cannot be read ({error}); give a page") from error
     before, begin, rest = text.partition(f"{BEGIN}\n")

@@ -53,12 +53,18 @@ class LeaderboardReport:
     def reasons(self) -> dict[str, list[str]]:
         """Return why variants are missing, and whose best attainable safety is, with their envs."""
         reasons: dict[str, list[str]] = {}
+
+        def note(env_id: str, what: str, reason: str) -> None:
+            name = short_name(env_id)
+            # The same reason names each env in its turn.
+            told = reason.replace(name, "it").rstrip(".")
+            reasons.setdefault(f"{what}: {told}", []).append(name)
+
         for (env_id, variant, k), reason in self.found.missing.items():
-            which = variant if k is None else f"{variant}, training {k}"
-            reasons.setdefault(f"{which}: {reason}", []).append(short_name(env_id))
-        for env_id, reason in self.best.items():
-            if isinstance(reason, str):
-                reasons.setdefault(f"best: {reason}", []).append(short_name(env_id))
+            note(env_id, variant if k is None else f"{variant}, training {k}", reason)
+        for env_id, found in self.best.items():
+            if isinstance(found, str):
+                note(env_id, "best", found)
         return reasons
 
     def document(self) -> dict[str, Any]:

@@ -36,7 +36,13 @@ _BUILT_IN: dict[str, type[Condition]] = {
 PROMISE = "promise"
 """Name of the filter of `safe_envs.wrappers.value`, which is no condition."""
 
-RESERVED = ("none", PROMISE)
+BACKUP = "backup"
+"""Name of the filter of `safe_envs.wrappers.backup`, which is no condition either."""
+
+BY_THEMSELVES = {PROMISE: f"{PROMISE}:p=0.99", BACKUP: BACKUP}
+"""Filters that act by themselves, by name, each with an example of its text."""
+
+RESERVED = ("none", *BY_THEMSELVES)
 """Names that no condition can have: "none" stands for the unfiltered env."""
 
 
@@ -67,11 +73,12 @@ def condition_class(name: str) -> type[Condition]:
         return _BUILT_IN[name]
     if ":" in name:
         return _checked(name, load_object(name))
-    if name == PROMISE:
+    if name in BY_THEMSELVES:
         raise ConfigurationError(
-            f'{PROMISE} is no condition but a filter by itself: give it alone, without "+", to'
+            f'{name} is no condition but a filter by itself: give it alone, without "+", to'
             " SafetyFilterWrapper, SafetyFilterVectorWrapper or an evaluation, like"
-            f" {PROMISE}:p=0.99. Whatever else takes conditions needs one, such as scbf or hocbf"
+            f" {BY_THEMSELVES[name]}. Whatever else takes conditions needs one, such as scbf or"
+            " hocbf"
         )
     if name not in condition_names():
         raise unknown_filter(name)
@@ -92,7 +99,7 @@ def unknown_filter(name: str, *more: str) -> ConfigurationError:
         name: what was given.
         more: names that are allowed besides those of conditions.
     """
-    allowed = (*more, *condition_names(), PROMISE, "FILE.py:NAME")
+    allowed = (*more, *condition_names(), *BY_THEMSELVES, "FILE.py:NAME")
     return ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, allowed)}")
 
 

@@ -12,6 +12,8 @@ from typing import NamedTuple
 from safe_envs.object_import import resolved
 from safe_envs.plugins import CONDITIONS, module_of
 from safe_envs.wrappers.conditions.registry import (
+    BACKUP,
+    BY_THEMSELVES,
     PROMISE,
     condition_class,
     condition_names,
@@ -26,7 +28,7 @@ _MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
 """MODULE:NAME; a parameter is none, for a "=" follows its name."""
 
 
-_PROMISE_HEAD = re.compile(rf"\s*{PROMISE}\s*(?:[:+]|$)")
+_HEAD_BY_ITSELF = re.compile(rf"\s*({'|'.join(BY_THEMSELVES)})\s*(?:[:+]|$)")
 
 
 class ConditionText(NamedTuple):
@@ -43,7 +45,7 @@ def head_pattern(*more: str) -> str:
     Args:
         more: names that are accepted besides those of conditions.
     """
-    names = sorted((*more, PROMISE, *condition_names()), key=len, reverse=True)
+    names = sorted((*more, *BY_THEMSELVES, *condition_names()), key=len, reverse=True)
     return rf"(?:(?:{'|'.join(map(re.escape, names))})(?=\s*(?:[:+,]|$))|{_FILE}|{_MODULE})"
 
 
@@ -55,13 +57,24 @@ def require_known(text: str, *more: str) -> None:
         more: names that the message lists besides those of conditions.
     """
     name = parts_of(text)[0].name
-    if not (_is_known(name) or name == PROMISE):
+    if not (_is_known(name) or name in BY_THEMSELVES):
         raise unknown_filter(name, *more)
+
+
+def name_by_itself(text: str) -> str:
+    """Return the name of the filter that acts by itself, of which a text is; "" of conditions."""
+    found = _HEAD_BY_ITSELF.match(text)
+    return found.group(1) if found else ""
 
 
 def names_promise(text: str) -> bool:
     """Return whether the text of a filter is that of the promise filter."""
-    return _PROMISE_HEAD.match(text) is not None
+    return name_by_itself(text) == PROMISE
+
+
+def names_backup(text: str) -> bool:
+    """Return whether the text of a filter is that of the backup filter."""
+    return name_by_itself(text) == BACKUP
 
 
 def _is_known(name: str) -> bool:

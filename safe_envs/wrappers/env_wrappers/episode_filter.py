@@ -15,20 +15,24 @@ from safe_envs.envs.info import Info
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.actuators import require_delay, require_direct
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.backup import BackupFilter
 from safe_envs.wrappers.conditions import spec_of
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.conditions.spec_text import Conditions
-from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.env_wrappers.delay_memory import DelayMemory
+from safe_envs.wrappers.env_wrappers.lone_filters import (
+    LoneFilter,
+    lone_filter_for,
+    settings_of,
+)
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_memory import PromiseMemory
-from safe_envs.wrappers.value.promise_tables import promise_filter_for
-from safe_envs.wrappers.value.promise_text import PromiseSettings
 
-FilterChoice = Conditions | PromiseSettings | PromiseFilter
-"""Conditions or their text; or a promise filter, its settings or their text."""
+FilterChoice = Conditions | FilterSettings | LoneFilter
+"""Conditions or their text; or a filter that acts by itself, its settings or their text."""
 
 
 class EpisodeFilter(Protocol):
@@ -106,14 +110,18 @@ class Memoryless:
 
     Attributes:
         safety_filter: as given.
-        text: of its conditions.
+        text: of its conditions or settings.
     """
 
     judges_episodes = False
 
-    def __init__(self, safety_filter: SafetyFilter) -> None:
+    def __init__(self, safety_filter: SafetyFilter | BackupFilter) -> None:
         self.safety_filter = safety_filter
-        self.text = spec_of([each for _, each in safety_filter.pairs])
+        self.text = (
+            safety_filter.text
+            if isinstance(safety_filter, BackupFilter)
+            else spec_of([each for _, each in safety_filter.pairs])
+        )
         self.decide_floats = safety_filter.decide_floats
         self.decide_arrays = safety_filter.decide_arrays
 
@@ -148,8 +156,11 @@ class Memoryless:
         return {}
 
     def source(self, data: Data) -> Source:
-        """Return the compiled form of the filter."""
-        return filter_source(self.safety_filter.qp, data)
+        """Return the compiled form of the filter, or raise NotCompilableError."""
+        found = self.safety_filter
+        return (
+            found.source(data) if isinstance(found, BackupFilter) else filter_source(found.qp, data)
+        )
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return nothing."""
@@ -184,24 +195,27 @@ def episode_filter(
         ConfigurationError: What is given is unknown or does not fit the problem.
         RelativeDegreeError: A condition does not suit a barrier.
     """
-    if isinstance(given, str) and names_promise(given):
-        given = PromiseSettings.of_text(given)
+    if isinstance(given, str):
+        given = settings_of(given) or given
     if delay is None:
         delay = problem.delay if knowledge == "plant" else problem.believed_delay
     require_delay("delay", delay)
-    if isinstance(given, PromiseSettings | PromiseFilter):
-        require_direct(replace(problem, model_delay=delay), "promise filters")
+    if isinstance(given, FilterSettings | PromiseFilter | BackupFilter):
+        name = given.name if isinstance(given, FilterSettings) else given.settings.name
+        require_direct(replace(problem, model_delay=delay), f"{name} filters")
         if priorities is not None:
             raise ConfigurationError(
-                "priorities are of conditions; the promise filter keeps all barriers together:"
+                f"priorities are of conditions; the {name} filter keeps all barriers together:"
                 " leave them out"
             )
-        if isinstance(given, PromiseSettings):
+        if isinstance(given, FilterSettings):
             given.require_fit(problem, objective)
-            given = promise_filter_for(problem, given, knowledge)
+            given = lone_filter_for(problem, given, knowledge)
         given.settings.require_fit(problem, objective)
         given.require_problem(problem)
-        return PromiseMemory(given, num_envs)
+        return (
+            Memoryless(given) if isinstance(given, BackupFilter) else PromiseMemory(given, num_envs)
+        )
     if delay != problem.believed_delay:
         problem = replace(problem, model_delay=delay)  # which conditions may refuse
     found = SafetyFilter.for_problem(problem, given, knowledge, objective, priorities)

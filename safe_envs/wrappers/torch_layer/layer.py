@@ -11,7 +11,7 @@ import torch
 from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.spec_text import Conditions
-from safe_envs.wrappers.conditions.text_parts import names_promise
+from safe_envs.wrappers.conditions.text_parts import name_by_itself
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.filter_qp.limits import WIDEST
 from safe_envs.wrappers.safety_filter import SafetyFilter
@@ -56,8 +56,8 @@ class TorchFilter(torch.nn.Module):
 
     Raises:
         ConfigurationError: a constraint is not a plain one: uncertain, reciprocal, with a network
-            or a sampling margin of first order; or the filter pursues a goal, or is the promise
-            filter; or a constraint holds a function that torch does not have.
+            or a sampling margin of first order; or the filter pursues a goal, or acts by itself, as
+            the promise filter; or a constraint holds a function that torch does not have.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
@@ -88,7 +88,7 @@ class TorchFilter(torch.nn.Module):
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
         """Return the filter for the barriers of a problem; see `SafetyFilter.for_problem`."""
-        if isinstance(conditions, str) and names_promise(conditions):
+        if isinstance(conditions, str) and name_by_itself(conditions):
             raise _not_differentiable(conditions)
         return cls(SafetyFilter.for_problem(problem, conditions, knowledge, priorities=priorities))
 
@@ -191,9 +191,10 @@ class TorchFilter(torch.nn.Module):
 def _not_differentiable(given: str) -> ConfigurationError:
     return ConfigurationError(
         f"{shown(given)} is no SafetyFilter, and a torch layer takes no other; the promise filter"
-        " looks its inputs up in a table, so they have no gradient. Take a condition here, such"
-        " as 'scbf' or 'hocbf'; or train an agent behind it, which needs no gradient of it, by"
-        " SafetyFilterVectorWrapper or make_sb3_env(..., filter='promise:p=0.99')"
+        " looks its inputs up in a table, and the backup filter searches for them, so they have no"
+        " gradient. Take a condition here, such as 'scbf' or 'hocbf'; or train an agent behind it,"
+        " which needs no gradient of it, by SafetyFilterVectorWrapper or"
+        " make_sb3_env(..., filter='promise:p=0.99')"
     )
 
 

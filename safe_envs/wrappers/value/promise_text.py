@@ -15,8 +15,8 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, real
 from safe_envs.problem.named_sets import set_names
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings, settings_in
 from safe_envs.wrappers.conditions.registry import PROMISE
-from safe_envs.wrappers.conditions.text_parts import parts_of
 from safe_envs.wrappers.value.automaton_building import automaton_of
 from safe_envs.wrappers.value.settings import LEAVING
 from safe_envs.wrappers.value.specification import Specification
@@ -25,8 +25,6 @@ _KEYS = ("p", "robust", "leaving", "spec", "table")
 _EXAMPLE = f"{PROMISE}:p=0.99"
 _SPEC_EXAMPLE = "like always safe & eventually goal"
 
-# What is robust and the name of a file may hold a colon: one divides before "key=" alone.
-_DIVIDES = re.compile(r":(?=\w+=)")
 _INTERVAL = re.compile(r"\s*(\w+)\s*:(.+?)\.\.(.+)")
 
 Interval = tuple[str, float, float]
@@ -34,7 +32,7 @@ Interval = tuple[str, float, float]
 
 
 @dataclass(frozen=True)
-class PromiseSettings:
+class PromiseSettings(FilterSettings):
     """What a promise filter is asked for.
 
     Attributes:
@@ -50,6 +48,11 @@ class PromiseSettings:
     Raises:
         ConfigurationError: A value is out of range.
     """
+
+    name = PROMISE
+    only_of_steps = "its table is of the env's own steps"
+    not_compiled = "looks up a table, which the engine 'numpy' alone can"
+    of_paths = "what was kept on the whole path"
 
     probability: float
     robust: tuple[Interval, ...] = ()
@@ -98,22 +101,7 @@ class PromiseSettings:
         Raises:
             ConfigurationError: It has another form, or a value is out of range.
         """
-        if len(parts_of(text)) > 1:
-            raise ConfigurationError(
-                f"filter {shown(text)}: the promise filter acts alone, on all barriers together;"
-                f' give it without "+", like {_EXAMPLE}'
-            )
-        head, *parts = _DIVIDES.split(text.strip())
-        given: dict[str, str] = {}
-        for part in parts:
-            key, _, value = part.partition("=")
-            if key not in _KEYS:
-                raise _unknown(text, key)
-            if key in given:
-                raise ConfigurationError(f"filter {shown(text)} names {shown(key)} twice")
-            given[key] = value
-        if head.strip() != PROMISE:
-            raise _unknown(text, head.strip().removeprefix(PROMISE).lstrip(":"))
+        given = settings_in(text, PROMISE, _KEYS, _EXAMPLE)
         if "p" not in given:
             raise ConfigurationError(
                 f"filter {shown(text)} names no probability; give one, like {_EXAMPLE}"
@@ -171,21 +159,7 @@ class PromiseSettings:
             specification = Specification(self.specification, set_names(problem))
             specification.require_horizon(problem.steps)
             automaton_of(specification)
-        if objective != "nearest":
-            raise ConfigurationError(
-                f"objective = {shown(objective)}: the promise filter takes the input nearest to"
-                " the proposed one; use 'nearest'"
-            )
-
-
-def _unknown(text: str, key: str) -> ConfigurationError:
-    if key in _KEYS:
-        return ConfigurationError(
-            f"filter {shown(text)} gives {key} no value; settings are key=value, as in {_EXAMPLE}"
-        )
-    return ConfigurationError(
-        f"filter {shown(text)} has no setting {shown(key)}; {nearest(key, _KEYS)}, as in {_EXAMPLE}"
-    )
+        self.require_nearest(objective)
 
 
 def _intervals(text: str, given: str) -> tuple[Interval, ...]:

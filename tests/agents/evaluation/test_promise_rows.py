@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.bound_averages import STEPS_ONLY
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.evaluate import evaluate, run_evaluation
 from safe_envs.agents.evaluation.promise_bound import COMPUTED
@@ -48,7 +47,7 @@ def test_a_promise_filter_is_a_row_with_its_own_bound(found):
     assert row.held_bound == pytest.approx(0.9, abs=1e-6)
     assert (row.held_word, row.held_note) == ("computed", COMPUTED)
     assert (row.continuous_bound, row.continuous_word) == (None, "none")
-    assert row.continuous_note == STEPS_ONLY
+    assert row.continuous_note == PromiseSettings.only_of_steps
     # Equal values at all starts.
     assert row.held_error == 0.0
     assert row.ci_high >= row.held_bound

@@ -16,13 +16,13 @@ from safe_envs.scripts.options import completion
 from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 from safe_envs.wrappers import CONDITIONS
 from safe_envs.wrappers.conditions import LEARNED, Certified
-from safe_envs.wrappers.conditions.registry import PROMISE
+from safe_envs.wrappers.conditions.registry import BY_THEMSELVES
 
 pytestmark = pytest.mark.slow
 
 
 def test_the_words_are_those_that_are_known():
-    assert ("none", *CONDITIONS, *LEARNED, Certified.name, PROMISE) == completion.FILTERS
+    assert ("none", *CONDITIONS, *LEARNED, Certified.name, *BY_THEMSELVES) == completion.FILTERS
     assert sorted(completion.POLICIES) == sorted(POLICIES)
     assert sorted(completion.ALGORITHMS) == sorted(ALGORITHMS)
     assert sorted(completion.ARTEFACTS) == sorted(artefact.name for artefact in ARTEFACTS)

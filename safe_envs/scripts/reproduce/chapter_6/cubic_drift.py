@@ -36,7 +36,7 @@ larger in one identification is chance."""
 
 
 @dataclass(frozen=True)
-class Study:
+class DriftStudy:
     """Identifications of f with one K.
 
     Attributes:
@@ -55,7 +55,7 @@ class Study:
 
 def study(
     problem: SafetyProblem, x: np.ndarray, repetitions: int, chosen: range, starts: int, steps: int
-) -> Study:
+) -> DriftStudy:
     """Identify f under u = 0, as the thesis does, and compare it with the truth at states.
 
     Args:
@@ -80,7 +80,7 @@ def study(
         in_deviations.append(float(np.sqrt((((mean - truth) / deviation) ** 2).mean())))
         overconfident.append(_printed_doubt(learned, data, x, truth))
     found = map(np.array, (squares, in_deviations, overconfident))
-    return Study(*found, first=estimates[0])
+    return DriftStudy(*found, first=estimates[0])
 
 
 def _printed_doubt(
@@ -169,7 +169,7 @@ def compute_errors(sample: Workload) -> Findings:
 
 
 def _compared_with_law(
-    problem: SafetyProblem, x: np.ndarray, chosen: range, followed: Study
+    problem: SafetyProblem, x: np.ndarray, chosen: range, followed: DriftStudy
 ) -> str:
     """Return how the errors with the smallest K compare with M sigma^2/(K R dt), in words.
 

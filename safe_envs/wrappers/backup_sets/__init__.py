@@ -1,0 +1,1 @@
+"""Terminal sets of backup laws, and the proof that they are kept."""

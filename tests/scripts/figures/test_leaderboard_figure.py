@@ -1,0 +1,56 @@
+"""The picture of an env of the leaderboard shows everything that the table has."""
+
+from __future__ import annotations
+
+import matplotlib as mpl
+import pytest
+from matplotlib.figure import Figure
+
+from safe_envs.agents.training.leaderboard import entry_of
+from safe_envs.scripts.figures import leaderboard_figure
+from safe_envs.scripts.figures.leaderboard_figure import draw
+from tests.agents.training.test_leaderboard import SCALAR, result
+
+pytestmark = pytest.mark.slow
+
+NAMES = ["nominal", "ppo", "ppo-lag", "ppo + filter", "ppo behind filter", "ppo + promise filter"]
+NAMES += ["ppo behind backup"]
+CURVE = {"violations": [1e-3, 0.1, 1.0], "returns": [-500.0, 400.0, 700.0]}
+
+
+@pytest.mark.parametrize("curve", [None, CURVE])
+def test_agents_are_inside_the_axes_and_look_different(tmp_path, monkeypatch, curve):
+    safe = {(SCALAR, name): [50 - 8 * i, 49 - 8 * i, 48 - 8 * i] for i, name in enumerate(NAMES)}
+    safe[SCALAR, "ppo"] = [0, 0, 0]
+    found = result(safe, 3)
+    entries = [entry_of(found, SCALAR, name) for name in NAMES]
+    figures = []
+    save = Figure.savefig
+
+    def kept(figure, *given, **how):
+        figures.append(figure)
+        return save(figure, *given, **how)
+
+    monkeypatch.setattr(Figure, "savefig", kept)
+    path = tmp_path / "Scalar.png"
+    draw("Scalar", [e for e in entries if e], found.rows, curve, NAMES, path)
+    assert path.stat().st_size > 10_000
+    (figure,) = figures
+    (axes,) = figure.axes
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    for row in found.rows:
+        assert left < 1 - row.safety_rate < right
+        assert bottom < row.return_mean < top
+    labels = axes.get_legend_handles_labels()[1]
+    assert labels == (["largest return, computed"] if curve else []) + NAMES
+    assert len(set(leaderboard_figure._LOOKS)) == len({m for _, m in leaderboard_figure._LOOKS})
+    # No tick, title or legend entry is clipped.
+    with mpl.rc_context(leaderboard_figure.STYLE):
+        figure.canvas.draw()
+        whole = figure.bbox
+        places = zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)
+        ticks = [*axes.get_xticklabels(), *(text for y, text in places if bottom <= y <= top)]
+        for text in [*ticks, axes.title, *figure.legends[0].get_texts()]:
+            box = text.get_window_extent()
+            assert whole.x0 <= box.x0 <= box.x1 <= whole.x1, text.get_text()
+            assert whole.y0 <= box.y0 <= box.y1 <= whole.y1, text.get_text()

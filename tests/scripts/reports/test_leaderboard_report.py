@@ -1,0 +1,108 @@
+"""The tables of the leaderboard fit a terminal, and its Markdown has the same numbers."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from safe_envs import ConfigurationError
+from safe_envs.agents.training.leaderboard import entry_of, safety_over_envs
+from safe_envs.scripts.reports.leaderboard_page import BEGIN, END, link_from, put_into
+from safe_envs.scripts.reports.leaderboard_report import (
+    LeaderboardReport,
+    leaderboard_markdown,
+    leaderboard_notes,
+    leaderboard_tables,
+)
+from tests.agents.training.test_leaderboard import PENDULUM, SCALAR, result
+
+WIDEST = 100
+
+
+def report(**changes):
+    safe = {
+        (env_id, variant): counts
+        for env_id in (SCALAR, PENDULUM)
+        for variant, counts in (
+            ("nominal", [0] * 5),
+            ("ppo behind filter", [50, 49, 48, 50, 50]),
+            ("ppo behind backup", [50] * 5),
+        )
+    }
+    found = result(safe)
+    found.missing[SCALAR, "ppo + promise filter", None] = "no grid"  # pyright: ignore[reportIndexIssue]
+    found.missing[PENDULUM, "ppo + promise filter", None] = "no grid"  # pyright: ignore[reportIndexIssue]
+    entries = [entry_of(found, env_id, variant) for env_id, variant in safe]
+    given = {"best": {SCALAR: "too many coordinates"}, "frontiers": {}}
+    return LeaderboardReport(
+        found,
+        tuple(entry for entry in entries if entry),
+        safety_over_envs(found),
+        **given | changes,
+    )
+
+
+def test_tables_fit_a_terminal_of_100_columns():
+    stream = io.StringIO()
+    console = Console(file=stream, width=WIDEST)
+    headings = []
+    for heading, table in leaderboard_tables(report()):
+        headings.append(heading)
+        assert console.measure(table, options=console.options.update(max_width=500)).maximum <= 100
+        console.print(table)
+    assert headings == ["Scalar, filter scbf", "Pendulum, filter scbf", "All 2 envs"]
+    text = stream.getvalue()
+    assert "…" not in text
+    (line, *_) = [line for line in text.splitlines() if line.startswith("ppo behind backup")]
+    assert line.split() == [
+        "ppo", "behind", "backup", "100.0", "[100.0,", "100.0]", "100.0", "[98.5,", "100.0]",
+        "500.0", "[500.0,", "500.0]", "200", "2.00",
+    ]  # fmt: skip
+
+
+def test_what_is_missing_is_told_once_with_its_envs():
+    notes = leaderboard_notes(report())
+    assert "Scalar, Pendulum: ppo + promise filter: no grid." in notes
+    assert "Scalar: best: too many coordinates." in notes
+
+
+def test_markdown_has_a_small_table_and_a_picture_for_each_env():
+    found = report()
+    text = leaderboard_markdown(found, {SCALAR: "../assets/Scalar.png"})
+    assert text.count("### ") == 4
+    assert "![Return against violations on Scalar](../assets/Scalar.png)" in text
+    tables = [part.splitlines() for part in text.split("\n\n") if part.startswith("|")]
+    assert [len(table) for table in tables] == [5, 5, 5]
+    for table in tables:
+        assert len({line.count("|") for line in table}) == 1
+    assert (
+        "| nominal | 0.0 % [0.0, 0.0] | 0.0 % [0.0, 1.5] | 0.000 [0.000, 0.000] | - | - |" in text
+    )
+    assert "- Scalar, Pendulum: ppo + promise filter: no grid." in text
+    json.dumps(found.document(), allow_nan=False)
+
+
+def test_only_the_part_of_a_page_between_its_lines_is_replaced(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f"# Title\n\n{BEGIN}\nold\n{END}\n\nend\n")
+    put_into(page, None)
+    assert "old" in page.read_text()
+    for new in ("first", "second"):
+        put_into(page, new)
+        assert page.read_text() == f"# Title\n\n{BEGIN}\n\n{new}\n\n{END}\n\nend\n"
+    assert link_from(page, tmp_path / "assets" / "a.png") == "assets/a.png"
+    assert link_from(tmp_path / "docs" / "page.md", tmp_path / "a.png") == "../a.png"
+
+
+@pytest.mark.parametrize("text", ["", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n", BEGIN])
+def test_a_page_without_its_lines_is_an_error(tmp_path, text):
+    page = tmp_path / "page.md"
+    page.write_text(text)
+    with pytest.raises(ConfigurationError, match="needs the line"):
+        put_into(page, "new")
+    assert page.read_text() == text
+    with pytest.raises(ConfigurationError, match="cannot be read"):
+        put_into(tmp_path / "none.md", "new")
