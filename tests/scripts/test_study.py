@@ -62,7 +62,7 @@ def test_agents_are_trained_once_and_compared(safe_envs_command, arguments):
     [
         (("study", "nothing", "Scalar-v0"), "filters-in-training"),
         (("study", "filters-in-training", "Nothing-v0"), "unknown env"),
-        (("study", "filters-in-training", "Scalar-v0", "--against", "PPO"), "no agents"),
+        (("study", "filters-in-training", "Scalar-v0", "--against", "A3C"), "no agents"),
     ],
 )
 def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, given, message):
