@@ -26,6 +26,7 @@ __all__ = [
     "CLFController",
     "Evaluation",
     "EvaluationSpec",
+    "FilteredReplayBuffer",  # pyright: ignore[reportUnsupportedDunderAll]
     "NominalController",
     "Policy",
     "RandomPolicy",
@@ -50,6 +51,10 @@ def __getattr__(name: str) -> Any:
         from safe_envs.agents.training.vec_env import make_sb3_env
 
         return make_sb3_env
+    if name == "FilteredReplayBuffer":
+        from safe_envs.agents.training.replay_buffer import FilteredReplayBuffer
+
+        return FilteredReplayBuffer
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -17,6 +17,7 @@ from safe_envs.scripts.listing import list_envs
 from safe_envs.scripts.options.app import make_app, run_app
 from safe_envs.scripts.render import render
 from safe_envs.scripts.reproduce.command import reproduce
+from safe_envs.scripts.study import study
 from safe_envs.scripts.sweep import sweep
 from safe_envs.scripts.sweep_report import sweep_report
 from safe_envs.scripts.train import train
@@ -28,6 +29,7 @@ app = make_app(
         "identify": identify,
         "train": train,
         "leaderboard": leaderboard,
+        "study": study,
         "best": best,
         "verify": verify,
         "certify": certify,

@@ -72,7 +72,10 @@ def train(
         str,
         typer.Option(
             metavar="executed|proposed|both",
-            help="On which action an off-policy algorithm learns with a filter in the loop.",
+            help=(
+                "On which action an off-policy algorithm learns with a filter in the loop;"
+                " Stable-Baselines3 by itself does on the proposed one."
+            ),
         ),
     ] = "executed",
     intervention_penalty: Annotated[
@@ -82,6 +85,17 @@ def train(
             help="Taken from the reward for each unit by which the filter moves the action.",
         ),
     ] = 0.0,
+    promise_curriculum: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="p of the promise filter to begin with; it rises to that of --filter.",
+        ),
+    ] = None,
+    curriculum_part: Annotated[
+        float,
+        typer.Option(metavar="X", help="Part of the training over which p rises."),
+    ] = 0.5,
     cost_limit: Annotated[
         float | None,
         typer.Option(
@@ -150,6 +164,8 @@ def train(
         seed=seed,
         action=action,
         intervention_penalty=intervention_penalty,
+        promise_curriculum=promise_curriculum,
+        curriculum_part=curriculum_part,
         cost_limit=cost_limit,
         violation_limit=violation_limit,
         eval_freq=eval_freq,

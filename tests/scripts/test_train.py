@@ -98,6 +98,11 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
         (("--algo", "ppo", "--n-timesteps", 0), "n_timesteps = 0"),
         (("--algo", "ppo", "--intervention-penalty", 1), "penalty"),
         (("--algo", "sac", "--action", "best"), "action = 'best'"),
+        (("--algo", "ppo", "--promise-curriculum", 0.5), "a promise filter in the loop"),
+        (
+            ("--algo", "ppo", "--filter", "promise:p=0.9", "--promise-curriculum", 0.9),
+            "promise_curriculum = 0.9",
+        ),
         (("--algo", "ppo", "--resume"), "holds no training"),
         (("--algo", "ppo", "--cost-limit", 1), "ppo has no cost_limit; leave it out, or choose"),
         (("--algo", "sac-lag", "--violation-limit", 1), "is a probability"),

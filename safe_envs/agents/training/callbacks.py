@@ -14,6 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 
 from safe_envs.agents.jobs.store import reading
+from safe_envs.agents.training.promise_curriculum import PromiseCurriculum
 from safe_envs.atomic_io import write_atomically, writing
 
 _EPISODES = 100
@@ -102,6 +103,25 @@ class SafetyFigures(BaseCallback):
                 "h_min": float(h_min.mean()),
             }
         return found
+
+
+class CurriculumCallback(BaseCallback):
+    """Goes on with a curriculum after each step, and records it as `train/probability`.
+
+    Args:
+        curriculum: to follow.
+    """
+
+    def __init__(self, curriculum: PromiseCurriculum) -> None:
+        super().__init__()
+        self._curriculum, self._asked = curriculum, curriculum.first
+
+    def _on_step(self) -> bool:
+        self._asked = self._curriculum.ask(self.training_env, self.num_timesteps)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.logger.record("train/probability", self._asked)
 
 
 class ProgressLog(KVWriter):

@@ -17,6 +17,7 @@ from safe_envs.agents.training.hyperparameters import (
 )
 from safe_envs.agents.training.limits import COST, DEFAULT_VIOLATION_LIMIT, UNITS, VIOLATION
 from safe_envs.agents.training.multiplier import require_at_least_zero
+from safe_envs.agents.training.promise_curriculum import PromiseCurriculum
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.registry import full_id
@@ -54,6 +55,10 @@ class Training:
         action: on which an off-policy algorithm learns; see
             `safe_envs.agents.training.replay_buffer`.
         intervention_penalty: see `safe_envs.agents.training.vec_env.make_sb3_env`.
+        promise_curriculum: p of a promise filter with which the training begins, and which rises to
+            that of the filter; None for the filter's from the beginning. See
+            `safe_envs.agents.training.promise_curriculum`.
+        curriculum_part: of the training, over which it rises.
         eval_episodes: of each evaluation.
         threads: of torch and BLAS. Small networks are many times slower on several threads of a
             busy machine.
@@ -80,6 +85,8 @@ class Training:
     seed: int = 0
     action: str = ACTIONS[0]
     intervention_penalty: float = 0.0
+    promise_curriculum: float | None = None
+    curriculum_part: float = 0.5
     eval_episodes: int = 200
     threads: int = 1
     engine: str = "auto"
@@ -97,6 +104,7 @@ class Training:
         for name, least in _LEAST.items():
             require_whole(name, getattr(self, name), least)
         require_engine(self.engine)
+        self.curriculum  # noqa: B018  (which refuses what is out of range)
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
         if self.action not in ACTIONS:
@@ -111,6 +119,13 @@ class Training:
                 "an intervention penalty is of the proposed action, and the executed one, on which"
                 " is learned, has none; give --action both or proposed too, or no penalty"
             )
+
+    @property
+    def curriculum(self) -> PromiseCurriculum | None:
+        """The curriculum on p of the promise filter; None without one."""
+        return PromiseCurriculum.of(
+            self.promise_curriculum, self.curriculum_part, self.filter, self.n_timesteps
+        )
 
     def _require_limits(self) -> None:
         given = {

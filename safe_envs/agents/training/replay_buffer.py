@@ -46,6 +46,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from safe_envs.agents.training.hyperparameters import ACTIONS
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.env_wrappers.filtered_box import FilteredBox
 
 _ROUNDING = 1e-6
 """How far beyond [-1, 1] rounding may move an action on the input bounds."""
@@ -53,6 +54,10 @@ _ROUNDING = 1e-6
 
 class FilteredReplayBuffer(ReplayBuffer):
     """A replay buffer that stores what a filter executed.
+
+    Example: `SAC("MlpPolicy", env, replay_buffer_class=FilteredReplayBuffer)`, where the filter is
+    the outermost wrapper that changes actions. Without this class SAC, TD3 and DDPG store what they
+    proposed.
 
     It takes `info["safe_action"]`, which is physical, to [-1, 1] in double precision. An env that
     reports none has no filter: its proposal is stored, as Stable-Baselines3 does. With "both" each
@@ -63,7 +68,8 @@ class FilteredReplayBuffer(ReplayBuffer):
 
     Args:
         args: those of `ReplayBuffer`.
-        box: physical (low, high) of each input.
+        box: physical (low, high) of each input; None for that of the action space, which that of a
+            filtered env has.
         action: "executed", "proposed" or "both".
         kwargs: those of `ReplayBuffer`.
 
@@ -73,7 +79,11 @@ class FilteredReplayBuffer(ReplayBuffer):
     """
 
     def __init__(
-        self, *args: Any, box: Sequence[Sequence[float]], action: str = "executed", **kwargs: Any
+        self,
+        *args: Any,
+        box: Sequence[Sequence[float]] | None = None,
+        action: str = "executed",
+        **kwargs: Any,
     ) -> None:
         if action not in ACTIONS:
             raise ConfigurationError(f"action = {action!r}; {nearest(str(action), ACTIONS)}")
@@ -85,7 +95,14 @@ class FilteredReplayBuffer(ReplayBuffer):
                 " optimize_memory_usage=False"
             )
         self.action = action
-        self._center, self._half = _center_and_half_width(box, self.action_dim)
+        space = self.action_space
+        if box is not None:
+            self._center, self._half = _center_and_half_width(box, self.action_dim)
+        elif isinstance(space, FilteredBox):
+            self._center = 0.5 * (space.at_low + space.at_high)
+            self._half = 0.5 * (space.at_high - space.at_low)
+        else:  # there may be no filter, and nothing to scale
+            self._center = self._half = None
 
     def add(
         self,
@@ -107,7 +124,7 @@ class FilteredReplayBuffer(ReplayBuffer):
             infos: of the step just taken, not of the reset after it.
 
         Raises:
-            ConfigurationError: an executed action is out of the input bounds.
+            ConfigurationError: an executed action is out of the input bounds, or these are unknown.
         """
         if self.action != "proposed":
             super().add(
@@ -134,10 +151,17 @@ class FilteredReplayBuffer(ReplayBuffer):
         return actions
 
     def _normalized(self, physical: np.ndarray) -> np.ndarray:
+        if self._center is None or self._half is None:
+            raise ConfigurationError(
+                "the env is filtered, and a wrapper around the filter changes the actions, or the"
+                " map of the actions is no straight line, so that the executed ones are unknown in"
+                " units of the action space; put the filter around that wrapper, or give"
+                " replay_buffer_kwargs={'box': [(low, high), ...]}: the inputs at its ends"
+            )
         actions = (physical - self._center) / self._half
         clipped = np.clip(actions, -1.0, 1.0)
         if not (np.abs(actions - clipped) <= _ROUNDING).all():
-            low, high = self._center - self._half, self._center + self._half
+            low, high = np.sort([self._center - self._half, self._center + self._half], axis=0)
             raise ConfigurationError(
                 f"the executed actions {physical.tolist()} are not between {low.tolist()} and"
                 f" {high.tolist()}; give the input bounds of the env's problem, as"
@@ -173,7 +197,7 @@ def replay_options(
 ) -> dict[str, Any]:
     """Return the arguments of SAC, TD3 or DDPG with which they learn on an action.
 
-    Example: `SAC("MlpPolicy", env, **replay_options(env))`.
+    Example: `SAC("MlpPolicy", env, **replay_options(env, "both"))`.
 
     Args:
         source: the problem, or an env of it with or without filter.

@@ -25,7 +25,7 @@ from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.store import make_folder
 from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
-from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
+from safe_envs.agents.training.callbacks import CurriculumCallback, ProgressLog, SafetyFigures
 from safe_envs.agents.training.checkpoints import (
     copy_policy,
     drop_replay_buffer,
@@ -217,16 +217,22 @@ class TrainingSession:
             progress(min(model.num_timesteps / training.n_timesteps, 1.0))
             return True  # anything else would end the training
 
+        callbacks = [self._figures, ConvertCallback(note)]
+
         # Schedules refer to the whole training, not to its part.
         of_part = model._update_current_progress_remaining
         model._update_current_progress_remaining = lambda done, _: of_part(
             done, training.n_timesteps
         )
+        if training.curriculum is not None:
+            # Before the first reset of a training: its episodes begin there.
+            training.curriculum.ask(model.get_env(), model.num_timesteps)
+            callbacks.append(CurriculumCallback(training.curriculum))
         began = time.process_time()
         try:
             model.learn(
                 end - model.num_timesteps,
-                CallbackList([self._figures, ConvertCallback(note)]),
+                CallbackList(callbacks),
                 log_interval=4 if training.algorithm in OFF_POLICY else 1,
                 reset_num_timesteps=False,
             )

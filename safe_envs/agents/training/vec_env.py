@@ -99,8 +99,8 @@ class SafeVecEnv(NativeVecEnv):
     action look alike. So nothing draws the policy away from proposals that need correction, unless
     a penalty does. Its amount is in the infos as "intervention_penalty", float64 of shape
     (num_envs,) in `batch_info`: zeros at reset, and no such key if c is 0.
-    `safe_envs.agents.training.replay_buffer` stores executed actions with the reward before the
-    penalty.
+    With `replay_buffer_class=FilteredReplayBuffer` SAC, TD3 and DDPG store executed actions, with
+    the reward before the penalty; see `safe_envs.agents.training.replay_buffer`.
 
     Attributes:
         env: the native vector env, with or without a filter.

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.independent_copies import IndependentCopies
+from safe_envs.registry import env_class, full_id
+from safe_envs.wrappers.env_wrappers.autoreset import autoreset_mode
+from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
+from safe_envs.wrappers.env_wrappers.safety_filter import SafetyFilterWrapper
+from safe_envs.wrappers.env_wrappers.safety_filter_vector import SafetyFilterVectorWrapper
 
 SixTuple = tuple[Any, Any, Any, Any, Any, dict[str, Any]]
 
@@ -24,7 +32,7 @@ class CostReturnWrapper(IndependentCopies):
         env: whose `info` holds the `cost` of each step.
 
     Raises:
-        ConfigurationError: it is no Gymnasium env.
+        ConfigurationError: it is no Gymnasium env, or a vector env that does not say how it resets.
     """
 
     def __init__(self, env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> None:
@@ -34,9 +42,7 @@ class CostReturnWrapper(IndependentCopies):
                 " gym.make('safe_envs/Quadrotor-v0')"
             )
         self.env = env
-        self._mode = (
-            env.metadata.get("autoreset_mode") if isinstance(env, gym.vector.VectorEnv) else None
-        )
+        self._mode = autoreset_mode(env) if isinstance(env, gym.vector.VectorEnv) else None
         self._ended = np.zeros(getattr(env, "num_envs", ()), dtype=bool)
 
     def __getattr__(self, name: str) -> Any:
@@ -86,3 +92,79 @@ class CostReturnWrapper(IndependentCopies):
             last = info["final_info"]
             return np.where(last["_cost"], last["cost"], cost)
         return np.where(self._ended, 0.0, cost) if self._mode == AutoresetMode.NEXT_STEP else cost
+
+
+def make_with_cost(
+    env_id: str,
+    filter: FilterChoice | None = None,  # noqa: A002  (the word of the whole project)
+    **options: Any,
+) -> CostReturnWrapper:
+    """Make an env whose `step` returns the cost after the reward, as `safety_gymnasium.make` does.
+
+    Args:
+        env_id: registered id, with or without its namespace.
+        filter: condition of a safety filter around the env, or its text, like "scbf".
+        **options: arguments of `gym.make`.
+
+    Raises:
+        ConfigurationError: an id, a filter or an argument is unknown or out of range.
+        RelativeDegreeError: the filter does not suit the env's barrier.
+    """
+    env = gym.make(full_id(env_id), **options)
+    return CostReturnWrapper(env if filter is None else SafetyFilterWrapper(env, filter))
+
+
+def make_vec_with_cost(
+    env_id: str,
+    num_envs: int = 1,
+    vectorization_mode: str | None = None,
+    filter: FilterChoice | None = None,  # noqa: A002
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    **options: Any,
+) -> CostReturnWrapper:
+    """Make a vector env whose `step` returns the costs after the rewards.
+
+    Args:
+        env_id: registered id, with or without its namespace.
+        num_envs: size of the batch.
+        vectorization_mode: of `gym.make_vec`: "vector_entry_point" for the native vector env, which
+            is the default, "sync", or "async" for a process for each env.
+        filter: see `make_with_cost`.
+        autoreset_mode: "NextStep", "SameStep" or "Disabled", in all three vectorisations.
+        **options: arguments of `gym.make`.
+
+    Raises:
+        ConfigurationError: an id, a filter, a mode or an argument is unknown or out of range.
+        RelativeDegreeError: the filter does not suit the env's barrier.
+    """
+    modes = [mode.value for mode in VectorizeMode]
+    if vectorization_mode is not None and vectorization_mode not in modes:
+        raise ConfigurationError(
+            f"vectorization_mode = {vectorization_mode!r};"
+            f" {nearest(str(vectorization_mode), modes)}"
+        )
+    resets = [mode.value for mode in AutoresetMode]
+    if autoreset_mode not in (*resets, *AutoresetMode):
+        raise ConfigurationError(
+            f"autoreset_mode = {autoreset_mode!r}; {nearest(str(autoreset_mode), resets)}"
+        )
+    require_whole("num_envs", num_envs, 1)
+    name, mode = full_id(env_id), AutoresetMode(autoreset_mode)
+    if vectorization_mode in (None, VectorizeMode.VECTOR_ENTRY_POINT.value):
+        env_class(name)  # others have no native vector env
+        native = VectorizeMode.VECTOR_ENTRY_POINT
+        env = gym.make_vec(name, num_envs, native, autoreset_mode=mode.value, **options)
+        return CostReturnWrapper(env if filter is None else SafetyFilterVectorWrapper(env, filter))
+    around: list[Callable[..., Any]] = (
+        [] if filter is None else [partial(SafetyFilterWrapper, condition=filter)]
+    )
+    return CostReturnWrapper(
+        gym.make_vec(
+            name,
+            num_envs,
+            vectorization_mode,
+            vector_kwargs={"autoreset_mode": mode},
+            wrappers=around,
+            **options,
+        )
+    )

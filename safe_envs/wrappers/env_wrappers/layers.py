@@ -14,6 +14,7 @@ from safe_envs.envs.info import Info, filter_info
 from safe_envs.envs.reset_options import refuse_time
 from safe_envs.errors import ConfigurationError
 from safe_envs.independent_copies import IndependentCopies
+from safe_envs.number_text import finite_number
 from safe_envs.problem.actuators import resting_input
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice, episode_filter
@@ -104,6 +105,28 @@ class FilterLayer(IndependentCopies):
         """
         if self._filter.judges_episodes and self._inner is self._inner.unwrapped:
             refuse_time(options, f"the filter {self._filter.text}")
+
+    def ask_promise(self, probability: float) -> None:
+        """Let the episodes that begin from now on keep a lower probability, and no other ones.
+
+        Args:
+            probability: above 0, up to p of the promise filter.
+
+        Raises:
+            ConfigurationError: the filter is another one, or the probability out of range.
+        """
+        memory = self._filter
+        if not isinstance(memory, PromiseMemory):
+            raise ConfigurationError(
+                f"the filter {memory.text} keeps no probability that could be changed; use a"
+                " promise filter, like promise:p=0.99"
+            )
+        most = memory.safety_filter.settings.probability
+        if not 0.0 < finite_number("probability", probability) <= most:
+            raise ConfigurationError(
+                f"probability = {probability!r}; give a number above 0, up to the filter's {most:g}"
+            )
+        memory.asked = float(probability)
 
     def watch_states(self, episodes: Episode | Episodes) -> None:
         """Look from now on for states that are set.

@@ -59,6 +59,10 @@ class MonitorLayer(IndependentCopies):
         is_drawn = env.render_mode == "rgb_array"
         self.viewer = Viewer(self.problem, "rgb_array", count) if is_drawn else None
 
+    def inputs_of(self, actions: np.ndarray) -> np.ndarray:
+        """Return the model's inputs (B, m) for actions of the env."""
+        return self._spec.inputs(actions)
+
     def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
         """Return the env's action for components of inputs; the inverse of `physical_action`."""
         # Of a batch the components are arrays, and the envs come first in the actions.

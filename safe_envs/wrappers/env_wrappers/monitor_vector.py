@@ -12,8 +12,9 @@ from gymnasium.vector import AutoresetMode
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, VectorStep, with_masks
-from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.errors import InvalidInputError
 from safe_envs.validators import real_array
+from safe_envs.wrappers.env_wrappers.autoreset import autoreset_mode
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer, barrier_table, doubt_layers
 
@@ -43,13 +44,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         for layer in getattr(env.unwrapped, "envs", [])[:1]:
             doubt_layers(layer)
         self.watch(spec, _one_of(env), env.single_action_space, "arrays", self.num_envs)
-        try:
-            self._mode = AutoresetMode(env.metadata.get("autoreset_mode"))
-        except ValueError as error:
-            raise ConfigurationError(
-                f"{env} does not say when it resets: its metadata has no autoreset_mode of"
-                " Gymnasium"
-            ) from error
+        self._mode = autoreset_mode(env)
         self.executed: Components = ()
         self._x: Components = ()
         self.episodes = Episodes(self.num_envs)

@@ -12,6 +12,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
+from safe_envs.wrappers.env_wrappers.filtered_box import filtered_box
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -88,6 +89,7 @@ class SafetyFilterWrapper(
             delay=delay,
         )
         gym.Wrapper.__init__(self, env)
+        self.action_space = filtered_box(env.action_space, inner)
         if observe_promise:
             self.observation_space = self.observation_box(env.observation_space)
         self._directly = _only_checks_between(env, inner)

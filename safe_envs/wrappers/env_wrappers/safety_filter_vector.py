@@ -15,6 +15,7 @@ from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice
+from safe_envs.wrappers.env_wrappers.filtered_box import filtered_box
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -64,6 +65,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         )
         self.watch_states(inner.episodes)
         gym.vector.VectorWrapper.__init__(self, env)
+        self.single_action_space = filtered_box(env.single_action_space, inner)
         if observe_promise:
             self.single_observation_space = self.observation_box(env.single_observation_space)
             self.observation_space = batch_space(self.single_observation_space, env.num_envs)

@@ -34,6 +34,7 @@ class PromiseMemory:
         text: of its settings.
         judges_episodes: whether the promise is of a specification, which is of whole episodes.
         levels: p_k of each episode, what is still kept; shape (num_envs,).
+        asked: p of the episodes that begin from now on, at most that of the filter.
         losses: how often p_k had to be lowered by more than rounding, which a right table never
             makes necessary.
         largest_loss: by which it was.
@@ -52,6 +53,7 @@ class PromiseMemory:
         self._expected = np.ones(num_envs)
         self._caps = np.full(num_envs, np.inf)
         self.levels = np.zeros(num_envs)
+        self.asked = promise_filter.settings.probability
         self.losses, self.largest_loss = 0, 0.0
         count = len(promise_filter.problem.barriers)
         self._barriers = count
@@ -72,7 +74,7 @@ class PromiseMemory:
             k = self._go_to(chosen, instants)
             self._ended[chosen] = False
             self.levels = self.levels.copy()
-            self.levels[chosen] = self.safety_filter.start(starts, k)
+            self.levels[chosen] = np.minimum(self.safety_filter.start(starts, k), self.asked)
             if self._product is not None:
                 pairs = self._product.starts(starts)
                 self._states[chosen] = pairs[-1]
@@ -93,12 +95,13 @@ class PromiseMemory:
         at, k = tuple([c[chosen] for c in _arrays(x)]), self._go_to(chosen, instants)
         self.levels = self.levels.copy()
         if self._product is None:
-            self.levels[chosen] = self.safety_filter.start(at, k)
+            self.levels[chosen] = np.minimum(self.safety_filter.start(at, k), self.asked)
             return
         pairs = (*at, self._states[chosen])
         # A table takes an episode to be over in a goal, but it is not over before the next step.
         is_open = np.isnan(self._product.settled(k, pairs))
         promised = np.where(is_open, self.safety_filter.attainable(k, pairs), 0.0)
+        promised = np.minimum(promised, self.asked)
         self.levels[chosen] = np.where(self._product.met(k, pairs[-1]), 1.0, promised)
 
     def _go_to(self, chosen: Any, instants: Any) -> np.ndarray:

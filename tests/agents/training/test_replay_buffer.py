@@ -21,6 +21,7 @@ from safe_envs.agents.training.replay_buffer import (
     replay_options,
 )
 from safe_envs.agents.training.vec_env import make_sb3_env
+from safe_envs.object_import import load_object
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
 pytestmark = pytest.mark.slow
@@ -316,7 +317,6 @@ def test_options_of_a_problem_and_of_any_env_of_it():
 @pytest.mark.parametrize(
     "box",
     [
-        None,
         (0.0, 4.0),
         ((0.0, 4.0),),
         ((0.0, 4.0), (5.0, -3.0)),
@@ -367,3 +367,71 @@ def test_envs_without_one_box():
         match=r"different input bounds \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
     ):
         replay_options(DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))]))
+
+
+def third_party():
+    """Gymnasium's own pendulum behind a filter; its actions are torques in [-2, 2]."""
+    spec = load_object("examples/pendulum_v1.py:spec")
+    view = {name: getattr(spec, name) for name in ("model", "barriers", "state_fn", "action_map")}
+    env = gym.make("Pendulum-v1", max_episode_steps=25)
+    return Monitor(SafetyFilterWrapper(env, spec.filter, **view))
+
+
+@pytest.mark.parametrize(
+    "make_envs",
+    [lambda: several(1), several, native, make, lambda: DummyVecEnv([third_party])],
+    ids=["one", "several", "native", "gym", "third party"],
+)
+@pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG])
+def test_the_class_alone_stores_what_was_executed(algorithm, make_envs):
+    """One argument; plain Stable-Baselines3 stores something else."""
+    net = {"net_arch": [8]}
+    model = algorithm(
+        "MlpPolicy", make_envs(), **SETTINGS, policy_kwargs=net, replay_buffer_class=Recording
+    )
+    model.learn(120)
+    buffer = model.replay_buffer
+    assert buffer.unit
+    assert len(buffer.unit) == buffer.size()
+    np.testing.assert_allclose(stored(model), np.array(buffer.unit), rtol=0, atol=1e-6)
+    assert np.abs(stored(model) - np.array(buffer.proposals)).max() > 0.1
+
+
+class Recording(FilteredReplayBuffer):
+    """Keeps what was proposed and, computed from the infos and known bounds, executed."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.proposals, self.unit = [], []
+
+    def add(self, obs, next_obs, action, reward, done, infos):
+        ours = self.observation_space.shape != (3,)  # of the third-party pendulum
+        center, half = (1.0, 4.0) if ours else (0.0, 2.0)
+        self.proposals.append(action.copy())
+        self.unit.append([(info["safe_action"] - center) / half for info in infos])
+        super().add(obs, next_obs, action, reward, done, infos)
+
+
+def test_the_class_alone_learns_as_with_the_options():
+    alone, _ = learned(SAC, several(), replay_buffer_class=FilteredReplayBuffer)
+    options, _ = learned(SAC, several(), **replay_options(several()))
+    assert_same_learning(alone, options)
+    free, _ = learned(SAC, several(filtered=False), replay_buffer_class=FilteredReplayBuffer)
+    plain, _ = learned(SAC, several(filtered=False))
+    assert_same_learning(free, plain)
+
+
+def test_a_wrapper_that_hides_the_box_is_told():
+    def hidden():
+        env = SafetyFilterWrapper(gym.make(ENV_ID, horizon=0.5, box=BOX), "scbf")
+        return gym.wrappers.RescaleAction(env, np.float32(-2.0), np.float32(2.0))
+
+    with pytest.raises(ConfigurationError, match="wrapper around the filter"):
+        learned(SAC, hidden(), replay_buffer_class=FilteredReplayBuffer)
+    model, _ = learned(
+        SAC,
+        hidden(),
+        replay_buffer_class=FilteredReplayBuffer,
+        replay_buffer_kwargs={"box": [BOX]},
+    )
+    assert model.replay_buffer.size() == 120

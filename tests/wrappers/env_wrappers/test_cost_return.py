@@ -11,8 +11,16 @@ from gymnasium.vector import AutoresetMode
 
 import safe_envs  # noqa: F401  (registers the envs)
 from safe_envs import ConfigurationError
-from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
-from safe_envs.wrappers.env_wrappers.cost_return import CostReturnWrapper
+from safe_envs.object_import import load_object
+from safe_envs.wrappers import (
+    CostReturnWrapper,
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    SafetyMonitorVector,
+    make_vec_with_cost,
+    make_with_cost,
+)
+from tests.wrappers.env_wrappers.scalar_oracle import ScalarEnvs
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 NUM_ENVS = 8
@@ -122,3 +130,83 @@ def test_envs_without_a_cost_are_refused():
     env.reset(seed=0)
     with pytest.raises(ConfigurationError, match="no 'cost'"):
         env.step(env.action_space.sample())
+
+
+def test_made_with_costs():
+    env = make_with_cost("StochasticDubins-v0", "scbf", noise=0.2)
+    assert isinstance(env, CostReturnWrapper)
+    assert isinstance(env.env, SafetyFilterWrapper)
+    env.reset(seed=0)
+    assert len(env.step(np.array([0.0]))) == 6
+    assert make_with_cost(ENV_ID).unwrapped.problem.plant is not None
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize("kind", ["vector_entry_point", "sync"])
+@pytest.mark.parametrize("text", [None, "scbf"])
+def test_costs_are_those_of_scalar_envs(mode, kind, text):
+    assert_costs_of_scalar_envs(mode, kind, text)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_costs_from_processes_are_those_of_scalar_envs(mode):
+    assert_costs_of_scalar_envs(mode, "async", "scbf", num_envs=2)
+
+
+def assert_costs_of_scalar_envs(mode, kind, text, num_envs=4):
+    settings = {"max_episode_steps": 5, "barrier": {"radius": 0.5}}
+    env = make_vec_with_cost(ENV_ID, num_envs, kind, text, mode, **settings)
+    oracle = ScalarEnvs(lambda: make_with_cost(ENV_ID, text, **settings), num_envs, mode, seed=5)
+    env.reset(seed=5)
+    actions, total, ends = np.linspace(-0.5, 0.5, num_envs)[:, None], 0.0, 0
+    for k in range(15):
+        if k == 2:
+            half = np.arange(num_envs) < 1
+            env.reset(options={"reset_mask": half})
+            oracle.reset(half)
+        *_, cost, terminated, truncated, info = env.step(actions)
+        steps, ended = oracle.step(actions), terminated | truncated
+        assert cost.dtype == np.float64
+        np.testing.assert_array_equal(cost, [0.0 if six is None else six[2] for six in steps])
+        np.testing.assert_array_equal(
+            ended, [six is not None and (six[3] or six[4]) for six in steps]
+        )
+        last = info["final_info"] if mode == "SameStep" and ended.any() else info
+        for i in np.flatnonzero(ended):
+            assert last["episode_cost"][i] == steps[i][5]["episode_cost"]
+            ends += 1
+        if mode == "Disabled" and ended.any():
+            env.reset(options={"reset_mask": ended})
+            oracle.reset(ended)
+        total += cost.sum()
+    assert ends >= 2 * num_envs
+    assert total > 0.0 or text
+    env.close()
+
+
+def test_costs_of_third_party_envs():
+    spec = load_object("examples/pendulum_v1.py:spec")
+    env = CostReturnWrapper(SafetyMonitorVector(gym.make_vec("Pendulum-v1", 3, "sync"), spec))
+    env.reset(seed=0)
+    _, _, cost, _, _, info = env.step(np.full((3, 1), 2.0, dtype=np.float32))
+    np.testing.assert_array_equal(cost, info["violation"].astype(float))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        ({"vectorization_mode": "threads"}, "vectorization_mode"),
+        ({"autoreset_mode": "Sometimes"}, "autoreset_mode"),
+        ({"num_envs": 0}, "num_envs"),
+        ({"filter": "nothing"}, "nothing"),
+        ({"env_id": "Nothing-v0"}, "Nothing"),
+        ({"env_id": "Pendulum-v1"}, "not one of this project"),
+    ],
+)
+def test_wrong_arguments_are_refused(arguments, word):
+    with pytest.raises(ConfigurationError, match=word):
+        make_vec_with_cost(**{"env_id": ENV_ID, **arguments})
+    silent = gym.make_vec(ENV_ID, 2)
+    silent.metadata = {}
+    with pytest.raises(ConfigurationError, match="autoreset_mode"):
+        CostReturnWrapper(silent)
