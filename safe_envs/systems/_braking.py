@@ -1,8 +1,9 @@
 """Backup law of a car behind another: brake until it is no faster, then keep the speed.
 
-**Law.** Let w = v - v_f be the closing speed and F_r the drag, which does not decrease with the
-speed. The law asks for the acceleration min(0, (v* - v)/dt), u = F_r(v) + M min(0, (v* - v)/dt),
-and is clipped to the force -F at most. v* is so far below v_f that it brakes fully where w > 0.
+**Law.** Let w = v - v_f be the closing speed and F_r the drag, a polynomial of the speed v >= 0
+without falling terms; other numbers are refused. The law asks for the acceleration min(0, (v* -
+v)/dt), u = F_r(v) + M min(0, (v* - v)/dt), and is clipped to the force -F at most. v* is so far
+below v_f that it brakes fully where w > 0.
 
 **Terminal set.** Let a_1 = (F + F_r(v_f))/M and a = (F + F_r(v_f - a_1 dt))/M, which full braking
 from w > 0 exceeds during a period. With h the distance to what is unsafe, h = z - D or h = z - tau
@@ -19,6 +20,9 @@ grows and w' stays <= 0. Let now w <= 0: the input takes the drag off exactly at
 falls the drag falls by less than what the law brakes; so v does not grow, w stays <= 0 and h does
 not fall. QED
 
+It takes that v stays >= 0, and that a period changes the drag by less than what changes it, dt
+F_r'(v) <= M: both are parts of the terminal set, and stay true in it.
+
 As the drag grows with the speed the true stopping distance is shorter; the horizon, within which
 the law may reach the set, regains that. Noise is left out: with it no law keeps a distance for
 certain.
@@ -31,6 +35,8 @@ from typing import Any
 
 import sympy as sp
 
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem.backup import Backup, BackupLaw
 
 _REACH = 1.05
@@ -58,7 +64,12 @@ def braking_backup(
         headway: tau in h = z - tau v, in s; 0 for h = z - D.
         drag: F_r of a speed, in N.
         mass: M, in kg.
+
+    Raises:
+        ConfigurationError: the proof does not hold for these numbers.
     """
+    for system in (problem.plant, problem.model):
+        _require_assumptions(problem, system, drag, mass)
     force = -problem.box[0][0]
     if force <= 0.0:
         return Backup((BackupLaw("brake", (sp.Integer(0),), sp.Integer(-1)),), _HORIZON)
@@ -73,8 +84,34 @@ def braking_backup(
             BackupLaw(
                 "brake",
                 (drag(speed) + mass * slowdown,),
-                sp.Min(distance - late**2 / (2 * a), speed, lead - 2 * most * problem.dt),
+                sp.Min(
+                    distance - late**2 / (2 * a),
+                    speed,
+                    lead - 2 * most * problem.dt,
+                    mass / problem.dt - sp.diff(drag(speed), speed),
+                ),
             ),
         ),
         _HORIZON,
     )
+
+
+def _require_assumptions(
+    problem: Any, system: ControlAffineSDE, drag: Callable[[Any], Any], mass: sp.Symbol
+) -> None:
+    """Raise ConfigurationError where the proof does not hold for the numbers of a system."""
+    speed = sp.Dummy("v", nonnegative=True)
+    *rising, at_rest = sp.Poly(system.numeric(drag(speed)), speed).all_coeffs()
+    low, high = problem.box[0]
+    for fits, what in (
+        (float(system.numeric(mass)) > 0.0, "a positive mass"),
+        (all(c >= 0.0 for c in rising), "a drag without terms that fall with the speed"),
+        (low >= 0.0 or at_rest > low, "a drag at rest above the lower bound of the force"),
+        (high >= at_rest, "an upper bound of the force that is no less than the drag at rest"),
+    ):
+        if not fits:
+            raise ConfigurationError(
+                f"the backup of {problem.name} needs {what}, for else its terminal set is not kept:"
+                f" given {system.parameter_values} and a force in [{low:g}, {high:g}]; take other"
+                " numbers or another filter"
+            )

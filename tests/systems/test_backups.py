@@ -12,6 +12,7 @@ from scipy.integrate import quad
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.integrators import Integrator
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem.backup import backup_of
 from safe_envs.registry import make_problem
 from safe_envs.systems._turning import circle_radius
@@ -180,3 +181,28 @@ def test_every_stated_backup_fits_its_model(name):
     for law in found.laws:
         symbols = set().union(*(e.free_symbols for e in (*law.law, law.terminal)))
         assert symbols <= set(problem.plant.states)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"plant": {"f_2": -1.0}}, "fall with the speed"),
+        ({"plant": {"f_1": -1.0}, "model": {"f_1": -1.0}}, "fall with the speed"),
+        ({"plant": {"M": -5.0}}, "positive mass"),
+        ({"plant": {"f_0": -5000.0}}, "above the lower bound"),
+        ({"box": (-4000.0, -100.0)}, "upper bound"),
+    ],
+)
+def test_what_the_proof_of_braking_takes_is_checked(options, said):
+    for name in ("ACC", "ACCGap"):
+        problem = make_problem(f"safe_envs/{name}-v0", noise=0.0, **options)
+        with pytest.raises(ConfigurationError, match=said):
+            backup_of(problem)
+
+
+def test_a_drag_that_a_period_changes_too_much_leaves_no_terminal_set():
+    sizes = {"f_2": 40.0}
+    known = Simulated("ACCGap", noise=0.0, dt=0.5, plant=sizes, model=sizes)
+    (law,) = known.laws.laws
+    x = np.array([[50.0, 21.0], [400.0, 400.0]])
+    assert (known.terminal(law, x) < 0.0).tolist() == [True, False]

@@ -14,6 +14,9 @@ from safe_envs.wrappers.backup import BackupFilter, BackupSettings
 COMPUTED = "1 where a backup law keeps the start safe; plans are of floating-point numbers"
 """Note on such a bound."""
 
+STATED = "; that {} keep the terminal sets that are stated is assumed, but for samples"
+"""What is added to it where terminal sets were not derived."""
+
 
 class BackupBound:
     """The guarantee of a backup filter: no violation from where a law keeps the system safe.
@@ -34,11 +37,12 @@ class BackupBound:
     """
 
     word: Literal["computed"] = "computed"
-    note = COMPUTED
     nowhere = "no backup law keeps any of the starts safe"
 
     def __init__(self, settings: BackupSettings, problem: SafetyProblem, knowledge: str) -> None:
         self._filter = BackupFilter.for_problem(problem, settings, knowledge)
+        stated = ", ".join(self._filter.stated)
+        self.note = COMPUTED + (STATED.format(stated) if stated else "")
         self.why_none = self._filter.why_not(problem.plant)
 
     def at(self, starts: np.ndarray) -> np.ndarray:

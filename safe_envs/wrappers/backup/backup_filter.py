@@ -57,7 +57,7 @@ from safe_envs.errors import (
     shown,
 )
 from safe_envs.number_text import finite_number
-from safe_envs.problem.backup import Backup
+from safe_envs.problem.backup import Backup, backup_of
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.problem import SafetyProblem
@@ -66,6 +66,7 @@ from safe_envs.wrappers.backup.plan_filter import ROUNDING, PlanFilter
 from safe_envs.wrappers.backup.planned_system import PlannedLaw
 from safe_envs.wrappers.backup.plans import Plans
 from safe_envs.wrappers.backup.settings import LONGEST, BackupSettings
+from safe_envs.wrappers.backup.stated_sets import require_kept, sampled_states
 from safe_envs.wrappers.backup_sets.terminal_set import with_terminal_sets
 from safe_envs.wrappers.filter_qp import FilterDecision, arguments, limits
 from safe_envs.wrappers.filter_qp.runtime import doubles, require_finite
@@ -98,6 +99,7 @@ class BackupFilter(PlanFilter):
         settings: as given.
         text: of the settings.
         plans: that are simulated.
+        stated: names of the laws whose terminal sets nothing but samples was checked of.
 
     Raises:
         SystemDefinitionError: The system or a barrier is none, or they do not fit.
@@ -126,7 +128,8 @@ class BackupFilter(PlanFilter):
         for law in backup.laws:
             law.require_known(system)
         self.settings = BackupSettings() if settings is None else settings
-        self.text, self._names = self.settings.text, [barrier.name for barrier in named]
+        self.text = self.settings.text
+        self.stated = tuple(law.name for law in backup.laws)
         low, high = limits.read_bounds(system.inputs, bounds, endless=False)
         period = finite_number("dt", dt)
         if period <= 0.0:
@@ -168,7 +171,8 @@ class BackupFilter(PlanFilter):
             knowledge: "model" for what the designer believes, "plant" for the true system.
 
         Raises:
-            SystemDefinitionError: What is given is no problem.
+            SystemDefinitionError: What is given is no problem, or a law leaves its stated terminal
+                set at a sampled state.
             ConfigurationError: The problem states no backup, or a word or number is not allowed.
         """
         arguments.require_problem(problem)
@@ -178,17 +182,15 @@ class BackupFilter(PlanFilter):
         settings = BackupSettings() if settings is None else settings
         settings.require_fit(problem)
         system = problem.model if knowledge == "model" else problem.plant
-        backup = with_terminal_sets(problem, system)
+        given, backup = backup_of(problem), with_terminal_sets(problem, system, settings.margin)
+        assert given is not None
         assert backup is not None
-        return cls(
-            system,
-            problem.barriers,
-            backup,
-            problem.box,
-            problem.dt,
-            problem.substeps,
-            settings,
-        )
+        timing = problem.dt, problem.substeps
+        made = cls(system, problem.barriers, backup, problem.box, *timing, settings)
+        stated = [j for j, law in enumerate(given.laws) if law.terminal is not None]
+        made.stated = tuple(given.laws[j].name for j in stated)
+        require_kept(made.plans, stated, sampled_states(problem))
+        return made
 
     def require_problem(self, problem: SafetyProblem) -> None:
         """Raise ConfigurationError where the filter was made for something else than a problem."""

@@ -71,7 +71,7 @@ def scaled(factor: float, a: BallMatrix) -> BallMatrix:
         a: the matrices.
     """
     center = factor * a.center
-    return BallMatrix(center, abs(factor) * a.radius * _MORE + _ULP * np.abs(center) + _TINY)
+    return BallMatrix(center, abs(factor) * a.radius * _MORE + 2 * _ULP * np.abs(center) + _TINY)
 
 
 @_QUIET

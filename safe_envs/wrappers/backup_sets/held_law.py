@@ -179,7 +179,7 @@ def held_law(system: ControlAffineSDE, law: BackupLaw, step: float, substeps: in
         The map, block by block, and what has to hold for it to be that of the law.
 
     Raises:
-        SystemDefinitionError: the coordinates do not close under the law.
+        SystemDefinitionError: the coordinates do not close under the law, or it jumps.
     """
     y = tuple(law.equilibrium)
     for entry in law.law:
@@ -196,6 +196,11 @@ def held_law(system: ControlAffineSDE, law: BackupLaw, step: float, substeps: in
         # Expanded with its symbols: what cancels between the inputs cancels exactly.
         rates[s] = system.numeric(system.drift[i] + sp.expand(effect[i]))
         _require_closed(law, f"the rate of {s}", rates[s], (*y, *now))
+        if rates[s].has(sp.atan2):  # Its slopes do not show where it jumps.
+            raise SystemDefinitionError(
+                f"the rate of {s} under backup law {law.name} holds atan2, which jumps; write it"
+                " with atan, or state the terminal set in place of the equilibrium"
+            )
     uses = [(s, now.get(t, t)) for s, r in rates.items() for t in r.free_symbols]
     blocks, before = [], ()
     for members in strongly_connected_components((list(y), uses)):

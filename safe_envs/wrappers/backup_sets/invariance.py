@@ -179,9 +179,13 @@ def is_kept(block: Block, conditions: Conditions, e: Ellipsoid, disturbed: Distu
 
 
 def _has_kinks_in(e: Any, symbols: Sequence[sp.Symbol]) -> bool:
-    """Return whether a function has kinks in some of its symbols."""
+    """Return whether a function has kinks in some of its symbols, or may jump."""
     return any(
-        part.free_symbols & set(symbols) and has_kinks(part.func(*(sp.Dummy() for _ in part.args)))
+        part.free_symbols & set(symbols)
+        and (
+            isinstance(part, sp.Piecewise | sp.atan2)
+            or has_kinks(part.func(*(sp.Dummy() for _ in part.args)))
+        )
         for part in e.atoms(sp.Function, sp.Max, sp.Min)
     )
 

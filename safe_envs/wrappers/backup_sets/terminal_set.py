@@ -14,7 +14,8 @@ largest volume is taken.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -35,17 +36,21 @@ _SHRINKING = (1.0, 0.5, 0.25, 0.125)
 _LEAST = 1e-4
 _CLOSE = 1.1
 _WORST_CONDITION = 1e4
+_WIDTHS = (1e-30, 1e30)
 
 BlockSet = tuple[tuple[sp.Symbol, ...], Ellipsoid]
 """Coordinates of a block, and the set that they stay in."""
 
 
-def with_terminal_sets(problem: Any, system: ControlAffineSDE) -> Backup | None:
+def with_terminal_sets(
+    problem: Any, system: ControlAffineSDE, margin: float = 0.0
+) -> Backup | None:
     """Return the backup of a problem, each law with its terminal set as an expression.
 
     Args:
         problem: a `SafetyProblem`.
         system: the dynamics that are believed: its plant or its model.
+        margin: which the barriers keep in sets that are derived.
 
     Returns:
         The backup with laws and terminal sets of the states alone, numbers in place of parameters;
@@ -64,7 +69,7 @@ def with_terminal_sets(problem: Any, system: ControlAffineSDE) -> Backup | None:
             tuple(system.numeric(e) for e in law.law),
             system.numeric(law.terminal)
             if law.terminal is not None
-            else terminal_expression(derived_sets(problem, system, law)),
+            else terminal_expression(derived_sets(problem, system, law, margin)),
         )
         for law in stated.laws
     )
@@ -80,13 +85,16 @@ def terminal_expression(sets: Sequence[BlockSet]) -> Any:
     return sp.Min(*(_of_block(symbols, e) for symbols, e in sets))
 
 
-def derived_sets(problem: Any, system: ControlAffineSDE, law: BackupLaw) -> tuple[BlockSet, ...]:
+def derived_sets(
+    problem: Any, system: ControlAffineSDE, law: BackupLaw, margin: float = 0.0
+) -> tuple[BlockSet, ...]:
     """Return sets around a law's equilibrium, whose product is proved to be kept.
 
     Args:
         problem: a `SafetyProblem`.
         system: the dynamics that are believed.
         law: with an equilibrium.
+        margin: that no barrier falls below in the sets.
 
     Raises:
         SystemDefinitionError: the coordinates of the equilibrium do not close, a barrier needs
@@ -101,11 +109,18 @@ def derived_sets(problem: Any, system: ControlAffineSDE, law: BackupLaw) -> tupl
             f"backup law {law.name} needs an extent of {', '.join(endless)}, whose workspace is"
             " unbounded: say how far its terminal set may reach, like extent={x: 0.5}"
         )
+    if not all(_WIDTHS[0] <= width <= _WIDTHS[1] for width in extent.values()):
+        raise ConfigurationError(
+            f"extent of backup law {law.name} = {extent}; give numbers in [{_WIDTHS[0]:g},"
+            f" {_WIDTHS[1]:g}], in other units if need be"
+        )
     return _derived(
         system,
         (law.name, law.law, tuple(law.equilibrium.items())),
         tuple(extent.items()),
-        tuple(b.expression for b in problem.barriers),
+        tuple(b.expression - sp.Float(margin, 17) for b in problem.barriers)
+        if margin
+        else tuple(b.expression for b in problem.barriers),
         problem.box,
         (problem.dt / problem.substeps, problem.substeps),
     )
@@ -145,11 +160,17 @@ def _derived(
         own = [e for e in expressions if e.free_symbols & set(block.symbols)]
         expressions = [e for e in expressions if e not in own]
         checked.append((block, Conditions(block, own)))
+    if not all(float(e) >= 0.0 for e in expressions):  # These are constants.
+        raise _unproved(name, equilibrium)
     for shrinking in _SHRINKING:
         found = _product(checked[::-1], {s: shrinking * w for s, w in extents}, name)
         if found is not None:
             return found
-    raise ConfigurationError(
+    raise _unproved(name, equilibrium)
+
+
+def _unproved(name: str, equilibrium: Sequence[tuple[sp.Symbol, Any]]) -> ConfigurationError:
+    return ConfigurationError(
         f"backup law {name} could not be proved to keep any set around its equilibrium"
         f" {dict(equilibrium)}; look whether it is one, whether it is safe and within the input"
         " bounds, and whether the law holds it with this control period"
@@ -184,6 +205,8 @@ def _largest(
     """
     point = Interval(block.rest[None, :], block.rest[None, :])
     a = block.period(point, disturbed).slope.center[0]
+    if not np.isfinite(a).all():
+        return None
     radius = float(abs(np.linalg.eigvals(a)).max())
     if not radius < 1.0:
         raise ConfigurationError(
@@ -194,8 +217,7 @@ def _largest(
     if (conditions.least(point, disturbed) < 0.0).any():
         return None
     best: tuple[float, Ellipsoid] | None = None
-    for p in _shapes(a, radius, widths):
-        root = np.linalg.cholesky(p)
+    for p, root in _with_roots(_shapes(a, radius, widths)):
         most = float((widths**2 / np.diag(np.linalg.inv(p))).min())
         level = _largest_level(block, conditions, disturbed, root, most)
         if level is not None:
@@ -223,6 +245,13 @@ def _shapes(a: np.ndarray, radius: float, widths: np.ndarray) -> list[np.ndarray
         modes = np.linalg.inv(right * sizes)
         shapes.append((modes.conj().T @ modes).real)
     return [0.5 * (p + p.T) for p in shapes]
+
+
+def _with_roots(shapes: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield P and L of each P = LL' that has an L in floating point."""
+    for p in shapes:
+        with suppress(np.linalg.LinAlgError):
+            yield p, np.linalg.cholesky(p)
 
 
 def _largest_level(

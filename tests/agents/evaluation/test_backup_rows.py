@@ -10,7 +10,7 @@ import sympy as sp
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import make_policy
-from safe_envs.agents.evaluation.backup_bound import COMPUTED, BackupBound
+from safe_envs.agents.evaluation.backup_bound import COMPUTED, STATED, BackupBound
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
@@ -20,13 +20,21 @@ from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.sweeps.cell import Sweep
 from safe_envs.agents.sweeps.spec import read_sweep
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.problem.backup import BackupLaw
 from safe_envs.wrappers import SafetyFilterVectorWrapper
 from safe_envs.wrappers.backup import BackupFilter
 from tests.agents.evaluation.test_compiled_episodes import assert_alike, joined
-from tests.wrappers.backup.carts import BRAKE, PULL, STRONGEST, cart, cart_problem, v, x
+from tests.wrappers.backup.carts import DT, STRONGEST, cart, cart_problem, v, x
 
 WIDE = {"start": [(-0.5, 0.9), (0.0, 2.0)]}
 TWO = (1 - x, 1 + x)
+
+SLOW = sp.Min(STRONGEST * DT - sp.Abs(v), *TWO, *(b.subs(x, x + v * DT / 2) for b in TWO))
+STOPS = (
+    BackupLaw("stop", (-v / DT,), terminal=SLOW),
+    BackupLaw("wait", (-v / DT + 5 * sp.Max(0, sp.Abs(v) - STRONGEST * DT),), terminal=SLOW),
+)
+"""Laws that stop within a period where the cart is slow."""
 
 
 def rows(problem, filters=("backup",), **settings):
@@ -36,7 +44,7 @@ def rows(problem, filters=("backup",), **settings):
 def test_it_is_safe_where_it_says_and_its_bound_is_the_share_of_such_starts():
     unfiltered, guarded = rows(cart_problem(**WIDE), ("none", "backup"), policy="nominal")
     assert unfiltered.safety_rate == 0.0
-    assert (guarded.held_word, guarded.held_note) == ("computed", COMPUTED)
+    assert (guarded.held_word, guarded.held_note) == ("computed", COMPUTED + STATED.format("brake"))
     assert 0.3 < guarded.held_bound < 0.95
     assert guarded.safety_rate == guarded.held_bound
     assert "plans" in guarded.continuous_note
@@ -72,7 +80,7 @@ def test_where_no_law_keeps_any_start_there_is_no_bound():
     assert found.infeasible_rate > 0.0
 
 
-@pytest.mark.parametrize("options", [{}, {"noise": 0.2}, {"laws": (BRAKE, PULL), "barriers": TWO}])
+@pytest.mark.parametrize("options", [{}, {"noise": 0.2}, {"laws": STOPS, "barriers": TWO}])
 def test_a_program_plays_the_episodes_of_numpy(options):
     problem = cart_problem(**{**WIDE, "horizon": 1.5, **options})
     actor, guard = make_policy("random", problem), BackupFilter.for_problem(problem)

@@ -141,3 +141,50 @@ def test_a_barrier_of_other_states_is_told():
     problem = made(Backup((only,), 1.0))
     with pytest.raises(SystemDefinitionError, match="unknown symbol x"):
         with_terminal_sets(problem, problem.plant)
+
+
+DECAY = ControlAffineSDE((x,), (u,), [-x], [1], [0])
+
+
+def decaying(entry, at=0.0, extent=0.5, system=DECAY, margin=0.0):
+    """The derived set of x' = -x + u, u in [-3, 3], under a law; x <= 10 is safe."""
+    stated = BackupLaw("said", (sp.sympify(entry),), equilibrium={x: at}, extent={x: extent})
+    backup, times = Backup((stated,), 1.0), {"dt": 0.1, "horizon": 1.0}
+    problem = state_problem(system, 10 - x, box=(-3, 3), start=[0.0], backup=backup, **times)
+    return with_terminal_sets(problem, system, margin).laws[0].terminal
+
+
+def test_a_constant_input_beyond_the_bounds_is_not_taken_for_one_within():
+    assert decaying(2, at=2.0).subs({x: 2.0}) == 1  # Under 3, the most, x leaves for 3.
+    with pytest.raises(ConfigurationError, match="could not be proved"):
+        decaying(5, at=5.0)
+
+
+def test_what_jumps_is_refused():
+    angle = sp.atan2(x - 0.1, -1)
+    with pytest.raises(SystemDefinitionError, match="jumps"):
+        decaying(-angle + sp.atan2(-0.1, -1))
+    found = decaying(-sp.Max(x, angle))  # The angle is -3 below x = .1, and 3 above.
+    assert float(found.subs({x: 0.09})) > 0.0 > float(found.subs({x: 0.11}))
+
+
+@pytest.mark.parametrize("entry", [sp.Piecewise((-x - 1, x > 0.1), (-x, True)), sp.floor(x)])
+def test_what_has_no_enclosure_is_refused(entry):
+    with pytest.raises(SystemDefinitionError, match="no interval form"):
+        decaying(entry)
+
+
+def test_laws_without_slope_and_extents_without_squares_are_told():
+    with pytest.raises(ConfigurationError, match="could not be proved"):
+        decaying(-sp.sqrt(x - 0.1))
+    for extent in (1e-300, 1e300):
+        with pytest.raises(ConfigurationError, match="extent of backup law said"):
+            decaying(-x, extent=extent)
+
+
+def test_derived_sets_keep_a_margin():
+    ends = {m: float(sp.Max(*sp.solve(decaying(-x, 0.0, 3.0, margin=m), x))) for m in (0.0, 8.0)}
+    assert ends[0.0] > 2.5
+    assert 1.8 < ends[8.0] <= 2.0
+    with pytest.raises(ConfigurationError, match="could not be proved"):
+        decaying(-x, margin=11.0)
