@@ -237,7 +237,9 @@ class DubinsDisk(SystemEnv):
 
     ## Backup
     `left` and `right`: turn at the full rate, once the circle of the turn fits into the disk, and
-    drive straight on before. The terminal set is in closed form. With noise nothing is guaranteed.
+    drive straight on before. The terminal set is in closed form. With noise nothing is guaranteed,
+    nor with knowledge of the model: its circles are smaller than the plant's, and every episode
+    ends unsafe. Take knowledge of the plant, or a model with its speed.
 
     ## Reward
     (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from

@@ -27,10 +27,14 @@ which an input was allowed is found again.
 which the last bits may differ. So 1. and 2. take plans on which no barrier is below `ROUNDING`, and
 3. counts a plan as good without that: it is one that was good with it, but for rounding.
 
-*What it does not cover.* What lies between control instants: a `margin` of at least half the
-distance that a barrier can fall and rise within a period does. Noise: the plan is then that of the
-mean of a step, and an allowed input may lead to where none is allowed. A model that differs from
-the plant. A start from which no law keeps the system safe.
+*A margin.* The proof holds for a floor m > 0 in the place of 0 if the laws keep m in their terminal
+sets too: those that are derived for a problem are proved to; of those that are stated, it is for
+the statement to say. Else 3. takes a plan that keeps 0, and says that it is feasible.
+
+*What it does not cover.* What lies between control instants: a margin, as far as it is kept, of at
+least half the distance that a barrier can fall and rise within a period does. Noise: the plan is
+then that of the mean of a step, and an allowed input may lead to where none is allowed. A model
+that differs from the plant. A start from which no law keeps the system safe.
 
 Source: T. Gurriet, M. Mote, A. Singletary, P. Nilsson, E. Feron, A. D. Ames, "A scalable safety
 critical control framework for nonlinear systems", IEEE Access 8 (2020), for backup laws under input
@@ -189,7 +193,7 @@ class BackupFilter(PlanFilter):
         made = cls(system, problem.barriers, backup, problem.box, *timing, settings)
         stated = [j for j, law in enumerate(given.laws) if law.terminal is not None]
         made.stated = tuple(given.laws[j].name for j in stated)
-        require_kept(made.plans, stated, sampled_states(problem))
+        require_kept(made.plans, stated, sampled_states(problem), settings.margin)
         return made
 
     def require_problem(self, problem: SafetyProblem) -> None:

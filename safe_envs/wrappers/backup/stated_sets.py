@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import filled
-from safe_envs.errors import SystemDefinitionError
+from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.wrappers.backup.plans import Plans
 
 _COUNT = 2000
@@ -46,7 +46,9 @@ def sampled_states(problem: Any) -> np.ndarray:
     return np.concatenate([starts, rng.uniform(low, high, (_COUNT, len(low)))])
 
 
-def require_kept(plans: Plans, laws: Iterable[int], states: np.ndarray) -> None:
+def require_kept(
+    plans: Plans, laws: Iterable[int], states: np.ndarray, margin: float = 0.0
+) -> None:
     """Raise SystemDefinitionError where a law leaves its terminal set at a sampled state.
 
     With noise a period is not that of the env, so that only the law's numbers are looked at.
@@ -55,11 +57,15 @@ def require_kept(plans: Plans, laws: Iterable[int], states: np.ndarray) -> None:
         plans: of the laws.
         laws: indices of those that are sampled.
         states: shape (B, n).
+        margin: of the filter.
+
+    Raises:
+        ConfigurationError: No state of a set keeps the margin.
     """
     x = np.array(plans.part(tuple(states.T)))
     with np.errstate(all="ignore"):
         for j in laws:
-            _require_kept(plans, j, x)
+            _require_kept(plans, j, x, margin)
 
 
 class _Read:
@@ -81,7 +87,7 @@ class _Read:
         return np.array(self._plans.advanced(self._at, u))
 
 
-def _require_kept(plans: Plans, j: int, x: np.ndarray) -> None:
+def _require_kept(plans: Plans, j: int, x: np.ndarray, margin: float) -> None:
     found, outside = [], x
     read = _Read(plans, j, x)
     sizes = [np.nanmedian(np.abs(e)) for e in (read.terminal, read.height)]
@@ -97,6 +103,12 @@ def _require_kept(plans: Plans, j: int, x: np.ndarray) -> None:
     outside = outside[:, ~_Read(plans, j, outside).inside]
     inside = np.concatenate([inside, _at_edge(plans, j, inside, outside)], axis=1)
     read = _Read(plans, j, inside)
+    if read.height.max() < margin:
+        raise ConfigurationError(
+            f"margin = {margin:g} of the backup filter: on the terminal set of backup law"
+            f" {plans.laws[j].name} the smallest barrier is {read.height.max():.3g} at most, of"
+            f" {read.height.size} sampled states; give a smaller margin"
+        )
     lost = ~np.isfinite(read.law).all(axis=0)
     what = "the law gives no finite input"
     if not lost.any() and not plans.system.noisy:
