@@ -88,10 +88,11 @@ class Pressed:
 
 
 POLICIES = ("random", "bang_bang", "adversary")
+NAMES = [pytest.param(n, marks=[pytest.mark.slow] * (n == "QuadrotorLimits")) for n in SYSTEMS]
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_no_step_is_infeasible_or_unsafe(name, policy):
     pressed = Pressed(name, 100, seed=0)
     assert pressed.run(getattr(pressed, policy), 30) == (0, 0)
@@ -105,7 +106,7 @@ def test_no_step_of_a_million_is_infeasible_or_unsafe(name, policy):
     assert pressed.run(getattr(pressed, policy), 250) == (0, 0)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_every_start_of_the_env_is_in_the_domain(name):
     pressed = Pressed(name, 10, seed=2)
     problem = pressed.problem

@@ -70,6 +70,7 @@ def test_the_set_moves_with_the_equilibrium_and_its_parameters():
     ],
     ids=str,
 )
+@pytest.mark.slow
 def test_the_quadrotors_set_is_kept_whatever_its_numbers(options):
     problem = make_problem("safe_envs/QuadrotorLimits-v0", **options)
     (stated,) = with_terminal_sets(problem, problem.plant).laws
@@ -124,6 +125,7 @@ def test_a_law_that_keeps_nothing_is_told(build, complaint):
         with_terminal_sets(problem, problem.plant)
 
 
+@pytest.mark.slow
 def test_a_quadrotor_that_cannot_hover_is_told():
     problem = make_problem("safe_envs/QuadrotorLimits-v0", box=(0.0, 4e4))
     with pytest.raises(ConfigurationError, match="could not be proved"):
