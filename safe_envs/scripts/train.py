@@ -137,10 +137,10 @@ def train(
 ) -> None:
     """Train an agent, evaluate it on the way, and keep the last and the best policy.
 
-    The default hyperparameters are in safe_envs/agents/training/hyperparams, in the RL Zoo's format.
-    progress.jsonl, and tensorboard if asked for, log the safety rate, the cost and the minimum h of
-    the last episodes, and the violations, interventions and infeasible steps of the training so
-    far. `safe-envs evaluate --policy DIR` reads the folder.
+    The default hyperparameters are in safe_envs/agents/training/hyperparams, in the format of the
+    RL Zoo. progress.jsonl, and tensorboard if asked for, log the safety rate, the cost and the
+    minimum h of the last episodes, and the violations, interventions and infeasible steps of the
+    training so far. `safe-envs evaluate --policy DIR` reads the folder.
     """
     from safe_envs.agents.training.config import Training
     from safe_envs.scripts.reports.training_report import print_evaluations
