@@ -55,7 +55,7 @@ def leaderboard(
         Path,
         typer.Option(
             metavar="DIR",
-            help="Where agents and results go. What is in it already is not done again.",
+            help="Folder of agents and results. Finished ones in it are kept.",
         ),
     ] = Path("leaderboard"),
     seeds: Annotated[
@@ -68,12 +68,13 @@ def leaderboard(
             min=1, help="Episodes of each evaluation; by default 1000, or 100 with --quick."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="From which all seeds are derived.")] = 0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes of this machine.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Seed from which all others are derived.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes on this machine.")] = 2,
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Train for moments only: to see that it works, not how good agents get."
+            "--quick",
+            help="Train for moments only: to check that it works, not how good agents are.",
         ),
     ] = False,
     best: Annotated[
@@ -82,8 +83,8 @@ def leaderboard(
             "--best",
             help=(
                 "Compute the best attainable safety of each env, and the largest return at each"
-                " chance of a violation; without it those are shown that were computed before,"
-                " with --quick by this command."
+                " probability of a violation. Otherwise only results that were computed before are"
+                " shown, with --quick only those of this command."
             ),
         ),
     ] = False,
@@ -108,12 +109,12 @@ def leaderboard(
 ) -> None:
     """Train agents on envs, with and without filters, and compare safety, return and cost.
 
-    Each variant is trained with several seeds. The tables have the interquartile mean over seeds
-    with its bootstrap interval, the interval over the episodes of these agents, unsafe steps in the
-    training and the processor time of one. Variants are: the nominal controller, the agent, the
-    agent with a limit on violations in training, the agent under the env's filter, one trained
-    behind it, the agent under a promise filter, and one trained behind a backup, where envs have
-    such filters. All filters know the plant.
+    Each variant is trained with several seeds. The tables show the interquartile mean over seeds
+    with its bootstrap interval, the safety rate of all episodes of these agents, and the unsafe
+    steps and the processor time of a training. The variants are the nominal controller, the agent,
+    one with a limit on violations, the agent under the env's default filter and under a promise
+    filter, and agents trained behind the default filter and behind a backup filter, where the
+    algorithm and the env have them. All filters know the plant.
     """
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.fingerprint import package_versions

@@ -41,26 +41,28 @@ def study(
         Path,
         typer.Option(
             metavar="DIR",
-            help="Where agents and results go. What is in it already is not done again.",
+            help="Folder of agents and results. Finished ones in it are kept.",
         ),
     ],
     seeds: Annotated[int, typer.Option(min=1, help="Trainings of each agent.")] = 5,
-    seed: Annotated[int, typer.Option(min=0, help="From which all seeds are derived.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed from which all others are derived.")] = 0,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Episodes of each evaluation; by default the file's.")
+        int | None,
+        typer.Option(min=1, help="Episodes of each evaluation; by default as in the file."),
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes of this machine.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes on this machine.")] = 2,
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Train for moments only: to see that it works, not how good agents get."
+            "--quick",
+            help="Train for moments only: to check that it works, not how good agents are.",
         ),
     ] = False,
     against: Annotated[
         str | None,
         typer.Option(
             metavar="AGENT",
-            help="Show how the others differ from these agents, seed by seed on the same episodes.",
+            help="Show differences from these agents, seed by seed on the same episodes.",
         ),
     ] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print Markdown.")] = False,
@@ -68,9 +70,10 @@ def study(
 ) -> None:
     """Train the agents of a study with several seeds, and compare them with and without filters.
 
-    A study is a list of agents: algorithm, filter in the loop, penalty, hyperparameters, and the
-    filters that they are evaluated with. filters-in-training compares filters in the loop with
-    filters in deployment only. Filters know the plant. What was interrupted goes on.
+    A study is a list of agents, each with its algorithm, its filter in the loop, hyperparameters
+    and the filters that it is evaluated with. filters-in-training compares filters in the loop with
+    filters in deployment only. Filters know the plant. An interrupted study continues with the same
+    command.
     """
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.fingerprint import package_versions
@@ -101,7 +104,7 @@ def study(
             if against is None
             else differences(found, read.agents, env_id, against)
         )
-        heading = env_id if against is None else f"{env_id}: differences to {against}"
+        heading = env_id if against is None else f"{env_id}: differences from {against}"
         document.setdefault("summaries", []).extend(asdict(row) for row in rows)
         if markdown:
             say(stdout(), f"**{heading}**\n\n{study_markdown(rows, against is not None)}\n")

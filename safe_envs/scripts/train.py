@@ -25,7 +25,7 @@ def train(
         typer.Option(
             metavar="NAME",
             autocompletion=completion.algorithms,
-            help="ppo, a2c, sac, td3, ppo-lag or sac-lag.",
+            help="ppo, a2c, sac or td3; with a limit on violations ppo-lag or sac-lag.",
         ),
     ],
     out: Annotated[
@@ -73,8 +73,8 @@ def train(
         typer.Option(
             metavar="executed|proposed|both",
             help=(
-                "On which action an off-policy algorithm learns with a filter in the loop;"
-                " Stable-Baselines3 by itself does on the proposed one."
+                "Action that sac, td3 and sac-lag learn on behind a filter. Stable-Baselines3"
+                " itself takes the proposed one."
             ),
         ),
     ] = "executed",
@@ -82,25 +82,25 @@ def train(
         float,
         typer.Option(
             metavar="X",
-            help="Taken from the reward for each unit by which the filter moves the action.",
+            help="Subtract X from the reward for each unit by which the filter changes the action.",
         ),
     ] = 0.0,
     promise_curriculum: Annotated[
         float | None,
         typer.Option(
             metavar="P",
-            help="p of the promise filter to begin with; it rises to that of --filter.",
+            help="Begin with the probability P for the promise filter, and raise it to its p.",
         ),
     ] = None,
     curriculum_part: Annotated[
         float,
-        typer.Option(metavar="X", help="Part of the training over which p rises."),
+        typer.Option(metavar="X", help="Share of the training over which p rises."),
     ] = 0.5,
     cost_limit: Annotated[
         float | None,
         typer.Option(
             metavar="X",
-            help="For ppo-lag and sac-lag: greatest mean number of unsafe steps of an episode.",
+            help="For ppo-lag and sac-lag: limit the mean number of unsafe steps in an episode.",
         ),
     ] = None,
     violation_limit: Annotated[
@@ -108,8 +108,8 @@ def train(
         typer.Option(
             metavar="P",
             help=(
-                "In its place: greatest probability of any unsafe step of an episode, 0.01 by"
-                " default. The episodes of the training end at the first one."
+                "In place of --cost-limit: limit the probability that an episode has any unsafe"
+                " step, 0.01 by default. Training episodes end at their first one."
             ),
         ),
     ] = None,
@@ -130,17 +130,17 @@ def train(
         bool,
         typer.Option(
             "--resume",
-            help="Go on with the unfinished training in --out after its last checkpoint.",
+            help="Continue the unfinished training in --out from its last checkpoint.",
         ),
     ] = False,
     json_file: Json = None,
 ) -> None:
     """Train an agent, evaluate it on the way, and keep the last and the best policy.
 
-    The hyperparameters are those of agents/hyperparams, in the RL Zoo's format. What is logged goes
-    to progress.jsonl and, if asked for, to tensorboard: the safety rate of the last episodes, their
-    cost and smallest h, and violations, interventions and infeasible steps in the training so far.
-    The folder is what `safe-envs evaluate --policy DIR` reads.
+    The default hyperparameters are in safe_envs/agents/training/hyperparams, in the format of the
+    RL Zoo. progress.jsonl, and tensorboard if asked for, log the safety rate, the cost and the
+    minimum h of the last episodes, and the violations, interventions and infeasible steps of the
+    training so far. `safe-envs evaluate --policy DIR` reads the folder.
     """
     from safe_envs.agents.training.config import Training
     from safe_envs.scripts.reports.training_report import print_evaluations

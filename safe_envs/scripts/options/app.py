@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import sys
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -28,7 +30,7 @@ def make_app(commands: Mapping[str, Callable[..., None]]) -> typer.Typer:
         context.with_resource(quietly(quiet))
 
     for name, command in commands.items():
-        app.command(name)(with_quiet(command))
+        app.command(name, help=_unwrapped(inspect.getdoc(command)))(with_quiet(command))
     return app
 
 
@@ -50,6 +52,11 @@ def run_alone(name: str, command: Callable[..., None]) -> None:
         command: the function with its options as parameters.
     """
     run_app(make_app({name: command}), name)
+
+
+def _unwrapped(text: str | None) -> str:
+    """Return paragraphs as one line each, which Typer wraps to the width of the terminal."""
+    return re.sub(r"(?<!\n)\n(?!\n)", " ", text or "")
 
 
 @cache

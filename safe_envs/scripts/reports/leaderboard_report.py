@@ -127,9 +127,9 @@ def leaderboard_notes(report: LeaderboardReport) -> list[str]:
         report: to tell.
     """
     notes = [
-        "IQM is the interquartile mean; its interval is of the bootstrap over seeds, that of the"
-        " episodes is of these agents alone. Unsafe steps are those in a training, min its"
-        " processor time in minutes.",
+        "IQM is the interquartile mean over seeds, with a bootstrap interval; the rate and the"
+        " interval of the episodes are those of these agents alone. Unsafe steps are those of a"
+        " training, min is its processor time in minutes.",
     ]
     for found in report.best.values():
         if not isinstance(found, str):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from rich.table import Table
@@ -23,6 +23,8 @@ _TITLES = {
     "violations": "unsafe\nsteps in\ntraining",
     "seconds": "s",
 }
+_FILTERED = ("safety", "returns", "interventions")
+_ALONE = ("safety_alone", "returns_alone", "violations", "seconds")
 _PERCENT = ("safety", "interventions", "safety_alone")
 _WITHOUT_INTERVAL = ("violations", "seconds")
 
@@ -41,10 +43,21 @@ def study_table(rows: Sequence[AgentSummary], differences: bool = False) -> Tabl
 
 
 def study_markdown(rows: Sequence[AgentSummary], differences: bool = False) -> str:
-    """Return the table as Markdown; see `study_table`."""
-    titles = ["agent", "filter", *(_one_line(title) for title in _TITLES.values())]
-    lines = [[row.name, f"`{row.filter}`", *_cells(row, differences)] for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *lines))
+    """Return two tables in Markdown: one with the filter, one without it and of the training.
+
+    One wide table would not fit a page. See `study_table` for the arguments.
+    """
+    filtered = _markdown(
+        ["agent", "filter", *map(_one_line, _FILTERED)],
+        [[row.name, f"`{row.filter}`", *_cells(row, differences, _FILTERED)] for row in rows],
+    )
+    # With several filters an agent has several rows, which differ in the first table only.
+    alone = {row.name: _cells(row, differences, _ALONE) for row in rows}
+    unfiltered = _markdown(
+        ["agent", *(_one_line(name).removesuffix(", no filter") for name in _ALONE)],
+        [[name, *cells] for name, cells in alone.items()],
+    )
+    return f"With the filter:\n\n{filtered}\n\nWithout a filter, and in training:\n\n{unfiltered}"
 
 
 def study_notes(found: StudyResult) -> list[str]:
@@ -60,12 +73,16 @@ def study_notes(found: StudyResult) -> list[str]:
     return notes
 
 
-def _one_line(title: str) -> str:
-    return title.replace("-\n", "").replace("\n", " ")
+def _markdown(titles: list[str], lines: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *lines))
 
 
-def _cells(row: AgentSummary, differences: bool) -> list[str]:
-    return [_text(name, row.estimates[name], differences) for name in _TITLES]
+def _one_line(name: str) -> str:
+    return _TITLES[name].replace("-\n", "").replace("\n", " ")
+
+
+def _cells(row: AgentSummary, differences: bool, names: Iterable[str] = _TITLES) -> list[str]:
+    return [_text(name, row.estimates[name], differences) for name in names]
 
 
 def _text(name: str, estimate: SeedEstimate | None, differences: bool) -> str:

@@ -1,0 +1,49 @@
+"""The Markdown of a study: tables that fit a page, with all the numbers of the printed one."""
+
+from __future__ import annotations
+
+import pytest
+
+from safe_envs.agents.training.seed_statistics import SeedEstimate
+from safe_envs.agents.training.study_summary import AgentSummary
+from safe_envs.scripts.reports.study_report import study_markdown
+
+MOST_COLUMNS = 6
+
+
+def summary(name, text, safety):
+    values = {"safety": safety, "returns": 40.0, "interventions": 0.5, "safety_alone": 0.125}
+    values |= {"returns_alone": 60.0, "violations": 34139.0, "seconds": 3.0}
+    estimates = {key: SeedEstimate(value, value, value, 5) for key, value in values.items()}
+    return AgentSummary("safe_envs/Scalar-v0", name, text, estimates)
+
+
+ROWS = [summary("PPO", "scbf", 0.9), summary("PPO", "hocbf", 0.8), summary("SAC", "scbf", 0.7)]
+
+
+def tables(markdown):
+    """Return the rows of cells of each table."""
+    found = [part.splitlines() for part in markdown.split("\n\n") if part.startswith("|")]
+    return [[line.strip("| ").split(" | ") for line in lines] for lines in found]
+
+
+def test_tables_are_narrow_and_name_each_agent_without_a_filter_once():
+    filtered, alone = tables(study_markdown(ROWS))
+    for table in (filtered, alone):
+        assert len({len(line) for line in table}) == 1
+        assert len(table[0]) <= MOST_COLUMNS
+    assert filtered[0] == ["agent", "filter", "safe %", "return", "intervened %"]
+    assert [line[:3] for line in filtered[2:]] == [
+        ["PPO", "`scbf`", "90.0 [90.0, 90.0]"],
+        ["PPO", "`hocbf`", "80.0 [80.0, 80.0]"],
+        ["SAC", "`scbf`", "70.0 [70.0, 70.0]"],
+    ]
+    assert alone[0] == ["agent", "safe %", "return", "unsafe steps in training", "s"]
+    rest = ["12.5 [12.5, 12.5]", "60.0 [60.0, 60.0]", "34,139", "3"]
+    assert alone[2:] == [["PPO", *rest], ["SAC", *rest]]
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_differences_have_a_sign(which):
+    for line in tables(study_markdown(ROWS, differences=True))[which][2:]:
+        assert all(cell.startswith("+") for cell in line[2 - which :])
