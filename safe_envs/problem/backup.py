@@ -130,6 +130,23 @@ class Backup:
         object.__setattr__(self, "horizon", horizon)
 
 
+@dataclass(frozen=True)
+class BackupFunction:
+    """A function of the configured problem, with arguments; equal to its own copies.
+
+    Attributes:
+        function: called with the `SafetyProblem` and the arguments; one that a module names.
+        arguments: by name.
+    """
+
+    function: Callable[..., Backup]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    def __call__(self, problem: Any) -> Backup:
+        """Return the backup of a complete `SafetyProblem`."""
+        return self.function(problem, **self.arguments)
+
+
 BackupSource = Backup | Callable[[Any], Backup]
 """A backup, or a function from the complete `SafetyProblem` to it.
 

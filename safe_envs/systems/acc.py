@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
+from safe_envs.problem.backup import BackupFunction
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start
@@ -136,14 +136,16 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         sampling=SamplingDomain(
             region=((10.0, 25.0), (15.0, 25.0), (20.0, 200.0)), inputs=((-4000.0,), (4000.0,))
         ),
-        backup=partial(
+        backup=BackupFunction(
             braking_backup,
-            speed=x_1,
-            lead=x_2,
-            distance=x_3 - headway * x_1,
-            headway=headway,
-            drag=drag,
-            mass=M,
+            {
+                "speed": x_1,
+                "lead": x_2,
+                "distance": x_3 - headway * x_1,
+                "headway": headway,
+                "drag": drag,
+                "mass": M,
+            },
         ),
     )
 

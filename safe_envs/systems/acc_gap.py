@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
+from safe_envs.problem.backup import BackupFunction
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -94,8 +93,9 @@ def acc_gap(
         plane=("v", "z"),
         scene="road",
         sampling=SamplingDomain(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
-        backup=partial(
-            braking_backup, speed=v, lead=v_f, distance=z - gap, headway=0.0, drag=drag, mass=M
+        backup=BackupFunction(
+            braking_backup,
+            {"speed": v, "lead": v_f, "distance": z - gap, "headway": 0.0, "drag": drag, "mass": M},
         ),
     )
 

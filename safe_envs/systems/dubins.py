@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -12,6 +11,7 @@ import sympy as sp
 from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
+from safe_envs.problem.backup import BackupFunction
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
@@ -193,7 +193,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
         horizon=50.0,
         gains=gains,
         filter="hocbf",
-        backup=partial(turning_backup, speed=v, radius=r),
+        backup=BackupFunction(turning_backup, {"speed": v, "radius": r}),
     )
 
 

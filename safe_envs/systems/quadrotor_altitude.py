@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -10,7 +9,7 @@ import sympy as sp
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.number_text import finite_number
-from safe_envs.problem.backup import Backup, BackupLaw
+from safe_envs.problem.backup import Backup, BackupFunction, BackupLaw
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -144,7 +143,9 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         plane=("z", "zdot"),
         scene="altitude",
         sampling=SamplingDomain(region=((center - half_width, center + half_width), CLIMB_RATES)),
-        backup=partial(hovering_backup, middle=float(center), reach=float(half_width)),
+        backup=BackupFunction(
+            hovering_backup, {"middle": float(center), "reach": float(half_width)}
+        ),
     )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import sympy as sp
 
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
+from safe_envs.problem.backup import BackupFunction
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME, Feature
@@ -90,8 +90,8 @@ def quadrotor_limits(
             )
         },
         gains=((2.0, 8.0), (2.0, 8.0), (3.0, 12.0)),
-        backup=partial(
-            levelling_backup, middle=(low + high) / 2, reach=(high - low) / 2, tilt=angle
+        backup=BackupFunction(
+            levelling_backup, {"middle": (low + high) / 2, "reach": (high - low) / 2, "tilt": angle}
         ),
     )
 
