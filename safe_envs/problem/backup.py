@@ -10,7 +10,7 @@ import sympy as sp
 
 from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, shown
+from safe_envs.errors import ConfigurationError, SafeEnvsError, SystemDefinitionError, shown
 from safe_envs.number_text import finite_number
 
 
@@ -180,10 +180,18 @@ def backup_of(problem: Any) -> Backup | None:
         problem: a `SafetyProblem`.
 
     Raises:
-        SystemDefinitionError: its function returned no backup that fits the system.
+        SystemDefinitionError: its function failed, or returned no backup that fits the system.
     """
     source = problem.backup
-    stated = source if source is None or isinstance(source, Backup) else source(problem)
+    try:
+        stated = source if source is None or isinstance(source, Backup) else source(problem)
+    except SafeEnvsError:
+        raise
+    except Exception as error:
+        raise SystemDefinitionError(
+            f"the function of the backup of {problem.name} failed:"
+            f" {type(error).__name__}: {shown(str(error))}"
+        ) from error
     if stated is not None and not isinstance(stated, Backup):
         raise SystemDefinitionError(
             f"the function of the backup returned {shown(stated)}; it is to return a `Backup`"

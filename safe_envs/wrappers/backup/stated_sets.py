@@ -19,7 +19,7 @@ from safe_envs.wrappers.backup.plans import Plans
 
 _COUNT = 2000
 _FOLLOWED = 20
-"""Control periods for which the law is followed from the samples, to find more of its set."""
+"""Control periods for which the law is followed from the samples, to see more of its set."""
 _HALVINGS = 30
 _ROUNDING = 1e-7
 """Of the median size of an expression: what rounding may take away."""
@@ -93,9 +93,7 @@ def _require_kept(plans: Plans, j: int, x: np.ndarray, margin: float) -> None:
     sizes = [np.nanmedian(np.abs(e)) for e in (read.terminal, read.height)]
     for _ in range(_FOLLOWED):
         found.append(x[:, read.inside])
-        x = read.advanced()[:, ~read.inside]
-        if not x.size:
-            break
+        x = read.advanced()
         read = _Read(plans, j, x)
     inside = np.concatenate(found, axis=1)
     if not inside.size:

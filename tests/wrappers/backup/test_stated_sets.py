@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import SystemDefinitionError
+from safe_envs import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.backup import BackupLaw
 from safe_envs.wrappers.backup import BackupFilter
 from safe_envs.wrappers.backup.stated_sets import sampled_states
@@ -68,3 +68,17 @@ def test_samples_cover_starts_and_what_is_around_them():
     assert (states.min(axis=0) <= starts.min(axis=0)).all()
     assert (states.max(axis=0) >= starts.max(axis=0)).all()
     assert (sampled_states(problem) == states).all()
+
+
+def test_a_margin_beyond_the_set_is_refused():
+    problem = cart_problem(laws=(BackupLaw("said", (-STRONGEST,), sp.Min(-v, 1 - x, x + 3)),))
+    with pytest.raises(SystemDefinitionError, match="leaves it"):
+        BackupFilter.for_problem(problem, "backup:margin=0.1")
+    with pytest.raises(ConfigurationError, match=r"margin = 1000 .* smallest barrier is"):
+        BackupFilter.for_problem(cart_problem(), "backup:margin=1000")
+
+
+def test_a_function_of_a_backup_that_fails_is_told():
+    problem = cart_problem(backup=lambda problem: problem.missing)
+    with pytest.raises(SystemDefinitionError, match="failed: AttributeError"):
+        BackupFilter.for_problem(problem)
