@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
-from scipy.linalg import solve_discrete_lyapunov
 
 from safe_envs.dynamics.interval_arithmetic import Interval
 from safe_envs.dynamics.sde import ControlAffineSDE
@@ -235,6 +234,8 @@ def _shapes(a: np.ndarray, radius: float, widths: np.ndarray) -> list[np.ndarray
         radius: its spectral radius.
         widths: w, shape (n,).
     """
+    from scipy.linalg import solve_discrete_lyapunov
+
     shapes = []
     for share in _SHARES:
         scale = radius + share * (1.0 - radius)
