@@ -14,6 +14,7 @@ from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
+    print_markdown,
     progress_bar,
     require_result,
     say,
@@ -158,7 +159,7 @@ def leaderboard(
     if page is not None:
         put_into(page, written)
     if markdown:
-        say(stdout(), written)
+        print_markdown(written)
     else:
         for heading, table in leaderboard_tables(report):
             say(stdout(), f"\n{heading}")

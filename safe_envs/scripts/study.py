@@ -13,6 +13,7 @@ from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
+    print_markdown,
     progress_bar,
     require_result,
     say,
@@ -107,7 +108,7 @@ def study(
         heading = env_id if against is None else f"{env_id}: differences from {against}"
         document.setdefault("summaries", []).extend(asdict(row) for row in rows)
         if markdown:
-            say(stdout(), f"**{heading}**\n\n{study_markdown(rows, against is not None)}\n")
+            print_markdown(f"**{heading}**\n\n{study_markdown(rows, against is not None)}\n")
         else:
             say(stdout(), f"\n{heading}")
             print_whole(stdout(), study_table(rows, against is not None))

@@ -34,7 +34,7 @@ def test_agents_are_compared_over_seeds_and_nothing_is_done_twice(safe_envs_comm
 
     monkeypatch.setattr("safe_envs.agents.training.trainer.train", None)  # An error, if called.
     Path("page.md").write_text(f"# Title\n\n{BEGIN}\n{END}\n")
-    more = ("--markdown", "--pictures", "pictures", "--page", "page.md")
+    more = ("--markdown", "--quiet", "--pictures", "pictures", "--page", "page.md")
     status, out, _ = safe_envs_command(*arguments, *more, "--json", "again.json")
     assert status == 0
     assert strictly("again.json")["rows"] == rows

@@ -174,6 +174,12 @@ def say(console: Console, text: str | Text) -> None:
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
+def print_markdown(text: str) -> None:
+    """Print tables in Markdown, with --quiet too, unless --json goes to stdout."""
+    if not _Terminal.silent:
+        print(text)
+
+
 def require_result(path: Path | None) -> None:
     """Raise ConfigurationError if the file of --json cannot be written, before a long run."""
     if path is not None and path != STDOUT:
