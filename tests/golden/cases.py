@@ -104,6 +104,16 @@ _TRAINED = (
         "ppo",
         "--set n_steps=16 --num-envs 8 --n-timesteps 256 --knowledge plant --filter hocbf --horizon 2",
     ),
+    (
+        "Pendulum-v0",
+        "ppo-lag",
+        "--set n_steps=32 --num-envs 8 --n-timesteps 512 --cost-limit 2 --horizon 1",
+    ),
+    (
+        "CubicSDE-v0",
+        "sac-lag",
+        "--set learning_starts=32 --num-envs 4 --n-timesteps 120 --violation-limit 0.1 --horizon 1",
+    ),
 )
 
 _ARTEFACTS = (
@@ -136,6 +146,12 @@ def cases() -> dict[str, Case]:
                 for name in ("bicycle", "cart_pole", "double_integrator")
             ),
             "evaluate Pendulum-v1 --filter-spec {root}/examples/pendulum_v1.py:spec --episodes 3 --seed 2",
+        )
+    )
+    found["evaluate/backups"] = Case(
+        tuple(
+            f"evaluate {env_id} --filter backup --policy random --episodes 5 --horizon 2 --seed 2"
+            for env_id in ("QuadrotorLimits-v0", "DubinsDisk-v0", "ACCGap-v0")
         )
     )
     found["leaderboard/Scalar-v0"] = Case(
