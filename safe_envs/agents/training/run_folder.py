@@ -84,6 +84,31 @@ def _require_same_training(folder: Path, training: Training) -> None:
             )
 
 
+def require_same_versions(folder: Path, versions: Mapping[str, str]) -> None:
+    """Check that no agent of other versions of the packages is in a folder.
+
+    Args:
+        folder: of a training, begun or not.
+        versions: those in use.
+
+    Raises:
+        ConfigurationError: the folder has an agent of others, or its file is damaged.
+    """
+    path = folder / CONFIG
+    if not os.path.isfile(path):
+        return
+    with reading(path, _ADVICE):
+        known = dict(_read(path)["versions"])
+    changed = sorted(name for name in {*known, *versions} if known.get(name) != versions.get(name))
+    if changed:
+        others = ", ".join(f"{name} {known.get(name, 'none')}" for name in changed)
+        now = ", ".join(f"{name} {versions.get(name, 'none')}" for name in changed)
+        raise ConfigurationError(
+            f"the agent in {folder} was trained with {others}, and in use is {now}; remove that"
+            " folder, and it is trained again, or give another --out"
+        )
+
+
 def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a training's attributes, with its hyperparameters and a custom system among them."""
     return {

@@ -197,7 +197,7 @@ def _plans(
             of_seeds = [_planned(study, env_id, variant, k, default) for k in seeds]
             try:
                 for name in {of_seeds[0].filter, of_seeds[0].in_loop}:
-                    _require_suitable(study, env_id, name)
+                    _require_suitable(study, env_id, name, variant)
             except SafeEnvsError as error:
                 missing[env_id, variant.name, None] = str(error)
                 continue
@@ -236,9 +236,15 @@ def _named(text: str | None, default: str) -> str:
     return default if text == DEFAULT else text or UNFILTERED
 
 
-def _require_suitable(study: Study, env_id: str, name: str) -> None:
-    """Raise a SafeEnvsError if an env has no such filter, before agents are trained for it."""
-    spec = EvaluationSpec(env_id, filters=(name,), options=study.options, knowledge=study.knowledge)
+def _require_suitable(study: Study, env_id: str, name: str, variant: Variant) -> None:
+    """Raise a SafeEnvsError if an env has no such filter or policy, before agents are trained."""
+    spec = EvaluationSpec(
+        env_id,
+        variant.policy if variant.algorithm is None else "nominal",
+        (name,),
+        options=study.options,
+        knowledge=study.knowledge,
+    )
     found = ResolvedEvaluation(spec)
     if names_promise(name):
         reduced(found.problem, study.knowledge)

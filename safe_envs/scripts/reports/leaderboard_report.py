@@ -196,7 +196,8 @@ def _count(value: float) -> str:
     for scale, letter in ((1e6, " M"), (1e3, " k")):
         if value >= 9.9995 * scale:
             return f"{value / scale:.{1 if value < 99.95 * scale else 0}f}{letter}"
-    return f"{value:,.0f}"
+    # What is seldom is not never.
+    return f"{value:,.{1 if 0.0 < value <= 0.5 else 0}f}"
 
 
 def _percent(estimate: SeedEstimate) -> str:

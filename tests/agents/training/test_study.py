@@ -11,7 +11,9 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.jobs.executor import Backend
+from safe_envs.agents.training import study as study_module
 from safe_envs.agents.training import study_job
+from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.study import (
     Study,
     Variant,
@@ -19,6 +21,7 @@ from safe_envs.agents.training.study import (
     run_study,
     training_seed,
 )
+from safe_envs.agents.training.study_job import Planned
 from safe_envs.agents.training.trainer import train
 
 SCALAR = "safe_envs/Scalar-v0"
@@ -62,6 +65,47 @@ def test_seeds_of_trainings_and_evaluations_are_all_different_and_of_one_seed():
         {episode_seed(evaluation_seed(0, ids[0], k), i) for i in range(200)} for k in (0, 1)
     ]
     assert not episodes[0] & episodes[1]
+
+
+def test_a_result_is_of_the_files_that_its_filter_and_its_policy_had(tmp_path):
+    table, policy = tmp_path / "table.npz", tmp_path / "policy.zip"
+    text = f"promise:p=0.9:table={table}"
+    given = {"env_id": SCALAR, "variant": "a", "k": 0, "options": {}, "knowledge": "plant"}
+    given |= {"episodes": 9, "seed": 0, "versions": {}}
+
+    def found():
+        training = Training.of(SCALAR, "ppo", filter=text)
+        parts = ((None, policy, "none"), (None, "nominal", text), (training, "nominal", "none"))
+        return [
+            Planned(training=training, policy=str(policy), filter=text, **given)
+            for training, policy, text in parts
+        ]
+
+    table.write_bytes(b"1")
+    policy.write_bytes(b"1")
+    first = found()
+    assert [each.key for each in found()] == [each.key for each in first]
+    table.write_bytes(b"2")
+    policy.write_bytes(b"2")
+    second = found()
+    assert not {each.key for each in first} & {each.key for each in second}
+    # An agent that learned behind another table is another agent.
+    assert first[2].agent != second[2].agent
+
+
+@pytest.mark.slow
+def test_an_agent_of_other_versions_is_neither_resumed_nor_taken_for_one_of_these(
+    tmp_path, monkeypatch
+):
+    few = replace(study(seeds=1), variants=VARIANTS[1:2])
+    run_study(few, tmp_path, ALONE)
+    newer = {**study_module.package_versions(), "torch": "99"}
+    monkeypatch.setattr(study_module, "package_versions", lambda: newer)
+    found = run_study(few, tmp_path, ALONE)
+    (reason,) = found.missing.values()
+    assert "was trained with torch 2" in reason
+    assert "in use is torch 99; remove that folder" in reason
+    assert not found.rows
 
 
 @pytest.mark.slow

@@ -166,3 +166,19 @@ def test_statistics_of_agents_and_of_their_differences(tmp_path):
     (less,) = differences(fewer, read.agents, SCALAR, "one")
     assert less.estimates["returns"].seeds == 4
     assert summaries(StudyResult(study, [], {}), read.agents, SCALAR) == []
+
+
+def test_agents_are_told_without_a_filter_that_their_env_has_not(tmp_path):
+    given = {**ONE, "filters": ["default", "promise:p=0.9", "none"]}
+    read = read_study(written(tmp_path / "s.yml", given))
+    rows = [row("one | default", 0, "scbf", violations=3), row("one | none", 0, "none")]
+    first, second = summaries(
+        StudyResult(Study([SCALAR], read.variants), rows, {}), read.agents, SCALAR
+    )
+    assert (first.filter, second.filter) == ("scbf", "promise:p=0.9")
+    assert second.estimates["safety"] is None
+    for each in (first, second):
+        # Those of the agents, whatever filter they are evaluated with.
+        assert each.estimates["violations"].value == 3.0
+        assert each.estimates["safety_alone"].value == 0.5
+    assert summaries(StudyResult(Study([SCALAR], read.variants), [], {}), read.agents, SCALAR) == []
