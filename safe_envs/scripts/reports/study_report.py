@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.agents.training.seed_statistics import caution
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
@@ -67,8 +68,10 @@ def study_notes(found: StudyResult) -> list[str]:
     """Return what has to be known to read the tables, and what is missing in them."""
     study = found.study
     notes = [
-        f"interquartile means over {study.seeds} seeds with the 95 % bootstrap interval over them,"
-        f" {study.episodes} episodes each; s is the processor time of a training."
+        f"interquartile means over {study.seeds} seed{'s' if study.seeds > 1 else ''} with the 95 %"
+        f" bootstrap interval, {study.episodes} episodes each; s is the processor time of a"
+        " training.",
+        *filter(None, [caution(study.seeds)]),
     ]
     for (env_id, variant, k), reason in found.missing.items():
         which = variant if k is None else f"{variant}, training {k}"

@@ -16,6 +16,7 @@ from safe_envs.agents.training import study_job
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.study import (
     Study,
+    StudyResult,
     Variant,
     evaluation_seed,
     run_study,
@@ -23,6 +24,7 @@ from safe_envs.agents.training.study import (
 )
 from safe_envs.agents.training.study_job import Planned
 from safe_envs.agents.training.trainer import train
+from safe_envs.file_locks import locked
 
 SCALAR = "safe_envs/Scalar-v0"
 SMALL = {
@@ -85,12 +87,13 @@ def test_a_result_is_of_the_files_that_its_filter_and_its_policy_had(tmp_path):
     policy.write_bytes(b"1")
     first = found()
     assert [each.key for each in found()] == [each.key for each in first]
+    agent = first[2].agent
     table.write_bytes(b"2")
     policy.write_bytes(b"2")
     second = found()
     assert not {each.key for each in first} & {each.key for each in second}
     # An agent that learned behind another table is another agent.
-    assert first[2].agent != second[2].agent
+    assert second[2].agent != agent
 
 
 @pytest.mark.slow
@@ -205,6 +208,25 @@ def test_a_damaged_result_is_an_error_that_names_the_file(tmp_path):
     (tmp_path / "results").write_text("a file")
     with pytest.raises(ConfigurationError, match="cannot be made"):
         run_study(few, tmp_path, ALONE)
+
+
+def test_two_studies_do_not_write_to_one_folder(tmp_path):
+    few = replace(study(), variants=VARIANTS[:1])
+    with (
+        locked(tmp_path / ".lock", ""),
+        pytest.raises(ConfigurationError, match="another study is writing"),
+    ):
+        run_study(few, tmp_path, ALONE)
+    assert len(run_study(few, tmp_path, ALONE).rows) == 2
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_a_failed_training_is_an_error_and_what_an_env_has_not_is_none():
+    StudyResult(study(), [], {(SCALAR, "ppo", None): "no backup"}).require_all()
+    with pytest.raises(
+        ConfigurationError, match=r"1 evaluation failed.*ppo, training 1: it diverg"
+    ):
+        StudyResult(study(), [], {(SCALAR, "ppo", 1): "it diverged"}).require_all()
 
 
 def test_wrong_numbers_and_equal_names_are_errors():
