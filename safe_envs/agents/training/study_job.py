@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ from safe_envs.agents.jobs.fingerprint import file_checksum, json_checksum
 from safe_envs.agents.jobs.store import ResultStore
 from safe_envs.agents.policies.registry import policy_file
 from safe_envs.agents.training.config import Training
-from safe_envs.errors import SafeEnvsError
+from safe_envs.errors import NumericalError, SafeEnvsError
 from safe_envs.wrappers.conditions.text_parts import files_of
 
 _LEARNED = "learned"
@@ -232,6 +233,8 @@ def _row(planned: Planned, policy: str, learned: dict[str, Any]) -> StudyRow:
         best=False,
     )
     training, row = planned.training, found.rows[0]
+    if not math.isfinite(row.return_mean):
+        raise NumericalError(f"the mean return of the evaluation is {row.return_mean}")
     return StudyRow(
         env_id=planned.env_id,
         variant=planned.variant,

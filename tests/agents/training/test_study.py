@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.jobs.executor import Backend
 from safe_envs.agents.training import study as study_module
@@ -227,6 +228,19 @@ def test_a_failed_training_is_an_error_and_what_an_env_has_not_is_none():
         ConfigurationError, match=r"1 evaluation failed.*ppo, training 1: it diverg"
     ):
         StudyResult(study(), [], {(SCALAR, "ppo", 1): "it diverged"}).require_all()
+
+
+def test_a_return_that_is_no_number_stops_no_other_evaluation(tmp_path, monkeypatch):
+    def found(_, policy, *args, **kwargs):
+        result = evaluate("Scalar-v0", policy, *args, **kwargs)
+        row = replace(result.rows[0], return_mean=float("nan"))
+        return replace(result, rows=(row,)) if policy == "zero" else result
+
+    monkeypatch.setattr(study_job, "evaluate", found)
+    few = replace(study(seeds=1), variants=(Variant("a", policy="zero"), Variant("b")))
+    result = run_study(few, tmp_path, ALONE)
+    assert [row.variant for row in result.rows] == ["b"]
+    assert "mean return of the evaluation is nan" in result.missing[SCALAR, "a", 0]
 
 
 def test_wrong_numbers_and_equal_names_are_errors():
