@@ -158,10 +158,10 @@ def _require_few(document: Any, path: Path) -> None:
         ConfigurationError: there are too many values, or a mapping has a name twice, of which only
             the last value would count.
     """
-    count, nodes = 1, [document]
+    count, nodes = 1, [document] if document is not None else []
     while nodes:
         node = nodes.pop()
-        children = node.value if node is not None else ()
+        children = node.value
         if isinstance(children, str):
             continue
         pairs = [each for each in children if isinstance(each, tuple)]
@@ -218,7 +218,7 @@ def _agent(entry: Any, where: str) -> Agent:
     own = [each.name for each in fields(Training)] + list(inspect.signature(Training.of).parameters)
     allowed = [each for each in own if each not in (*_OF_STUDY, "hyperparameters", "attributes")]
     _require_names(training, allowed, f"{where}: training")
-    _require_names(training.get("settings") or {}, None, f"{where}: settings")
+    _require_mapping(training.get("settings") or {}, f"{where}: settings")
     filters = entry.get("filters", [UNFILTERED])
     if not isinstance(filters, list) or not filters or not all(isinstance(f, str) for f in filters):
         raise ConfigurationError(
@@ -246,11 +246,14 @@ def _code(where: str, text: str, what: str) -> ConfigurationError:
     )
 
 
-def _require_names(given: Any, allowed: Sequence[str] | None, where: str) -> None:
-    """Raise ConfigurationError unless a value is a mapping, of no other names than some."""
+def _require_mapping(given: Any, where: str) -> None:
     if not isinstance(given, Mapping):
         raise ConfigurationError(f"{where} is {shown(given)}; give names with values")
-    for name in given if allowed is not None else ():
+
+
+def _require_names(given: Any, allowed: Sequence[str], where: str) -> None:
+    _require_mapping(given, where)
+    for name in given:
         if name not in allowed:
             raise ConfigurationError(
                 f"{where} has an unknown name {shown(name)}; {nearest(str(name), allowed)}"
