@@ -30,7 +30,6 @@ def put_into(page: Path, markdown: str | None) -> None:
         ConfigurationError: the page cannot be read or written, or has not each line once, in this
             order.
     """
-    require_writable(page)
     try:
         text = read_bytes(page).decode()
     except OSError as error:
@@ -47,6 +46,7 @@ def put_into(page: Path, markdown: str | None) -> None:
             f"--page {page} needs the line {BEGIN} and below it the line {END}, each once; what is"
             " between them is replaced"
         )
+    require_writable(page)
     if markdown is not None:
         before, newline, after = found.groups()
         lines = f"\n{markdown}\n\n".replace("\n", newline)
