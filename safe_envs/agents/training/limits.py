@@ -8,6 +8,7 @@ from typing import Any
 
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.training.constraint import EpisodeConstraint
+from safe_envs.errors import shown
 
 COST, VIOLATION = "cost_limit", "violation_limit"
 """Names of the limits: of the expected number of unsafe steps of an episode, and of the probability
@@ -73,6 +74,24 @@ def judged(
         "high": high,
         "met": low <= constraint.limit and found["evaluation_met"] is not False,
     }
+
+
+def require_judgement(given: Any) -> None:
+    """Raise ValueError unless it is what `judged` returns, as far as it is read again.
+
+    Args:
+        given: content of a file.
+    """
+    numbers = [given[name] for name in ("limit", "multiplier", "episodes")]
+    numbers += [given[name] for name in ("mean", "low", "high") if given["episodes"]]
+    kept = [given[name] for name in ("met", "evaluation_met")]
+    if not (
+        given["kind"] in UNITS
+        and type(given["saturated"]) is bool
+        and all(met is None or type(met) is bool for met in kept)
+        and all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
+    ):
+        raise ValueError(f"the limit is judged as {shown(given)}")
 
 
 def rank(evaluation: Mapping[str, Any]) -> tuple[bool, float]:

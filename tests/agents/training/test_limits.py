@@ -218,6 +218,32 @@ def test_an_altered_constraint_is_refused(tmp_path):
 
 
 @pytest.mark.slow
+def test_an_altered_judgement_is_refused(tmp_path):
+    wanted = Training.of(SCALAR, "ppo-lag", **SMALL)
+    train(wanted, tmp_path / "run")
+    path = tmp_path / "run" / "evaluations.json"
+    rows = json.loads(path.read_text())
+    judgement = rows[-1]["constraint"]
+    assert judgement["episodes"]
+    for altered in (
+        None,
+        [],
+        {key: value for key, value in judgement.items() if key != "high"},
+        judgement | {"mean": "much"},
+        judgement | {"saturated": float("inf")},
+        judgement | {"met": 1},
+        judgement | {"kind": "speed"},
+    ):
+        path.write_text(json.dumps([*rows[:-1], rows[-1] | {"constraint": altered}]))
+        with pytest.raises(ConfigurationError, match=r"evaluations.json cannot be read"):
+            train(wanted, tmp_path / "run", resume=True)
+    # JSON as this project writes it has no such number.
+    path.write_text(json.dumps([*rows[:-1], rows[-1] | {"other": float("nan")}]))
+    with pytest.raises(ConfigurationError, match=r"evaluations.json cannot be read"):
+        train(wanted, tmp_path / "run", resume=True)
+
+
+@pytest.mark.slow
 def test_a_filter_in_the_loop_keeps_the_limit_by_itself(tmp_path):
     wanted = Training.of(
         SCALAR, "ppo-lag", filter="scbf", intervention_penalty=0.1, violation_limit=0.5, **SMALL
