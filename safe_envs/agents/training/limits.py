@@ -41,7 +41,7 @@ def judged(
         `kind`, `limit`, the `multiplier` and whether it is `saturated`; number of `episodes` in
         training, their `mean` cost, and its 95 % interval from `low` to `high`, all None before
         every env ended an episode; `met`: False if this interval, or that of the evaluation, lies
-        above the limit, otherwise True, or None as long as nothing was measured; and
+        above the limit, otherwise True, or None as long as nothing was measured in training; and
         `evaluation_met`: the same for the evaluation alone, None for a limit of the cost, which it
         does not measure.
     """
@@ -56,8 +56,9 @@ def judged(
     else:
         found["evaluation_met"] = None
     if not constraint.recent:
-        unknown = dict.fromkeys(("mean", "low", "high", "met"))
-        return found | {"episodes": 0, **unknown}
+        unknown = dict.fromkeys(("mean", "low", "high"))
+        met = False if found["evaluation_met"] is False else None
+        return found | {"episodes": 0, "met": met, **unknown}
     episodes, cost, squares, violated = (
         sum(numbers) for numbers in zip(*constraint.recent, strict=True)
     )
