@@ -57,17 +57,17 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Barrier": "problem.barrier",
-    "CLF": "problem.clf",
-    "ControlAffineSDE": "dynamics.sde",
-    "DecisionLog": "wrappers.decision_log",
-    "SafeEnv": "envs.env",
-    "SafeVectorEnv": "envs.vector_env",
-    "SafetyFilter": "wrappers.safety_filter",
-    "SafetyProblem": "problem.problem",
-    "plot_log": "scripts.figures.log_figure",
-    "register": "envs.custom",
-    "state_problem": "problem.builder",
+    "Barrier": "safe_envs.problem.barrier",
+    "CLF": "safe_envs.problem.clf",
+    "ControlAffineSDE": "safe_envs.dynamics.sde",
+    "DecisionLog": "safe_envs.wrappers.decision_log",
+    "SafeEnv": "safe_envs.envs.env",
+    "SafeVectorEnv": "safe_envs.envs.vector_env",
+    "SafetyFilter": "safe_envs.wrappers.safety_filter",
+    "SafetyProblem": "safe_envs.problem.problem",
+    "plot_log": "safe_envs.scripts.figures.log_figure",
+    "register": "safe_envs.envs.custom",
+    "state_problem": "safe_envs.problem.builder",
 }
 
 

@@ -18,14 +18,14 @@ def lazy_attributes(
 
     Args:
         package: its name.
-        modules: the module of each attribute, relative to the package.
+        modules: the full name of the module of each attribute.
         namespace: of the package, its `globals()`; an attribute is put there once it is imported.
     """
 
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        found = namespace[name] = getattr(import_module(f"{package}.{modules[name]}"), name)
+        found = namespace[name] = getattr(import_module(modules[name]), name)
         return found
 
     def names() -> list[str]:

@@ -119,13 +119,21 @@ def parse_for_system(
 
 
 def require_readable(text: str, problem: SafetyProblem) -> None:
-    """Raise ConfigurationError where `parse_conditions` would, without reading learned models.
+    """Raise where `parse_conditions` would, or where a condition does not fit the problem.
+
+    Learned models and certificates are not read, and what depends on them is not checked.
 
     Args:
         text: as for `parse_conditions`.
         problem: problem whose barriers and gains are taken.
+
+    Raises:
+        ConfigurationError: The text names something unknown, or a value is not allowed.
+        RelativeDegreeError: A condition does not suit a barrier.
     """
-    _parsed(text, problem, lambda condition, path: None)
+    for condition in _parsed(text, problem, lambda condition, path: None):
+        if not _reads_file(type(condition)):
+            condition.require_fit(problem)
 
 
 def parse_condition(text: str, gains: Sequence[float]) -> Condition:

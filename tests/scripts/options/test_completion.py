@@ -16,7 +16,7 @@ from safe_envs.scripts.options import completion
 from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 from safe_envs.wrappers import CONDITIONS
 from safe_envs.wrappers.conditions import LEARNED, Certified
-from safe_envs.wrappers.conditions.registry import BY_THEMSELVES
+from safe_envs.wrappers.conditions.names import BY_THEMSELVES
 
 pytestmark = pytest.mark.slow
 
