@@ -119,21 +119,13 @@ def parse_for_system(
 
 
 def require_readable(text: str, problem: SafetyProblem) -> None:
-    """Raise where `parse_conditions` would, or where a condition does not fit the problem.
-
-    Learned models and certificates are not read, and what depends on them is not checked.
+    """Raise ConfigurationError where `parse_conditions` would, without reading learned models.
 
     Args:
         text: as for `parse_conditions`.
         problem: problem whose barriers and gains are taken.
-
-    Raises:
-        ConfigurationError: The text names something unknown, or a value is not allowed.
-        RelativeDegreeError: A condition does not suit a barrier.
     """
-    for condition in _parsed(text, problem, lambda condition, path: None):
-        if not _reads_file(type(condition)):
-            condition.require_fit(problem)
+    _parsed(text, problem, lambda condition, path: None)
 
 
 def parse_condition(text: str, gains: Sequence[float]) -> Condition:
