@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     )
     from safe_envs.agents.policies.base import Policy
     from safe_envs.agents.policies.clf import CLFController
+    from safe_envs.agents.policies.names import POLICIES
     from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
-    from safe_envs.agents.policies.registry import POLICIES, make_policy
+    from safe_envs.agents.policies.registry import make_policy
     from safe_envs.agents.training.replay_buffer import FilteredReplayBuffer
     from safe_envs.agents.training.vec_env import make_sb3_env
     from safe_envs.registry import make_problem
@@ -56,7 +57,7 @@ _MODULES = {
     "EvaluationSpec": "safe_envs.agents.evaluation.spec",
     "FilteredReplayBuffer": "safe_envs.agents.training.replay_buffer",
     "NominalController": "safe_envs.agents.policies.nominal",
-    "POLICIES": "safe_envs.agents.policies.registry",
+    "POLICIES": "safe_envs.agents.policies.names",
     "Policy": "safe_envs.agents.policies.base",
     "RandomPolicy": "safe_envs.agents.policies.nominal",
     "Refinement": "safe_envs.agents.evaluation.refinement",

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from safe_envs.wrappers.conditions.class_k import ClassK, power
     from safe_envs.wrappers.conditions.constraint import AffineConstraint
     from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
-    from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
     from safe_envs.wrappers.conditions.names import condition_names
+    from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
     from safe_envs.wrappers.conditions.registry import CONDITIONS, LEARNED
     from safe_envs.wrappers.conditions.spec_text import (
         parse_condition,

@@ -19,7 +19,8 @@ from safe_envs.agents.evaluation.targets import Env, make_target
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import make_policy, policy_file
+from safe_envs.agents.policies.names import policy_file
+from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, shown

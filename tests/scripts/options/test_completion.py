@@ -9,7 +9,7 @@ from contextlib import redirect_stdout
 import pytest
 
 import safe_envs
-from safe_envs.agents.policies.registry import POLICIES
+from safe_envs.agents.policies.names import POLICIES
 from safe_envs.agents.training.hyperparameters import ALGORITHMS
 from safe_envs.scripts import cli
 from safe_envs.scripts.options import completion
