@@ -80,7 +80,7 @@ def env_class(env_id: str) -> type[SystemEnv]:
     if not (isinstance(creator, type) and issubclass(creator, SystemEnv)):
         raise ConfigurationError(
             f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id}"
-            " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium's. For the envs of"
+            " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium. For the envs of"
             f" this project: `safe-envs list`, such as {ENV_IDS[0]}"
         )
     return creator

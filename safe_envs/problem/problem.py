@@ -14,9 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import (
     ConfigurationError,
     SystemDefinitionError,
-    nearest,
     require_whole,
-    shown,
 )
 from safe_envs.problem.actuators import Limits, rate_limits, require_delay
 from safe_envs.problem.backup import BackupSource, require_backup
@@ -24,6 +22,7 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.option_errors import unknown_start
 from safe_envs.problem.options import ProblemOptions, noise_levels
 from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
 from safe_envs.problem.regions import sound_regions
@@ -277,10 +276,7 @@ class SafetyProblem:
         start = given.start
         if isinstance(start, str):
             if start not in self.starts:
-                raise ConfigurationError(
-                    f"unknown start {shown(start)}; {nearest(start, self.starts)}, or"
-                    f" {len(self.states)} numbers"
-                )
+                raise unknown_start(start, self.starts, len(self.states))
             changes["start"] = start
         elif start is not None:
             changes["starts"] = {**self.starts, "given": Start.given(self.states, start)}

@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.package_version import package_version
 from safe_envs.scripts.options.console import Quiet, quietly, run, with_quiet
 from safe_envs.scripts.options.help_text import (
     GroupedCommand,
@@ -159,9 +160,7 @@ def _made(name: str, function: Callable[..., None]) -> Any:
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from safe_envs import __version__
-
-        typer.echo(f"{_NAME} {__version__}")
+        typer.echo(f"{_NAME} {package_version()}")
         raise typer.Exit
 
 

@@ -98,8 +98,14 @@ class EnvOptions:
         }
 
     def require_known(self) -> None:
-        """Raise ConfigurationError where the env is unknown or an option cannot be read."""
-        _ = self.full_id, self.arguments
+        """Raise ConfigurationError where the env is unknown or cannot have an option."""
+        from safe_envs.systems import ENV_IDS
+        from safe_envs.systems.summary import summaries
+
+        env_id, arguments = self.full_id, self.arguments
+        if env_id in ENV_IDS and arguments:
+            title = env_id.partition("/")[2].removesuffix("-v0")
+            summaries()[env_id].require_options(title, arguments)
 
     def evaluate_command(self, *words: str) -> str:
         """Return a command line that evaluates something in the same env, quoted for a shell.

@@ -30,6 +30,11 @@ Entry = tuple[str, str]
 class GroupedCommand(TyperCommand):
     """A command whose help has its options in groups and examples at the end."""
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return what follows the name of the command in its usage line."""
+        arguments = [p for p in self.get_params(ctx) if p.param_type_name == "argument"]
+        return ["[OPTIONS]", *map(written, arguments)]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments and options; called by the method that formats the help."""
         write_sections(formatter, sections_of(self.get_params(ctx)))
@@ -60,10 +65,16 @@ def sections_of(params: Iterable[Any]) -> dict[str, list[Entry]]:
     return {panel: entries for panel, entries in found.items() if entries}
 
 
+def _argument(param: Any) -> str:
+    """Return an argument as usage lines write it: in brackets if it may be left out."""
+    name = (param.metavar or param.name.upper()).strip("[].")
+    return f"{name if param.required else f'[{name}]'}{'...' if param.nargs != 1 else ''}"
+
+
 def written(param: Any) -> str:
     """Return an argument or an option as it is written, with a placeholder for its value."""
     if param.param_type_name == "argument":
-        return param.metavar or param.name.upper()
+        return _argument(param)
     names = ", ".join(sorted(param.opts, key=len))
     if param.is_flag:
         return " / ".join([names, *param.secondary_opts])

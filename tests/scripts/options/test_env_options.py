@@ -27,7 +27,7 @@ GIVEN = (
     "--noise=-.1,0",
     "--plant=v=.8",
     "--plant=w=2",
-    "--barrier=kind=a b",
+    "--barrier=level=a b",
     "--dt=0.05",
     "--substeps=2",
     "--box=-1,2",
@@ -55,7 +55,7 @@ def test_a_command_is_handed_the_env_that_its_options_ask_for():
     assert env.arguments == {
         "noise": [-0.1, 0.0],
         "plant": {"v": 0.8, "w": 2},
-        "barrier": {"kind": "a b"},
+        "barrier": {"level": "a b"},
         "dt": 0.05,
         "substeps": 2,
         "box": [-1.0, 2.0],
@@ -96,7 +96,7 @@ def test_identify_has_no_episodes(safe_envs_command):
             "identify", "Scalar-v0", *COMMANDS["identify"], option, "1"
         )
         assert status == 2
-        assert f"No such option: {option}" in err
+        assert f"unknown option '{option}'" in err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,64 @@
+"""Errors of the options of a problem, which need no problem but what it is called.
+
+A command looks for them before anything is imported that builds the problem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from safe_envs.errors import ConfigurationError, nearest, shown
+
+
+def refused_noise(noise: Any, names: Sequence[str]) -> ConfigurationError:
+    """Return the error of levels of noise that are negative, not finite, or of a wrong number.
+
+    Args:
+        noise: what was given.
+        names: of the channels.
+    """
+    if len(names) == 1:
+        allowed = f"give one number from 0, for {names[0]}"
+    else:
+        allowed = (
+            f"give one number from 0 for all channels, or {len(names)} of them for"
+            f" {', '.join(names)}"
+        )
+    return ConfigurationError(f"noise = {shown(noise)}; {allowed}")
+
+
+def unknown_start(start: str, starts: Iterable[str], count: int) -> ConfigurationError:
+    """Return the error of the name of an initial distribution that there is not.
+
+    Args:
+        start: what was given.
+        starts: names of the distributions.
+        count: of states.
+    """
+    return ConfigurationError(
+        f"unknown start {shown(start)}; {nearest(start, starts)}, or {count} numbers"
+    )
+
+
+def wrong_start(count: int, states: Sequence[str]) -> ConfigurationError:
+    """Return the error of an initial state of a wrong number of entries.
+
+    Args:
+        count: of what was given.
+        states: names of the states.
+    """
+    return ConfigurationError(
+        f"start has {count} numbers; the state has {len(states)}: {', '.join(states)}"
+    )
+
+
+def refused_box(box: Any, count: int) -> ConfigurationError:
+    """Return the error of input bounds that are no pair, and not one for each input.
+
+    Args:
+        box: what was given.
+        count: of inputs.
+    """
+    pairs = "" if count == 1 else f", or one such pair for each of the {count} inputs"
+    return ConfigurationError(f"box = {shown(box)}; give (low, high){pairs}")
