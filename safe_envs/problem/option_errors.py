@@ -5,10 +5,35 @@ A command looks for them before anything is imported that builds the problem.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown
+
+_WIDEST = 1e100
+"""Largest bound of an input: its square, an effort, is still a number."""
+
+
+def require_bounds(name: str, low: float, high: float) -> None:
+    """Raise ConfigurationError unless two numbers can be the bounds of an input.
+
+    Args:
+        name: of the input.
+        low: its lower bound.
+        high: its upper bound.
+    """
+    if not -_WIDEST <= low < high <= _WIDEST:
+        raise ConfigurationError(
+            f"box of input {name} is [{low}, {high}]; it needs bounds within {_WIDEST:g}, the lower"
+            " one below the upper. Unbounded control is a wide box"
+        )
+
+
+def require_period(dt: float) -> None:
+    """Raise ConfigurationError unless a number can be a control period, in s."""
+    if not (dt > 0 and math.isfinite(dt)):
+        raise ConfigurationError(f"dt = {dt} s; a control period is positive and finite")
 
 
 def refused_noise(noise: Any, names: Sequence[str]) -> ConfigurationError:

@@ -27,7 +27,7 @@ def list_envs(json: Json = None) -> None:
         values = {
             "states": len(found.states),
             "inputs": len(found.inputs),
-            "degree": list(found.degree),
+            "degree": list(found.degree.values()),
             "filter": found.filter,
             "noise": list(found.noise.values()),
             "dt": found.dt,

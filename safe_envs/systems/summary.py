@@ -17,9 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.errors import unknown
+from safe_envs.number_text import finite_number
 from safe_envs.problem.option_errors import (
     refused_box,
     refused_noise,
+    require_bounds,
+    require_period,
     unknown_start,
     wrong_start,
 )
@@ -37,7 +40,7 @@ class SystemSummary:
         about: what is to be kept safe.
         states: names.
         inputs: names.
-        degree: relative degree of each barrier.
+        degree: relative degree of each barrier, by its name.
         filter: the env's own.
         noise: level of each channel, by name.
         dt: control period in s.
@@ -50,7 +53,7 @@ class SystemSummary:
     about: str
     states: tuple[str, ...]
     inputs: tuple[str, ...]
-    degree: tuple[int, ...]
+    degree: Mapping[str, int]
     filter: str
     noise: Mapping[str, float]
     dt: float
@@ -68,9 +71,10 @@ class SystemSummary:
         """
         given = ProblemOptions.of(title, options, self.barrier)
         for values in (given.plant, given.model):
-            for name in values or {}:
+            for name, value in (values or {}).items():
                 if name not in self.parameters:
                     raise unknown("parameter", name, self.parameters)
+                finite_number(f"parameter {name}", value)
         if given.noise is not None:
             levels = [given.noise] if isinstance(given.noise, int | float) else list(given.noise)
             if len(levels) not in (1, len(self.noise)) or not all(
@@ -78,9 +82,13 @@ class SystemSummary:
             ):
                 raise refused_noise(given.noise, list(self.noise))
         if given.box is not None:
-            several = isinstance(given.box[0], list)
-            if several and len(given.box) != len(self.inputs):
+            pairs = given.box if isinstance(given.box[0], list) else [given.box] * len(self.inputs)
+            if len(pairs) != len(self.inputs):
                 raise refused_box(given.box, len(self.inputs))
+            for name, (low, high) in zip(self.inputs, pairs, strict=True):
+                require_bounds(name, low, high)
+        if given.dt is not None:
+            require_period(given.dt)
         # Rates of the inputs become states.
         if given.rate_limit is None:
             self._require_start(given.start)
@@ -125,7 +133,7 @@ def summary_of(env_id: str) -> SystemSummary:
         about=" ".join((env.__doc__ or "").strip().partition("\n\n")[0].split()),
         states=tuple(s.symbol.name for s in problem.states),
         inputs=tuple(i.symbol.name for i in problem.inputs),
-        degree=tuple(relative_degree(problem.model, b.expression) for b in problem.barriers),
+        degree={b.name: relative_degree(problem.model, b.expression) for b in problem.barriers},
         filter=problem.filter,
         noise={channel: levels[channel] for channel in problem.noise},
         dt=problem.dt,

@@ -33,6 +33,7 @@ from safe_envs.wrappers import (
     spec_of,
 )
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
+from safe_envs.wrappers.conditions.names import unfiltered_in_sum
 from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
 from safe_envs.wrappers.env_wrappers import lone_filters
 from safe_envs.wrappers.value.closed_loop import require_few_states
@@ -272,10 +273,7 @@ def _checked(name: str, problem: SafetyProblem, known: ControlAffineSDE) -> str 
     if name == UNFILTERED:
         return UNFILTERED
     if UNFILTERED in name.split("+"):
-        raise ConfigurationError(
-            f"filter {shown(name)}: {UNFILTERED!r} is the unfiltered env, no condition; give it"
-            " alone or leave it out"
-        )
+        raise unfiltered_in_sum(name)
     require_known(name, UNFILTERED)
     settings = lone_filters.settings_of(name)
     if settings is not None:
