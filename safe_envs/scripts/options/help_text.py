@@ -6,6 +6,7 @@ the rest of a command that only prints its help.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,9 @@ def default_of(param: Any) -> str:
 
 def with_default(param: Any) -> str:
     """Return what an option means, and its default in brackets."""
-    default = "required" if param.required else default_of(param)
-    return f"{param.help or ''}  [{default}]" if default else param.help or ""
+    default = default_of(param)
+    note = "  [required]" if param.required else f"  [default: {default}]" * bool(default)
+    return f"{param.help or ''}{note}"
 
 
 def write_sections(formatter: Any, sections: dict[str, list[Entry]]) -> None:
@@ -103,10 +105,30 @@ def write_sections(formatter: Any, sections: dict[str, list[Entry]]) -> None:
     """
     names = [len(name) for entries in sections.values() for name, _ in entries]
     # All groups have the same columns; a longer name has a line of its own.
-    width = max(length for length in names if length <= _WIDEST)
+    column = max(length for length in names if length <= _WIDEST) + 4
     for title, entries in sections.items():
         with formatter.section(heading(title)):
-            formatter.write_dl([(n.ljust(width), text) for n, text in entries], col_max=width)
+            for name, text in entries:
+                formatter.write(_entry(name, text, column, formatter.width))
+
+
+def _entry(name: str, text: str, column: int, width: int) -> str:
+    """Return the lines of an entry.
+
+    Words are not divided at hyphens, as Click does: `--closed-loop` is to be found and copied.
+    """
+    lines = [
+        line
+        for paragraph in text.split("\n\n")
+        for line in textwrap.wrap(
+            paragraph, width - column, break_on_hyphens=False, break_long_words=False
+        )
+    ]
+    first = f"  {name}"
+    if len(first) > column - 2:
+        lines.insert(0, "")
+    rows = [f"{first:<{column}}{lines[0] if lines else ''}"]
+    return "".join(f"{row.rstrip()}\n" for row in (*rows, *(" " * column + s for s in lines[1:])))
 
 
 def heading(title: str) -> str:
