@@ -77,7 +77,7 @@ Learned = Annotated[
     ),
 ]
 Episodes = Annotated[
-    int | None, typer.Option(min=1, help="Episodes for each filter. [default: 1000]")
+    int | None, typer.Option(min=1, show_default="1000", help="Episodes for each filter.")
 ]
 Repeats = Annotated[
     int,
@@ -145,7 +145,7 @@ Particles = Annotated[
 ]
 Repetitions = Annotated[
     int | None,
-    typer.Option(help="With --rare: independent ones, which give the interval. [default: 20]"),
+    typer.Option(show_default="20", help="With --rare: independent ones, which give the interval."),
 ]
 NumEnvs = Annotated[
     int | None,
@@ -157,9 +157,9 @@ Jobs = Annotated[
     int | None,
     typer.Option(
         min=1,
+        show_default="1, or all",
         help=(
             "Processes, or threads of the compiled engine; they change the speed, not the answer."
-            " [default: 1, or all]"
         ),
     ),
 ]

@@ -84,6 +84,8 @@ def written(param: Any) -> str:
 
 def default_of(param: Any) -> str:
     """Return the default of an option that takes a value, as text; "" if it has none to show."""
+    if isinstance(param.show_default, str):
+        return param.show_default
     if param.is_flag or param.default is None or callable(param.default) or not param.show_default:
         return ""
     return str(param.default)
