@@ -140,7 +140,7 @@ Rare = Annotated[
 Particles = Annotated[
     int | None,
     typer.Option(
-        help="With --rare, in place of --episodes: episodes of a repetition. [default: 250]"
+        show_default="250", help="With --rare, in place of --episodes: episodes of a repetition."
     ),
 ]
 Repetitions = Annotated[
@@ -150,7 +150,9 @@ Repetitions = Annotated[
 NumEnvs = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Episodes side by side; it changes the speed, not the answer. [default: 1024]"
+        min=1,
+        show_default="1024",
+        help="Episodes side by side; it changes the speed, not the answer.",
     ),
 ]
 Jobs = Annotated[
