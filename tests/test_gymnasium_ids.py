@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 ORDERS = {
     "the package first": "import safe_envs; import gymnasium as gym",
     "Gymnasium first": "import gymnasium as gym; import safe_envs",
-    "a module of Gymnasium first": "import gymnasium.envs.registration, safe_envs, gymnasium as gym",
+    "a module of Gymnasium first": "import gymnasium.envs, safe_envs, gymnasium as gym",
     "the package, then a module of Gymnasium": (
         "import safe_envs; import gymnasium.envs; import gymnasium as gym"
     ),

@@ -86,7 +86,7 @@ def _section(name: str, command: Any) -> str:
 
 
 def _table(params: list[Any], grouped: bool = True) -> list[str]:
-    """Return the arguments and options as a table, with a row for the title of each group."""
+    """Return the arguments and options as a table, with the title of each group."""
     by_name = {written(p): p for p in params}
     rows = []
     for title, entries in sections_of(params).items():
@@ -100,5 +100,5 @@ def _table(params: list[Any], grouped: bool = True) -> list[str]:
 
 def _cell(text: str | None) -> str:
     found = (text or "").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
-    # A row of a table is one line.
+    # Entries of a table have one line.
     return found.replace("\n\n", "<br>").replace("\n", " ")

@@ -32,16 +32,16 @@ class GroupedCommand(TyperCommand):
     """A command whose help has its options in groups and examples at the end."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return what follows the name of the command in its usage line."""
+        """See `typer.core.TyperCommand.collect_usage_pieces`."""
         arguments = [p for p in self.get_params(ctx) if p.param_type_name == "argument"]
         return ["[OPTIONS]", *map(written, arguments)]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments and options; called by the method that formats the help."""
+        """See `typer.core.TyperCommand.format_options`."""
         write_sections(formatter, sections_of(self.get_params(ctx)))
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the examples."""
+        """See `typer.core.TyperCommand.format_epilog`: examples."""
         examples = EXAMPLES.get(self.name or "", ())
         if examples:
             with formatter.section(heading("Examples")):

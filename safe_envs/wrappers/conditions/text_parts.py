@@ -34,6 +34,9 @@ _MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
 
 _HEAD_BY_ITSELF = re.compile(rf"\s*({'|'.join(BY_THEMSELVES)})\s*(?:[:+]|$)")
 
+_RATES = re.compile(r"p=[-+.0-9e]+(,[-+.0-9e]+)*")
+"""Rates that are numbers; with class-K functions among them more may be wrong than their count."""
+
 
 class ConditionText(NamedTuple):
     """The text of one condition, taken apart: its name or place, and what sets its parameters."""
@@ -92,7 +95,7 @@ def require_degrees(text: str, degrees: Mapping[str, int]) -> None:
     """
     parts = parts_of(text)
     for part, (barrier, degree) in zip(parts * len(degrees), degrees.items(), strict=False):
-        rates = next((s for s in part.settings if s.startswith("p=")), None)
+        rates = next((s for s in part.settings if _RATES.fullmatch(s)), None)
         if part.name == "cbf" and degree != 1:
             raise RelativeDegreeError(f"{wrong_rates(barrier, degree, 1)}. {ONLY_DEGREE_1}")
         if part.name == "hocbf" and rates is not None and rates.count(",") + 1 != degree:
