@@ -93,9 +93,15 @@ def _table(params: list[Any], grouped: bool = True) -> list[str]:
         rows += [f"| **{title}** | | |"] * grouped
         for name, _ in entries:
             found = by_name[name]
-            default = default_of(found) if found.param_type_name == "option" else ""
-            rows.append(f"| `{name}` | {_cell(found.help)} | {default and f'`{default}`'} |")
+            rows.append(f"| `{name}` | {_cell(found.help)} | {_default(found)} |")
     return ["| | meaning | default |", "|---|---|---|", *rows] if rows else []
+
+
+def _default(param: Any) -> str:
+    if param.required:
+        return "required"
+    default = default_of(param) if param.param_type_name == "option" else ""
+    return default and f"`{default}`"
 
 
 def _cell(text: str | None) -> str:
