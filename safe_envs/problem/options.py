@@ -10,11 +10,9 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, named_values, numbers
-from safe_envs.validators import numbers_in
+from safe_envs.problem.option_errors import refused_noise
 
 Reader = Callable[[str, Any], Any]
 """From the name of an option and its text (texts, where it is repeatable) to its value."""
@@ -198,6 +196,11 @@ def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[st
     """
     if noise is None:
         return {}
+    # Not imported before it is needed: a command reads the options first.
+    import numpy as np
+
+    from safe_envs.validators import numbers_in
+
     names = problem.noise
     if not names:
         advice = (
@@ -212,8 +215,5 @@ def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[st
         or not np.isfinite(given).all()
         or (given < 0).any()
     ):
-        raise ConfigurationError(
-            f"noise = {shown(noise)}; give one number >= 0, or {len(names)} of them"
-            f" ({', '.join(names)})"
-        )
+        raise refused_noise(noise, names)
     return dict(zip(names, np.broadcast_to(given, len(names)).tolist(), strict=True))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.evaluation.filter_texts import checked_filter
 from safe_envs.agents.evaluation.identification import Learning
 from safe_envs.agents.evaluation.spec import (
     UNFILTERED,
@@ -19,19 +20,17 @@ from safe_envs.agents.evaluation.targets import Env, make_target
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import make_policy, policy_file
+from safe_envs.agents.policies.names import policy_file
+from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
     Condition,
     SafetyFilterVectorWrapper,
-    parse_conditions,
-    require_readable,
     spec_of,
 )
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
-from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
 from safe_envs.wrappers.env_wrappers import lone_filters
 from safe_envs.wrappers.value.closed_loop import require_few_states
 from safe_envs.wrappers.value.reduction import reduced
@@ -82,7 +81,8 @@ class ResolvedEvaluation:
         for settings in self._alone.values():
             settings.require_fit(self.problem, spec.objective)
         self._in_use: list[lone_filters.LoneFilter] = []
-        self._texts = {name: _checked(name, self.problem) for name in texts}
+        known = self.problem.plant if spec.knowledge == "plant" else self.problem.model
+        self._texts = {name: checked_filter(name, self.problem, known) for name in texts}
         self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
         if self.target.filter_spec is not None and self.learning.missing():
             raise ConfigurationError(
@@ -256,25 +256,6 @@ def _require_third_party(spec: EvaluationSpec) -> None:
         raise ConfigurationError(
             f"knowledge = {shown(spec.knowledge)}: nothing is known but the model of such an env"
         )
-
-
-def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """Return the text of a filter with all parameters; None where it has to be learned first."""
-    if name == UNFILTERED:
-        return UNFILTERED
-    if UNFILTERED in name.split("+"):
-        raise ConfigurationError(
-            f"filter {shown(name)}: {UNFILTERED!r} is the unfiltered env, no condition; give it"
-            " alone or leave it out"
-        )
-    require_known(name, UNFILTERED)
-    settings = lone_filters.settings_of(name)
-    if settings is not None:
-        return settings.text
-    if learned_parts(name):
-        require_readable(name, problem)
-        return None
-    return spec_of(parse_conditions(name, problem))
 
 
 def _describe(problem: SafetyProblem) -> dict[str, Any]:

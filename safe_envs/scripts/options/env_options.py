@@ -14,6 +14,7 @@ import typer
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.console import with_signature
+from safe_envs.systems import ENV_IDS
 
 _KINDS = get_type_hints(ProblemOptions)
 
@@ -22,9 +23,8 @@ def _annotation(option: Field[Any]) -> Any:
     """Return the annotation by which typer reads an option."""
     text = list[str] if option.metadata["repeatable"] else str
     kind = _KINDS[option.name] if option.metadata["reader"] is None else text | None
-    return Annotated[
-        kind, typer.Option(metavar=option.metadata["metavar"], help=option.metadata["help"])
-    ]
+    given = {name: option.metadata[name] for name in ("metavar", "help")}
+    return Annotated[kind, typer.Option(min=option.metadata["least"], **given)]
 
 
 def _flag(name: str) -> str:
@@ -35,7 +35,7 @@ _OPTIONS: dict[str, Any] = {
     "env_id": Annotated[
         str | None,
         typer.Argument(
-            metavar="[ENV_ID]",
+            metavar="ENV_ID",
             help="Registered id; `safe-envs list` shows all.",
             show_default=False,
             autocompletion=completion.env_ids,
@@ -98,6 +98,33 @@ class EnvOptions:
             if value is not None
         }
 
+    def require_known(self, filters: Sequence[str] = ()) -> None:
+        """Check the env, its options and its filters by what is known without its problem.
+
+        Args:
+            filters: their texts.
+
+        Raises:
+            ConfigurationError: The env is unknown, or cannot have an option.
+            RelativeDegreeError: A filter does not suit a barrier.
+        """
+        from safe_envs.registry import require_own
+        from safe_envs.systems.summary import summaries
+        from safe_envs.wrappers.conditions.text_parts import require_degrees
+
+        env_id, arguments = self.full_id, self.arguments
+        if env_id not in ENV_IDS:
+            require_own(env_id)
+            return
+        summary = summaries()[env_id]
+        if arguments:
+            title = env_id.partition("/")[2].removesuffix("-v0")
+            summary.require_options(title, arguments)
+        # Where rates are limited, they are the inputs, and the degree is another one.
+        if "rate_limit" not in arguments:
+            for text in filters:
+                require_degrees(text, summary.degree)
+
     def evaluate_command(self, *words: str) -> str:
         """Return a command line that evaluates something in the same env, quoted for a shell.
 
@@ -130,7 +157,12 @@ def with_env(command: Callable[..., None], without: Sequence[str] = ()) -> Calla
             for name, value in given.items()
             if name not in ("env_id", "system") and value not in (None, [])
         }
-        command(env=EnvOptions(given["env_id"], given["system"], changes), **arguments)
+        env = EnvOptions(given["env_id"], given["system"], changes)
+        # A third-party env need not be among the ids; its name shows to be wrong when it is made.
+        if not arguments.get("filter_spec"):
+            filters = arguments.get("filters") or [arguments.get("filter_name")]
+            env.require_known([text for text in filters if text])
+        command(env=env, **arguments)
 
     found: list[inspect.Parameter] = []
     for parameter in inspect.signature(command, eval_str=True).parameters.values():

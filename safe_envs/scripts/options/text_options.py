@@ -12,9 +12,15 @@ import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.scripts.options import early_checks
 from safe_envs.scripts.options.console import STDOUT
 
-Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
+KNOWLEDGE = early_checks.one_of("knowledge", ("model", "plant"))
+
+Knowledge = Annotated[
+    str,
+    typer.Option(metavar="model|plant", callback=KNOWLEDGE, help="What the filters know."),
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -25,18 +31,22 @@ Trust = Annotated[
         ),
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 Engine = Annotated[
     str,
     typer.Option(
         metavar="auto|numpy|compiled",
+        callback=early_checks.one_of("engine", ("auto", "numpy", "compiled")),
         help=(
             "What simulates: NumPy, or a program that is compiled once, which needs Numba. auto"
             " takes that for long runs."
         ),
     ),
 ]
-FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
+PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "svgz", "tif", "tiff", "webp")
+"""Suffixes of pictures, all of which matplotlib writes: to ask it takes longer than all else."""
+
+FORMATS = ".png, .pdf, .svg, .eps, .jpg, .tif or .webp."
 
 
 def require_outputs(
@@ -85,15 +95,10 @@ def require_outputs(
 
 def _require_format(path: Path) -> None:
     """Raise ConfigurationError unless the suffix of a path names a format that can be drawn."""
-    # Not imported before it is needed: completion has to be quick.
-    from matplotlib.backend_bases import FigureCanvasBase
-
-    # pgf is left out: it needs a TeX installation.
-    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})
     suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in formats:
+    if suffix not in PLOT_FORMATS:
         raise ConfigurationError(
-            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}"
+            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, PLOT_FORMATS)}"
         )
 
 
@@ -116,7 +121,7 @@ def inputs_of(
     Returns:
         Pairs of option and file.
     """
-    from safe_envs.agents.policies.registry import policy_file
+    from safe_envs.agents.policies.names import policy_file
 
     for option, place in (("--system", system), ("--filter-spec", filter_spec)):
         source = (place or "").rpartition(":")[0]

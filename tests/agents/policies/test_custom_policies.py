@@ -11,7 +11,7 @@ import pytest
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs import plugins as safe_envs_plugins
 from safe_envs.agents import ZeroController, evaluate, make_policy
-from safe_envs.agents.policies.registry import absolute_policy, policy_file
+from safe_envs.agents.policies.names import absolute_policy, policy_file
 from safe_envs.registry import make_problem
 
 SHORT = {"episodes": 6, "bounds": False, "options": {"horizon": 0.2}}
@@ -27,6 +27,9 @@ class Gain:
 
 def function(observation):
     return np.tanh(-observation[:, :1])
+
+def factory(problem):
+    return Gain(problem)
 
 number = 3
 
@@ -63,7 +66,7 @@ def rows(policy, **changes):
 def test_a_policy_may_be_a_function_a_class_or_an_object(file):
     wanted = rows(function)
     assert wanted != rows("zero")
-    places = [f"mine.py:{name}" for name in ("Gain", "function")]
+    places = [f"mine.py:{name}" for name in ("Gain", "function", "factory")]
     for policy in (lambda x: np.tanh(-x[:, 0]), *places, make_policy(places[0], problem())):
         assert rows(policy) == wanted
     assert rows(ZeroController) == rows("zero")
