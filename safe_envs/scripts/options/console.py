@@ -27,9 +27,13 @@ from rich.text import Text
 from safe_envs.atomic_io import require_writable, write_json
 from safe_envs.errors import SafeEnvsError, shortened
 from safe_envs.scripts.options.number_options import strict
+from safe_envs.text_lines import break_points
 
-_LEAST_WIDTH = 104
-_PIPE_WIDTH = 240
+_LEAST_WIDTH = 40
+_PIPE_WIDTH = 80
+_INDENT = 4
+"""Blanks before the further lines of a text that is wrapped."""
+
 _LONGEST = 2000
 """Characters of an error, at most: messages of third-party code or files have any length."""
 
@@ -68,6 +72,7 @@ class _Terminal:
 
     quiet = False
     silent = False
+    wraps = False
 
 
 class _Tables(Console):
@@ -155,8 +160,18 @@ def with_signature(
     return function
 
 
+@contextmanager
+def as_on_a_terminal() -> Iterator[None]:
+    """Wrap what `say` prints within this context, as on a terminal, for pages of documentation."""
+    before, _Terminal.wraps = _Terminal.wraps, True
+    try:
+        yield
+    finally:
+        _Terminal.wraps = before
+
+
 def stdout() -> Console:
-    """Return the console for results, wide enough for tables."""
+    """Return the console for results, as wide as the terminal; without one, 80 characters."""
     kind = _Tables if _Terminal.quiet else Console
     if sys.stdout.isatty():
         return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
@@ -164,14 +179,32 @@ def stdout() -> Console:
     return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
 
 
-def say(console: Console, text: str | Text) -> None:
-    """Print a text as it is, in lines of any length.
+def say(console: Console, text: str | Text, wrap: bool = True) -> None:
+    """Print a text: on a terminal in lines of its width, elsewhere in lines as they are.
 
     Args:
         console: to print on.
         text: to print; markup in a str is not interpreted.
+        wrap: whether the lines may be wrapped; a command that is to be copied may not.
     """
+    if wrap and (console.is_terminal or _Terminal.wraps):
+        text = Text("\n").join(
+            line
+            for given in (Text(text) if isinstance(text, str) else text).split(allow_blank=True)
+            for line in _wrapped(given, console.width)
+        )
     console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+def _wrapped(text: Text, width: int) -> list[Text]:
+    """Return a line in lines of a width, all but the first indented more than it."""
+    plain = text.plain
+    indent = min(_INDENT + len(plain) - len(plain.lstrip(" ")), width // 2)
+    first, *others = text.divide(break_points(plain, width, indent))
+    lines = [first, *(Text(" " * indent) + other for other in others)]
+    for line in lines:
+        line.rstrip()
+    return lines
 
 
 def print_markdown(text: str) -> None:

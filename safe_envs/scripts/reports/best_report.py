@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.best_text import COMPUTED, outwards
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import COMPUTED, outwards
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.tables import make_table, print_whole
 

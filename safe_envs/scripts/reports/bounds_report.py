@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.console import Console
 from rich.markup import escape
 
+from safe_envs.agents.evaluation.best_text import COMPUTED, attainable_text, is_certified
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
 from safe_envs.agents.evaluation.bound_text import (
     bound_text,
@@ -16,8 +17,6 @@ from safe_envs.agents.evaluation.bound_text import (
 )
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import COMPUTED
-from safe_envs.scripts.reports.bound_notes import attainable_text, is_certified
 from safe_envs.scripts.reports.quantities import share_text, state_text
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer

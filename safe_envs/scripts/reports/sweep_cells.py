@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
+from safe_envs.agents.evaluation.best_text import ends_text, times_text
 from safe_envs.agents.evaluation.bound_text import bound_cells
 from safe_envs.agents.evaluation.rate_text import percent, rate_of
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.evaluation.yardstick import times_between
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import ends_text, times_text
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
