@@ -5,35 +5,29 @@ from __future__ import annotations
 import errno
 import functools
 import inspect
-import io
 import json
 import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
 from rich.text import Text
 
 from safe_envs.atomic_io import require_writable, write_json
 from safe_envs.errors import SafeEnvsError, shortened
 from safe_envs.scripts.options.number_options import strict
-from safe_envs.text_lines import break_points
+from safe_envs.scripts.options.printing import TablesOnly, TrimmedStream, wrapped_text
 
 _LEAST_WIDTH = 40
 _PIPE_WIDTH = 80
-_INDENT = 4
-"""Blanks before the further lines of a text that is wrapped."""
-
 _LONGEST = 2000
 """Characters of an error, at most: messages of third-party code or files have any length."""
 
@@ -50,6 +44,9 @@ _UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", 
 
 STDOUT = Path("-")
 """The file of --json that means standard output, where nothing else is printed then."""
+
+_TO_STDOUT = ("json", "json_file", "latex")
+"""Parameters of commands whose file may be standard output."""
 
 Quiet = Annotated[
     bool,
@@ -73,35 +70,6 @@ class _Terminal:
     quiet = False
     silent = False
     wraps = False
-
-
-class _Tables(Console):
-    """A console that leaves out all but tables."""
-
-    def print(self, *objects: Any, **how: Any) -> None:
-        tables = [found for found in objects if isinstance(found, Table)]
-        if tables:
-            super().print(*tables, **how)
-
-
-class _Trimmed(io.TextIOBase):
-    """A stream without the blanks at the ends of the lines of a table."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The encoding, which decides on the characters that draw tables."""
-        return self._stream.encoding
-
-    def write(self, text: str, /) -> int:
-        """Write whole lines, as a console does."""
-        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
-
-    def flush(self) -> None:
-        """See `io.TextIOBase`."""
-        self._stream.flush()
 
 
 @contextmanager
@@ -131,7 +99,7 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
-        with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
+        with quietly(quiet, silent=STDOUT in map(arguments.get, _TO_STDOUT)):
             command(**arguments)
 
     option = inspect.Parameter(
@@ -172,10 +140,10 @@ def as_on_a_terminal() -> Iterator[None]:
 
 def stdout() -> Console:
     """Return the console for results, as wide as the terminal; without one, 80 characters."""
-    kind = _Tables if _Terminal.quiet else Console
+    kind = TablesOnly if _Terminal.quiet else Console
     if sys.stdout.isatty():
         return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
-    trimmed: Any = _Trimmed(sys.stdout)
+    trimmed: Any = TrimmedStream(sys.stdout)
     return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
 
 
@@ -188,23 +156,8 @@ def say(console: Console, text: str | Text, wrap: bool = True) -> None:
         wrap: whether the lines may be wrapped; a command that is to be copied may not.
     """
     if wrap and (console.is_terminal or _Terminal.wraps):
-        text = Text("\n").join(
-            line
-            for given in (Text(text) if isinstance(text, str) else text).split(allow_blank=True)
-            for line in _wrapped(given, console.width)
-        )
+        text = wrapped_text(Text(text) if isinstance(text, str) else text, console.width)
     console.print(text, soft_wrap=True, highlight=False, markup=False)
-
-
-def _wrapped(text: Text, width: int) -> list[Text]:
-    """Return a line in lines of a width, all but the first indented more than it."""
-    plain = text.plain
-    indent = min(_INDENT + len(plain) - len(plain.lstrip(" ")), width // 2)
-    first, *others = text.divide(break_points(plain, width, indent))
-    lines = [first, *(Text(" " * indent) + other for other in others)]
-    for line in lines:
-        line.rstrip()
-    return lines
 
 
 def print_markdown(text: str) -> None:
