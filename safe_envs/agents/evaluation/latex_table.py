@@ -177,7 +177,7 @@ def _caption(evaluation: Evaluation) -> str:
         f" Brackets: {interval_name(evaluation)}."
     )
     marks = "; ".join(marks_in(evaluation_table(evaluation).columns))
-    return escape(text + (f" In bounds {marks}." if marks else ""))
+    return escape(text + (f" Bounds: {marks}." if marks else ""))
 
 
 def _label(evaluation: Evaluation) -> str:

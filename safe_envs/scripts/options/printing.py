@@ -20,6 +20,7 @@ class TablesOnly(Console):
     """A console that leaves out all but tables."""
 
     def print(self, *objects: Any, **how: Any) -> None:
+        """Print those of the objects that are tables."""
         tables = [found for found in objects if isinstance(found, Table)]
         if tables:
             super().print(*tables, **how)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from safe_envs.atomic_io import write_atomically, writing
+from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.options.console import STDOUT
 
 
@@ -22,5 +22,4 @@ def write_text_result(path: Path | None, text: Callable[[], str]) -> None:
     if path == STDOUT:
         print(text())
     elif path is not None:
-        with writing(path):
-            write_atomically(path, lambda part: part.write_text(f"{text()}\n"))
+        write_atomically(path, lambda part: part.write_text(f"{text()}\n", encoding="utf-8"))
