@@ -20,7 +20,12 @@ def best(
     env: EnvOptions,
     leaving: value_options.Leaving = "violation",
     knowledge: Annotated[
-        str, typer.Option(metavar="plant|model", help="In whose world: the env's, or the model's.")
+        str,
+        typer.Option(
+            metavar="plant|model",
+            callback=text_options.KNOWLEDGE,
+            help="In whose world: the env's, or the model's.",
+        ),
     ] = "plant",
     cells: value_options.Cells = None,
     inputs: value_options.Inputs = None,

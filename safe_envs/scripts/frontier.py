@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import completion, text_options, value_options
+from safe_envs.scripts.options import completion, early_checks, text_options, value_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -31,6 +31,7 @@ def frontier(
         typer.Option(
             "--filter",
             metavar="NAME",
+            callback=early_checks.known_filters,
             autocompletion=completion.filters,
             help="Filter over the nominal controller, next to the env's own and "
             + ", ".join(PROMISES)
@@ -42,6 +43,7 @@ def frontier(
         typer.Option(
             "--policy",
             metavar="NAME|FOLDER|FILE",
+            callback=early_checks.known_policies,
             autocompletion=completion.policies,
             help="Who acts without a filter, next to the nominal controller. Repeatable.",
         ),

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -22,6 +22,7 @@ def verify(
         typer.Option(
             "--filter",
             metavar="NAME",
+            callback=early_checks.known_filter,
             autocompletion=completion.filters,
             help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own.",
         ),
@@ -31,6 +32,7 @@ def verify(
         str,
         typer.Option(
             metavar="NAME|FOLDER|FILE",
+            callback=early_checks.known_policy,
             autocompletion=completion.policies,
             help="Who acts in the simulation, as for evaluate.",
         ),

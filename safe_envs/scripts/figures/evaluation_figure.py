@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.agents.policies.base import POLICY_FILE
+from safe_envs.agents.policies.names import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem

@@ -12,9 +12,15 @@ import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.scripts.options import early_checks
 from safe_envs.scripts.options.console import STDOUT
 
-Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
+KNOWLEDGE = early_checks.one_of("knowledge", ("model", "plant"))
+
+Knowledge = Annotated[
+    str,
+    typer.Option(metavar="model|plant", callback=KNOWLEDGE, help="What the filters know."),
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -25,11 +31,12 @@ Trust = Annotated[
         ),
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 Engine = Annotated[
     str,
     typer.Option(
         metavar="auto|numpy|compiled",
+        callback=early_checks.one_of("engine", ("auto", "numpy", "compiled")),
         help=(
             "What simulates: NumPy, or a program that is compiled once, which needs Numba. auto"
             " takes that for long runs."
@@ -119,7 +126,7 @@ def inputs_of(
     Returns:
         Pairs of option and file.
     """
-    from safe_envs.agents.policies.registry import policy_file
+    from safe_envs.agents.policies.names import policy_file
 
     for option, place in (("--system", system), ("--filter-spec", filter_spec)):
         source = (place or "").rpartition(":")[0]
