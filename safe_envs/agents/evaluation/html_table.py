@@ -47,9 +47,9 @@ def html_table(evaluation: Evaluation) -> str:
     head = "".join(map(_title, columns))
     under = f'<p style="{_SMALL}">{told}</p>' if lines else ""
     return (
-        f'<p style="{_SMALL}"><b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}</p>'
+        f'<div><p style="{_SMALL}"><b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}</p>'
         '<div style="overflow-x:auto"><table style="border-collapse:collapse;font-size:90%">'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{under}"
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{under}</div>"
     )
 
 

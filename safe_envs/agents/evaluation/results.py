@@ -65,7 +65,7 @@ class Timing:
     rows: list[FilterTiming]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
     """The result of `evaluate`. `print` and notebooks show it as a table.
 
@@ -193,6 +193,8 @@ class Evaluation:
         table = evaluation_table(self).short()
         tables = map(text_of, table.arranged(_WIDTH))
         return "\n\n".join([f"{self.title} | {self.about}", *tables, *table.facts])
+
+    __repr__ = __str__
 
     def _repr_html_(self) -> str:
         return html_table(self)
