@@ -59,7 +59,8 @@ def break_points(text: str, width: int, indent: int = 0) -> list[int]:
     for word in re.finditer(r"[^ ]+", text):
         if text_width(text[begin : word.end()]) <= room:
             continue
-        if text[begin : word.start()].strip():
+        # A name that is to be folded anyway begins in the line in which it is.
+        if text[begin : word.start()].strip() and text_width(word[0]) <= width - indent:
             points.append(word.start())
             begin, room = word.start(), max(width - indent, 1)
         for piece in _PIECES.finditer(text, word.start(), word.end()):
