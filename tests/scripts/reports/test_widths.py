@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorSummary
 from safe_envs.scripts import benchmark
 from safe_envs.scripts.options import result_console, wrapping
 from safe_envs.scripts.reports import benchmark_figures, tables
@@ -18,13 +15,11 @@ from safe_envs.scripts.reports.evaluation_report import print_evaluation
 from safe_envs.scripts.reports.sweep_cells import print_cells
 from safe_envs.scripts.reports.training_report import print_evaluations
 from safe_envs.text_lines import text_width
-from tests.agents.evaluation.made_up import attainable
+from tests.agents.evaluation.made_up import LONG_NAME, LONG_WORD, nasty_evaluation
 from tests.scripts.reports.test_sweep_cells import CELL
 from tests.wrappers.certificates.examples import disk
 from tests.wrappers.verification.verified import hurry
 
-NASTY = "learned-hocbf:p=2.00000001,8:level=.95:file=/a/very/long/path/of/[red]models/v0.npz+cbf"
-WORDS = "a_name_without_any_joint_that_is_longer_than_what_is_left_of_the_line_of_a_terminal"
 SCALAR = ("Scalar-v0", "--horizon", 0.2)
 OWN = "a_folder_with_a_long_name/a_file_with_a_long_name.py:AConditionWithALongName"
 CONDITION = """
@@ -88,42 +83,7 @@ def told(request, monkeypatch):
 
 @pytest.fixture(scope="module")
 def evaluated():
-    """An evaluation with all that a table can show, under names of any length."""
-    answer = evaluate(
-        "Scalar-v0",
-        filters=["none", "scbf", "cbf"],
-        options={"horizon": 0.2, "noise": 1.5},
-        episodes=20,
-        bounds=False,
-    )
-    names = {"none": "none", "scbf": NASTY, "cbf": f"cbf:file={WORDS}"}
-    learning = LearningSummary([], 3, 20, [], [], [WORDS], {}, [], [WORDS], rates=[0.9, 0.5, 0.8])
-    bound = PosteriorSummary(0.4, "it is weak", "proved", 0.1, 1.0, 0.0, 0.0)
-    bounds = {
-        "held_bound": 0.5,
-        "held_word": "computed",
-        "held_note": f"of a table in {NASTY}",
-        "continuous_bound": 0.123456,
-        "continuous_word": "proved",
-        "outside_rate": 0.25,
-        "touching": 1,
-    }
-    rows = [replace(row, filter=names[row.filter]) for row in answer.rows]
-    rows[1] = replace(rows[1], learning=learning, posterior_bound=bound, **bounds)
-    rows[2] = replace(rows[2], continuous_bound=0.5, continuous_word="estimated")
-    compared = [
-        replace(c, first=names[c.first], second=names[c.second]) for c in answer.comparisons
-    ]
-    speeds = zip(answer.timing.rows, rows, strict=True)
-    timing = [replace(speed, filter=row.filter, engine="compiled") for speed, row in speeds]
-    return replace(
-        answer,
-        config={**answer.config, "title": f"safe_envs/{WORDS}-v0"},
-        rows=rows,
-        comparisons=compared,
-        timing=replace(answer.timing, rows=timing),
-        best=attainable(0.9, 0.99981),
-    )
+    return nasty_evaluation()
 
 
 def test_evaluate(told, evaluated):
@@ -170,8 +130,10 @@ def test_times_are_shown_only_where_they_are_asked_for(evaluated):
 def test_sweep_report(told, count):
     swept = ["filter", *(f"setting_{i}" for i in range(count))]
     cell = {**CELL, "best_lower": 0.9, "best_upper": 0.99, "held_bound": 0.42}
-    cell |= {"held_word": "computed", "filter": NASTY} | dict.fromkeys(swept[1:], WORDS[:30])
-    failed = {**cell, "error": f"{NASTY} cannot be read; name another file"}
+    cell |= {"held_word": "computed", "filter": LONG_NAME} | dict.fromkeys(
+        swept[1:], LONG_WORD[:30]
+    )
+    failed = {**cell, "error": f"{LONG_NAME} cannot be read; name another file"}
     console = Console(file=io.StringIO(), width=told.width)
     print_cells(console, {"cells": "abc", "swept": swept}, [cell, cell, failed], 5)
     out = told(console.file.getvalue())
@@ -186,13 +148,13 @@ def test_train(told):
     judgement |= {"low": 0.1, "high": 0.3, "multiplier": 100.0, "saturated": True}
     judgement |= {"met": False, "evaluation_met": False}
     console = Console(file=io.StringIO(), width=told.width)
-    print_evaluations(console, NASTY, [row, row | {"constraint": judgement}])
+    print_evaluations(console, LONG_NAME, [row, row | {"constraint": judgement}])
     assert "NOT MET" in told(console.file.getvalue())
 
 
 def test_benchmark(told, monkeypatch, capsys, tmp_path):
-    figures = {benchmark_figures.FUSED: 1.5, f"a case of {WORDS}": 123456.0}
-    figures |= {f"latency, {WORDS}: {i}": 1e5 for i in range(3)}
+    figures = {benchmark_figures.FUSED: 1.5, f"a case of {LONG_WORD}": 123456.0}
+    figures |= {f"latency, {LONG_WORD}: {i}": 1e5 for i in range(3)}
     part = benchmark_figures.Part("all", lambda: figures)
     monkeypatch.setattr(benchmark_figures, "parts", lambda: [part])
     benchmark.benchmark()
@@ -208,12 +170,12 @@ COMMANDS = {
         *("--filter", OWN),
     ),
     "verify": ("verify", *SCALAR, "--filter", OWN, "--episodes", 20, "--dt", 0.05),
-    "certify": ("certify", *SCALAR, "--degree", 4, "--rate", 0, "--out", f"{WORDS}.json"),
+    "certify": ("certify", *SCALAR, "--degree", 4, "--rate", 0, "--out", f"{LONG_WORD}.json"),
     "held": ("certify", *SCALAR, "--held", "--degree", 4),
     "identify": (
         *("identify", "CubicSDEDisk-v0", "--method", "bayesian", "--set", "degree=2"),
         *("--set", "starts=10", "--set", "steps=20", "--set", "repetitions=10"),
-        *("--out", f"{WORDS}.npz"),
+        *("--out", f"{LONG_WORD}.npz"),
     ),
     "list": ("list",),
 }
