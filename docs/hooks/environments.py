@@ -8,6 +8,7 @@ import re
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import sympy as sp
 from formulas import with_latex, with_set_units
 from PIL import Image
@@ -15,6 +16,7 @@ from PIL import Image
 from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.agents import NominalController
 from safe_envs.dynamics.lie import relative_degree
+from safe_envs.rendering.style import PANEL, SCENE
 from safe_envs.wrappers import SafetyFilterWrapper
 
 _SHOWN, _MOST_STEPS = 0.4, 400
@@ -63,7 +65,9 @@ def env_pages() -> dict[str, str | bytes]:
         name = short_name(env_id)
         env: Any = gym.make(env_id, render_mode="rgb_array")
         problem, (summary, text) = env.unwrapped.problem, _docstring(env)
-        pages[f"envs/{name}.png"], caption = _picture(env)
+        frame, caption = _picture(env)
+        pages[f"envs/{name}.png"] = _written(frame)
+        pages[f"envs/{name}-narrow.png"] = _written(_stacked(frame))
         pages[f"envs/{name}.md"] = _page(env_id, problem, summary, text, caption)
         rows.append(_row(name, problem, summary))
         env.close()
@@ -87,7 +91,10 @@ def _page(env_id: str, problem: SafetyProblem, summary: str, text: str, caption:
 
 {summary}
 
-![{name}: the scene, the actions and h over time](./{name}.png)
+<picture>
+  <source srcset="{name}-narrow.png" media="(max-width: 600px)">
+  <img src="{name}.png" alt="{name}: the scene, the actions and h over time">
+</picture>
 
 *{caption}*
 
@@ -187,7 +194,7 @@ def _set(text: str) -> str:
     return with_latex("".join(parts))
 
 
-def _picture(env: Any) -> tuple[bytes, str]:
+def _picture(env: Any) -> tuple[np.ndarray, str]:
     """Return a frame of an episode under the env's default filter, and its caption."""
     problem = env.unwrapped.problem
     filtered: Any = SafetyFilterWrapper(env, problem.filter)
@@ -200,13 +207,26 @@ def _picture(env: Any) -> tuple[bytes, str]:
         count += 1
         if terminated or truncated:
             break
-    written = io.BytesIO()
-    Image.fromarray(filtered.render()).save(written, "PNG", optimize=True)
     mismatch = problem.plant.parameters != problem.model.parameters
     why = ": the model differs from the plant, see [Mismatch](#mismatch)" if mismatch else ""
     seen = f" The minimum of $h$ so far is {info['h_min']:.3g}{why}." if info["h_min"] < 0 else ""
-    return written.getvalue(), (
+    return filtered.render(), (
         f"The nominal controller under {_link(problem)} after {count * problem.dt:g} s, seed 0."
         " Green: the safe set; hatched: $h < 0$. The panel shows the executed action (bar), the"
         f" nominal action (diamond), and $h$ over time.{seen}"
     )
+
+
+def _stacked(frame: np.ndarray) -> np.ndarray:
+    """Return a frame with its panel below the scene, for narrow screens."""
+    width = round(SCENE[2])
+    scene, panel = frame[:, :width], frame[:, width:]
+    rest = np.full((len(panel), width - panel.shape[1], 3), PANEL, dtype=np.uint8)
+    half = rest.shape[1] // 2
+    return np.vstack([scene, np.hstack([rest[:, :half], panel, rest[:, half:]])])
+
+
+def _written(frame: np.ndarray) -> bytes:
+    written = io.BytesIO()
+    Image.fromarray(frame).save(written, "PNG", optimize=True)
+    return written.getvalue()

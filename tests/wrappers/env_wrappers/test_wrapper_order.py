@@ -185,14 +185,14 @@ def test_vector_wrappers_above_the_filter_leave_its_decisions_alone(name: str):
 @pytest.mark.parametrize("above", [True, False])
 def test_videos_show_the_filtered_episode_from_both_sides(above: bool, tmp_path: Path):
     def recorded(env: Any) -> Any:
-        return wrappers.RecordVideo(env, str(tmp_path), video_length=3, disable_logger=True)
+        return wrappers.RecordVideo(env, str(tmp_path / "videos"), video_length=3, disable_logger=True)
 
     env = (
         recorded(own(render_mode="rgb_array")) if above else own(recorded, render_mode="rgb_array")
     )
     np.testing.assert_allclose(executed(env, count=5), executed(own(), count=5), rtol=1e-9)
     env.close()
-    assert len(list(tmp_path.glob("*.mp4"))) == 1
+    assert len(list(tmp_path.glob("videos/*.mp4"))) == 1
 
 
 def test_the_guide_has_these_wrappers_and_no_other():
