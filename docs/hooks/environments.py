@@ -102,17 +102,17 @@ def _page(env_id: str, problem: SafetyProblem, summary: str, text: str, caption:
 env = gym.make("{env_id}")
 ```
 
-| control period | horizon | relative degree | gains | default filter |
-|---|---|---|---|---|
-| {" | ".join(_defaults(problem))} |
+{_defaults(problem)}
 
 {text}
 """
 
 
-def _defaults(problem: SafetyProblem) -> list[str]:
-    times = [f"{problem.dt:g} s", f"{problem.horizon:g} s"]
-    return [*times, _degrees(problem), _gains(problem), _link(problem)]
+def _defaults(problem: SafetyProblem) -> str:
+    return (
+        f"Control period {problem.dt:g} s, horizon {problem.horizon:g} s, relative degree"
+        f" {_degrees(problem)}, gains {_gains(problem)}, default filter {_link(problem)}."
+    )
 
 
 def _title(name: str) -> str:
