@@ -86,7 +86,7 @@ def _page(env_id: str, problem: SafetyProblem, summary: str, text: str, caption:
     # Docstrings state the equations for a terminal; here they come from the symbols.
     before, _, after = text.partition(_EQUATIONS)
     after = re.sub(r"\A(?:    .*\n)+", "", after)
-    text = "".join([_set(before), _EQUATIONS, _equations(problem), _set(after)])
+    text = "".join([_set(before), _EQUATIONS, _equations(problem), "\n", _set(after)])
     return f"""# {_title(name)}
 
 {summary}
