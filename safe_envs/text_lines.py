@@ -52,7 +52,13 @@ def wrapped(text: str, width: int, indent: int = 0) -> list[str]:
 
 
 def break_points(text: str, width: int, indent: int = 0) -> list[int]:
-    """Return where the lines of `wrapped` begin in the text, but for the first one."""
+    """Return where the lines of `wrapped` begin in the text, but for the first one.
+
+    Args:
+        text: a line.
+        width: of a line.
+        indent: blanks before all lines but the first.
+    """
     text = _TOGETHER.sub(lambda found: found[0].replace(" ", "\u00a0"), text)
     points: list[int] = []
     begin, room = 0, width

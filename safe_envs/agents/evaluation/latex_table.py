@@ -6,9 +6,9 @@ import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from safe_envs.agents.evaluation.bound_marks import marks_in
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.evaluation_table import (
     compared,
     evaluation_table,
@@ -17,9 +17,6 @@ from safe_envs.agents.evaluation.evaluation_table import (
 )
 from safe_envs.text_lines import folded
 from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of
-
-if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.results import Evaluation
 
 _WIDTH = 80
 _NAMES = 0.38
@@ -60,7 +57,7 @@ _GREEK = re.compile(
 )
 
 
-def latex_table(evaluation: Evaluation) -> str:
+def latex_table(evaluation: EvaluationData) -> str:
     """Return a floating table with a row for each filter, and the comparisons of filters.
 
     Args:
@@ -127,7 +124,7 @@ def _tabular(table: FittedTable) -> str:
     return _framed([column.column for column in table], [*titles], [*rows])
 
 
-def _compared(evaluation: Evaluation) -> str:
+def _compared(evaluation: EvaluationData) -> str:
     rows = [
         (
             folded(f"{c.first} - {c.second}", _WIDTH // 2),
@@ -177,7 +174,7 @@ def _bottom(lines: Sequence[str], height: int) -> list[str]:
     return [""] * (height - len(lines)) + list(lines)
 
 
-def _caption(evaluation: Evaluation) -> str:
+def _caption(evaluation: EvaluationData) -> str:
     config, problem = evaluation.config, evaluation.problem
     text = (
         f"Safety of the policy {config['policy']['name']} on {evaluation.title}:"
@@ -189,7 +186,7 @@ def _caption(evaluation: Evaluation) -> str:
     return escape(text + (f" Bounds: {marks}." if marks else ""))
 
 
-def _label(evaluation: Evaluation) -> str:
+def _label(evaluation: EvaluationData) -> str:
     name = unicodedata.normalize("NFKD", evaluation.title).encode("ascii", "ignore").decode()
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
     return f"tab:{slug or 'evaluation'}"
