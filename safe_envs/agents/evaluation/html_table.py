@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.evaluation_table import (
 )
 from safe_envs.text_tables import Column
 
-_WIDTH = 90
+_WIDTH = 80
 """Of a table, in characters: about what the column of a page holds."""
 
 _CELL = "padding:.2em .7em;vertical-align:bottom;border:0;"
@@ -70,10 +70,10 @@ def _title(column: Column) -> str:
 
 
 def _cell(column: Column, text: str) -> str:
-    return f'<td style="{_align(column)}{_CELL}">{escape(text)}</td>'
+    # A number stays on one line with its interval; titles and long names take several.
+    breaks = "white-space:nowrap;" if column.kind == "r" else "overflow-wrap:anywhere;"
+    return f'<td style="{_align(column)}{_CELL}{breaks}">{escape(text)}</td>'
 
 
 def _align(column: Column) -> str:
-    if column.kind == "r":
-        return "text-align:right;white-space:nowrap;"
-    return "text-align:left;overflow-wrap:anywhere;min-width:5em;"
+    return "text-align:right;" if column.kind == "r" else "text-align:left;min-width:9em;"
