@@ -13,30 +13,36 @@ _COLUMNS = ("states", "inputs", "degree", "filter", "noise", "dt", "horizon")
 
 def list_envs(json: Json = None) -> None:
     """List the registered envs."""
-    from rich.markup import escape
+    from rich.text import Text
 
-    from safe_envs.scripts.reports.tables import make_table
+    from safe_envs.scripts.reports.tables import print_columns
     from safe_envs.systems.summary import summaries
+    from safe_envs.text_tables import Column
 
     require_result(json)
-    table = make_table("pl", "id, and what is to be kept safe", *_COLUMNS)
-    table.columns[0].max_width = 50
     rows = []
     for env_id in ENV_IDS:
         found = summaries()[env_id]
-        values = {
-            "states": len(found.states),
-            "inputs": len(found.inputs),
-            "degree": list(found.degree.values()),
-            "filter": found.filter,
-            "noise": list(found.noise.values()),
-            "dt": found.dt,
-            "horizon": found.horizon,
-        }
-        rows.append({"env_id": env_id, "about": found.about, **values})
-        cells = [_cell(name, value) for name, value in values.items()]
-        table.add_row(f"[bold]{env_id}[/]\n{escape(found.about)}\n", *cells)
-    stdout().print(table)
+        rows.append(
+            {
+                "env_id": env_id,
+                "about": found.about,
+                "states": len(found.states),
+                "inputs": len(found.inputs),
+                "degree": list(found.degree.values()),
+                "filter": found.filter,
+                "noise": list(found.noise.values()),
+                "dt": found.dt,
+                "horizon": found.horizon,
+            }
+        )
+    ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")
+    abouts = Column("what is to be kept safe", tuple(row["about"] for row in rows), "p")
+    settings = [
+        Column(name, tuple(_cell(name, row[name]) for row in rows), "l", part=1 + (i > 2))
+        for i, name in enumerate(_COLUMNS)
+    ]
+    print_columns(stdout(), [ids], [abouts, *settings])
     write_result(json, lambda: {"envs": rows})
 
 

@@ -1,163 +1,26 @@
-"""The result of an evaluation."""
+"""The result of an evaluation, as texts, tables and data frames."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData
+from safe_envs.agents.evaluation.evaluation_table import evaluation_table
+from safe_envs.agents.evaluation.frames import frame_of, row_columns
+from safe_envs.agents.evaluation.html_table import html_table
+from safe_envs.agents.evaluation.latex_table import latex_table
+from safe_envs.text_tables import markdown_of, text_of
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.bound_text import continuous_text, held_text
-from safe_envs.agents.evaluation.comparison import Comparison
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
-from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
-from safe_envs.agents.evaluation.safe_flags import SafeFlags
-from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
-from safe_envs.agents.evaluation.trajectories import Trajectories
-from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.agents.evaluation.yardstick import best_document
-from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.errors import ConfigurationError
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning import LearnedModel
-
-_TEXT_TITLES = ("continuous", "min h, median", "violations", "intervened", "infeasible", "return")
+_WIDTH = 80
+"""Of texts, in characters."""
 
 
-@dataclass(frozen=True)
-class FilterTiming:
-    """How long the episodes under a filter took.
+@dataclass(frozen=True, repr=False)
+class Evaluation(EvaluationData):
+    """The result of `evaluate`. `print` and notebooks show it as a table."""
 
-    Attributes:
-        filter: its name.
-        seconds: wall-clock time.
-        steps: control periods of all episodes.
-        steps_per_second: steps/seconds.
-        learning_seconds: mean time of an identification; None where nothing was learned.
-        engine: "numpy" or "compiled".
-        jobs: processes of NumPy, or threads of the compiled engine.
-    """
-
-    filter: str
-    seconds: float
-    steps: int
-    steps_per_second: float
-    learning_seconds: float | None
-    engine: str
-    jobs: int
-
-
-@dataclass(frozen=True)
-class Timing:
-    """The part of a result that depends on the machine.
-
-    Attributes:
-        num_envs: episodes that NumPy simulates side by side.
-        rows: one for each filter.
-    """
-
-    num_envs: int
-    rows: list[FilterTiming]
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The result of `evaluate`. `print` shows it as a table.
-
-    Attributes:
-        problem: what was simulated.
-        spec: what was asked for.
-        config: all that determines the result, as JSON-able data.
-        rows: statistics, one row for each filter.
-        comparisons: of every two rows, by which of the same episodes were safe.
-        timing: the only part that depends on the machine and on `num_envs`.
-        trajectories: of each filter, if they were asked for.
-        safe: which episodes are safe, for each filter and identification.
-        visited: states of the episodes that contradict a bound, if any do, for each filter and
-            identification.
-        learned: models of the first identifications.
-        is_deterministic: whether nothing is random, so that all episodes are one and the same.
-        episodes_if_kept: see `episodes`; None where they were not kept.
-        best: how safe any policy can be, counted as the rows are; None where it is not known.
-    """
-
-    problem: SafetyProblem
-    spec: EvaluationSpec
-    config: dict[str, Any]
-    rows: list[EvaluationRow]
-    comparisons: list[Comparison]
-    timing: Timing
-    trajectories: dict[str, Trajectories]
-    safe: dict[str, list[SafeFlags]]
-    visited: dict[str, list[VisitedStates]]
-    learned: list[LearnedModel]
-    is_deterministic: bool
-    episodes_if_kept: dict[str, list[EpisodeResults]] | None
-    best: AttainableSafety | None = None
-
-    @property
-    def title(self) -> str:
-        """How results call what was evaluated."""
-        return self.config["title"]
-
-    @property
-    def episodes(self) -> dict[str, list[EpisodeResults]]:
-        """Results of each episode, for each filter and identification.
-
-        They are there where the evaluation was to keep them: see `RunSettings.keep_episodes`.
-
-        Raises:
-            ConfigurationError: they were not kept.
-        """
-        if self.episodes_if_kept is None:
-            count = sum(len(flags) for each in self.safe.values() for flags in each)
-            raise ConfigurationError(
-                f"the results of the {count:,} episodes were not kept one by one; evaluate with"
-                " keep_episodes=True for that, or with episodes_out='FILE.parquet' to write them"
-                " to a file, which takes no memory"
-            )
-        return self.episodes_if_kept
-
-    def row(self, name: str) -> EvaluationRow:
-        """Return the row of a filter.
-
-        Raises:
-            KeyError: No row has the name.
-        """
-        return {row.filter: row for row in self.rows}[name]
-
-    def document(self) -> dict[str, Any]:
-        """Return the whole as JSON-able data."""
-        return {
-            "config": self.config,
-            "versions": package_versions(),
-            "rows": [row.as_dict() for row in self.rows],
-            "comparisons": [asdict(comparison) for comparison in self.comparisons],
-            "timing": asdict(self.timing),
-            "best": best_document(self.best, self.rows),
-        }
-
-    def episode_columns(self) -> dict[str, np.ndarray]:
-        """Return the results of all episodes as columns, in the order of filters and episodes.
-
-        Returns:
-            Arrays of equal length: filter, identification, episode, safe, return, min_h,
-            first_violation (s, NaN where there is none), length (steps), interventions,
-            infeasible, effort.
-
-        Raises:
-            ConfigurationError: they were not kept: see `episodes`.
-        """
-        found: dict[str, list[Any]] = {}
-        for name, identifications in self.episodes.items():
-            for repeat, results in enumerate(identifications):
-                columns = results.columns(name, repeat, 0, self.problem.dt)
-                for key, values in columns.items():
-                    found.setdefault(key, []).append(values)
-        return {key: np.concatenate(parts) for key, parts in found.items()}
-
-    def to_dataframe(self, episodes: bool = False) -> Any:
+    def to_frame(self, episodes: bool = False) -> Any:
         """Return a pandas DataFrame with a row for each filter, or for each episode.
 
         Args:
@@ -167,43 +30,24 @@ class Evaluation:
             ConfigurationError: pandas is not installed, or the episodes were not kept: see
                 `episodes`.
         """
-        try:
-            import pandas as pd  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise ConfigurationError(
-                "to_dataframe needs pandas, which is not installed: pip install pandas, or use"
-                " rows or episode_columns()"
-            ) from error
-        if episodes:
-            return pd.DataFrame(self.episode_columns())
-        nested = ("curve", "posterior_bound", "learning")
-        return pd.DataFrame(
-            [{k: v for k, v in row.as_dict().items() if k not in nested} for row in self.rows]
-        )
+        return frame_of(self.episode_columns() if episodes else row_columns(self))
+
+    def to_latex(self) -> str:
+        """Return the table and the comparisons for a paper, in LaTeX with booktabs."""
+        return latex_table(self)
+
+    def to_markdown(self) -> str:
+        """Return the table in Markdown, in parts that fit a page."""
+        table = evaluation_table(self)
+        tables = [markdown_of(each) for each in table.arranged(_WIDTH)]
+        return "\n\n".join([tables[0], *table.facts, *tables[1:]])
 
     def __str__(self) -> str:
-        level = f"{100 * self.spec.confidence:.10g}"
-        titles = ("filter", "held input", f"safe [{level} % interval]", *_TEXT_TITLES)
-        table = [titles, *map(_text_cells, self.rows)]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = [
-            "  ".join(f"{cell:{'<' if i == 0 else '>'}{widths[i]}}" for i, cell in enumerate(cells))
-            for cells in table
-        ]
-        heading = f"{self.title}, policy {self.rows[0].policy}, {self.spec.episodes} episodes"
-        return "\n".join([heading, *lines])
+        table = evaluation_table(self).short()
+        tables = map(text_of, table.arranged(_WIDTH))
+        return "\n\n".join([f"{self.title} | {self.about}", *tables, *table.facts])
 
+    __repr__ = __str__
 
-def _text_cells(row: EvaluationRow) -> tuple[str, ...]:
-    filtered = row.filter != UNFILTERED
-    return (
-        row.filter,
-        held_text(row),
-        percent_in(row.safety_rate, row.ci_low, row.ci_high),
-        continuous_text(row),
-        f"{row.min_h_median:.3g}",
-        str(row.violations),
-        percent(row.intervention_rate) if filtered else "-",
-        percent(row.infeasible_rate) if filtered else "-",
-        f"{row.return_mean:.4g}",
-    )
+    def _repr_html_(self) -> str:
+        return html_table(self)

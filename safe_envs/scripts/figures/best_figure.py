@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from safe_envs.agents.evaluation.best_text import best_text
 from safe_envs.atomic_io import write_atomically
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE, WARM
 from safe_envs.scripts.reports.best_report import BestAnswer
-from safe_envs.scripts.reports.best_text import best_text
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.wrappers.value.table import ValueTable
 

@@ -45,6 +45,9 @@ _UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", 
 STDOUT = Path("-")
 """The file of --json that means standard output, where nothing else is printed then."""
 
+_TO_STDOUT = ("json", "json_file", "latex")
+"""Parameters of commands whose file may be standard output."""
+
 Quiet = Annotated[
     bool,
     typer.Option(
@@ -95,7 +98,7 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
-        with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
+        with quietly(quiet, silent=STDOUT in map(arguments.get, _TO_STDOUT)):
             command(**arguments)
 
     option = inspect.Parameter(
@@ -125,19 +128,24 @@ def with_signature(
 
 
 def stdout() -> Console:
-    """Return the console for results, wide enough for tables."""
+    """Return the console for results, as wide as the terminal; without one, 80 characters."""
     from safe_envs.scripts.options.result_console import result_console
 
     return result_console(_Terminal.quiet, _Terminal.silent)
 
 
-def say(console: Console, text: str | Text) -> None:
-    """Print a text as it is, in lines of any length.
+def say(console: Console, text: str | Text, wrap: bool = True) -> None:
+    """Print a text: on a terminal in lines of its width, elsewhere in lines as they are.
 
     Args:
         console: to print on.
         text: to print; markup in a str is not interpreted.
+        wrap: whether the lines may be wrapped; a command that is to be copied may not.
     """
+    if wrap:
+        from safe_envs.scripts.options.wrapping import wrapped_for
+
+        text = wrapped_for(console, text)
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 

@@ -175,6 +175,20 @@ JsonOut = Annotated[
         ),
     ),
 ]
+Latex = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help=(
+            "Write the table and the comparisons in LaTeX, with booktabs; - for stdout, and nothing"
+            " else there."
+        ),
+    ),
+]
+Timing = Annotated[
+    bool,
+    typer.Option("--timing", help="Print the times too: of learning, and steps per second."),
+]
 EpisodesOut = Annotated[
     Path | None,
     typer.Option(metavar="FILE.parquet", help="Write what became of each episode; needs pyarrow."),

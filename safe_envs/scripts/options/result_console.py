@@ -12,8 +12,8 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.table import Table
 
-_LEAST_WIDTH = 104
-_PIPE_WIDTH = 240
+_LEAST_WIDTH = 40
+_PIPE_WIDTH = 80
 
 
 class _Tables(Console):
@@ -46,7 +46,7 @@ class _Trimmed(io.TextIOBase):
 
 
 def result_console(quiet: bool, silent: bool) -> Console:
-    """Return the console for results, wide enough for tables.
+    """Return the console for results, as wide as the terminal; without one, 80 characters.
 
     Args:
         quiet: print tables only.

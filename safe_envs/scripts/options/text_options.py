@@ -55,6 +55,7 @@ def require_outputs(
     *,
     out: Path | None = None,
     episodes_out: Path | None = None,
+    latex: Path | None = None,
     inputs: Iterable[tuple[str, Path]] = (),
 ) -> None:
     """Check, before any work, that --out, --json and --plot can be written to different files.
@@ -64,6 +65,7 @@ def require_outputs(
         plot: of --plot, if given.
         out: of --out, where a command has it.
         episodes_out: of --episodes-out, where a command has it.
+        latex: of --latex, where a command has it.
         inputs: options and the files that they read, which are not to be overwritten.
 
     Raises:
@@ -73,10 +75,11 @@ def require_outputs(
     for option, path in (
         ("--out", out),
         ("--json", json),
+        ("--latex", latex),
         ("--episodes-out", episodes_out),
         ("--plot", plot),
     ):
-        if path is None or (option == "--json" and path == STDOUT):
+        if path is None or (option in ("--json", "--latex") and path == STDOUT):
             continue
         require_writable(path)
         place = os.path.realpath(path)

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.results import Timing
+from safe_envs.agents.evaluation.evaluation_data import Timing
 from safe_envs.agents.evaluation.rounding import touches
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
 from tests.scripts.conftest import strictly
@@ -77,7 +77,7 @@ def test_starts_from_which_nothing_is_promised_are_told(evaluated):
 
 def printed(answer):
     console = Console(width=200, file=io.StringIO())
-    print_evaluation(console, answer)
+    print_evaluation(console, answer, timing=True)
     return " ".join(console.file.getvalue().split())
 
 
