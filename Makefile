@@ -60,4 +60,4 @@ $(DOCS_READY): $(READY)
 	touch $@
 
 clean:
-	rm -rf .venv site
+	rm -rf .venv site .docs_cache

@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import sympy as sp
+from navigation import short_name
 from PIL import Image
 
 from safe_envs import ENV_IDS, SafetyProblem
@@ -26,11 +27,6 @@ _HEADER = (
 _WORD = re.compile(r"^[A-Za-z]{2,}")
 _FUNCTION = re.compile(r"(?<=[A-Za-z0-9}]) (?=\\(?:sin|cos|tan|exp|log)\b)")
 _LOW = re.compile(r"\\left\(((?:(?!\\left|\\right|\\frac).)*)\\right\)")
-
-
-def short_name(env_id: str) -> str:
-    """Return the name of an env without its namespace and version."""
-    return env_id.removeprefix("safe_envs/").removesuffix("-v0")
 
 
 def env_pages() -> dict[str, str | bytes]:
