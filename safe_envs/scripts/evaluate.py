@@ -8,7 +8,7 @@ from typing import Any
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import evaluation_options as of
-from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options import figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -41,6 +41,7 @@ def evaluate(
     json: of.JsonOut = None,
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print the safety rate of a policy under each filter, and compare the filters in pairs.
 
@@ -55,6 +56,7 @@ def evaluate(
     """
     reads = text_options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec)
     text_options.require_outputs(json, plot, episodes_out=episodes_out, inputs=reads)
+    figure_options.width_of(size)
     common: dict[str, Any] = {
         "filters": list(dict.fromkeys(filters)) if filters else None,
         "trust": trust,
@@ -95,21 +97,21 @@ def evaluate(
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id
-    _evaluate(problem, policy, refine, (json, plot), common)
+    _evaluate(problem, policy, refine, (json, plot, size), common)
 
 
 def _evaluate(
     problem: Any,
     policy: str,
     refine: bool,
-    outputs: tuple[Path | None, Path | None],
+    outputs: tuple[Path | None, Path | None, str],
     arguments: dict[str, Any],
 ) -> None:
     """Evaluate, print and write."""
     from safe_envs.agents.evaluation import evaluate, refinement
     from safe_envs.scripts.reports.evaluation_report import print_evaluation, print_refinement
 
-    json, plot = outputs
+    json, plot, size = outputs
     found: Any
     with progress_bar("Evaluating") as progress:
         run: Any = refinement.refine if refine else evaluate.evaluate
@@ -122,7 +124,7 @@ def _evaluate(
     if plot is not None:
         from safe_envs.scripts.figures.evaluation_figure import draw
 
-        draw(first, plot)
+        draw(first, plot, size)
 
 
 def _evaluate_rare(
