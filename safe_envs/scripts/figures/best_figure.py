@@ -14,8 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.labels import labelled, mathematics, plain, quantity, symbol
+from safe_envs.scripts.figures.labels import expression, labelled, mathematics, plain
 from safe_envs.scripts.figures.saving import save
 from safe_envs.scripts.figures.style import (
     COLORS,
@@ -77,7 +76,8 @@ def figure_of(answer: BestAnswer, table: ValueTable, size: str = DEFAULT_SIZE) -
         else np.asarray(rows[0], dtype=float).reshape(shape)
         for rows in (table.lower, table.upper)
     )
-    names = [_label(problem, coordinate) for coordinate in found.coordinates]
+    units = {state.symbol.name: state.unit for state in problem.states}
+    names = [expression(coordinate, units) for coordinate in found.coordinates]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, 3.9 if size == "double" else 3.7))
         panel = figure.subplots()
@@ -88,11 +88,12 @@ def figure_of(answer: BestAnswer, table: ValueTable, size: str = DEFAULT_SIZE) -
             edges = (axes[0].edges, axes[1].edges)
             handles = _draw_plane(figure, panel, edges, lower, upper)
             panel.set(xlabel=names[0], ylabel=names[1])
+        unitless = dict.fromkeys(units, "")
         held = [
-            f"{symbol(name)} = {0.5 * (axis.edges[i] + axis.edges[i + 1]):.3g}"
+            f"{expression(name, unitless)} = {0.5 * (axis.edges[i] + axis.edges[i + 1]):.3g}"
             for name, axis, i in zip(found.coordinates[2:], axes[2:], middle, strict=True)
         ]
-        title = "Best attainable safety at the start of an episode"
+        title = "Best attainable safety from each start"
         title += f"; {', '.join(held)}" * bool(held)
         panel.set_title(wrapped(figure, title, mpl.rcParams["axes.titlesize"], 0.75 * width))
         add_legend(figure, handles)
@@ -162,10 +163,3 @@ def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
     """Return the first and the one after the last place of each run of True."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
-
-
-def _label(problem: SafetyProblem, coordinate: str) -> str:
-    """Return the label of an axis: the coordinate, with the unit where it is a state."""
-    units = {state.symbol.name: state.unit for state in problem.states}
-    unit = units.get(coordinate, "")
-    return quantity(coordinate, unit)

@@ -41,7 +41,8 @@ def write_levels(figure: Figure, axes: Axes, lines: ContourSet) -> None:
             places.append(axes.transData.inverted().transform(place))
             others.append(corners)
     if places:
-        axes.clabel(lines, fontsize=SMALL, fmt=_FORM, manual=places, inline_spacing=2)
+        style: Any = {"fontsize": SMALL, "fmt": _FORM, "colors": "black", "inline_spacing": 4}
+        axes.clabel(lines, manual=places, **style)
 
 
 def _pixels(axes: Axes, segments: Sequence[Any]) -> np.ndarray:

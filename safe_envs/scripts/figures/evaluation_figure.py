@@ -9,6 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
@@ -88,7 +89,8 @@ def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Figure:
             draw_plane(figure.add_subplot(place), evaluation, looks)
         panels = _draw_episodes(lower.subgridspec(count, len(episodes)), episodes)
         handles = barrier.get_legend_handles_labels()[0]
-        add_legend(figure, [*handles, *_handles_of(evaluation, episodes, panels)])
+        unsafe = Patch(color=UNSAFE, alpha=0.35, label="unsafe")
+        add_legend(figure, [*handles, unsafe, *_handles_of(evaluation, episodes, panels)])
         title = f"{evaluation.title}, {_policy_name(Path(config['policy']['name']))} policy"
         add_title(figure, f"{plain(title, 200)}\n{mathematics(describe_system(problem))}")
     return figure
@@ -118,7 +120,9 @@ def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> dict[str, list[
     for (name, drawn), column in zip(episodes.items(), panels.T, strict=True):
         drawn.draw(list(column))
         room = grid.figure.get_figwidth() / len(episodes) - 0.4
-        title = wrapped(grid.figure, f"{name}, first episode", mpl.rcParams["axes.titlesize"], room)
+        title = wrapped(
+            grid.figure, f"{plain(name, 200)}, first episode", mpl.rcParams["axes.titlesize"], room
+        )
         column[0].set_title(title)
     for i, row in enumerate(panels):
         low, high = np.transpose([panel.get_ylim() for panel in row])
@@ -180,7 +184,7 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
         color = looks[name]["color"]
         axes.fill_between(time, low, high, color=color, alpha=0.09, linewidth=0)
         axes.plot(time, np.stack([low, high], axis=1), color=color, linewidth=0.4, alpha=0.6)
-        label = f"{name}: {percent(row.safety_rate)} safe"
+        label = f"{plain(name, 200)}: {percent(row.safety_rate)} safe"
         axes.plot(time, median, **looks[name], linewidth=1.5, label=label)
         lowest, highest, last = (
             min(lowest, low.min()),
@@ -190,12 +194,11 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     # Values far below 0 are cut off, so that they do not shrink the rest.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
     margin = 0.05 * max(highest - bottom, 1e-3)
-    # The unsafe side always has room for its name.
+    # Some of the unsafe side is always seen.
     bottom = min(bottom - margin, -2.0 * margin)
     axes.set(xlim=(0.0, max(last, evaluation.problem.dt)), ylim=(bottom, highest + margin))
     axes.axhspan(bottom, 0.0, color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.9)
-    axes.text(0.99, 0.02, "unsafe", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
     axes.set(ylabel="barrier $h$", title="Median and 5 to 95 % of the episodes")
 
 
@@ -212,4 +215,6 @@ def _draw_curve(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     bottom = 100 * lowest - 4 * (1 - lowest)
     axes.set(ylim=(bottom, 100 + 4 * (1 - lowest)), xlabel=labelled("time", "s"))
     axes.set(ylabel=labelled("safe so far", "%"))
-    axes.set_title(f"With its pointwise {100 * evaluation.config['confidence']:.10g} % band")
+    axes.set_title(
+        f"Safe so far, with its pointwise {100 * evaluation.config['confidence']:.10g} % band"
+    )

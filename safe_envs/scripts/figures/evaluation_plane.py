@@ -48,14 +48,16 @@ def draw_plane(axes: Axes, evaluation: Evaluation, looks: dict[str, dict[str, An
     axes.set(
         xlabel=quantity(names[across], units[across]),
         ylabel=quantity(names[up], units[up]),
-        title=f"{len(starts)} episodes from the dots; safe set{_when(problem)}",
+        title=f"First {len(starts)} episodes, dots at their starts{_when(problem)}",
     )
 
 
 def _when(problem: SafetyProblem) -> str:
     """Return a remark if the safe set in the plane changes with the other states."""
     used = set().union(*(b.expression.free_symbols for b in problem.barriers))
-    return " at the start" if {str(s) for s in used} - set(problem.plane or ()) else ""
+    return (
+        "\n(safe set as at the start)" if {str(s) for s in used} - set(problem.plane or ()) else ""
+    )
 
 
 def _safe_function(

@@ -18,12 +18,11 @@ from safe_envs.scripts.figures.labels import labelled, mathematics, plain, symbo
 from safe_envs.scripts.figures.saving import save
 from safe_envs.scripts.figures.style import (
     COLORS,
-    QUIET,
-    SMALL,
     STYLE,
     WARM,
     add_legend,
     add_title,
+    wrapped,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.scripts.reports.identify_answer import Function, IdentifyAnswer
@@ -38,9 +37,11 @@ _ACROSS = {"single": 2, "double": 4}
 _SAMPLES = 20_000
 _CONSTANT = 1e-9
 _AROUND = 0.1
-_HEADROOM = 1.3
 _HIGHEST = 3.0
 """In inches, of a panel."""
+
+_TITLE = 0.2
+"""In inches, of a line of a title."""
 
 _TINY, _HUGE = 0.02, 2e4
 
@@ -86,12 +87,17 @@ def figure_of(found: IdentifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
     down = max(math.ceil(count / _ACROSS[size]), 1)
     across = max(math.ceil(count / down), 1)
     with mpl.rc_context(STYLE):
-        side = min(width / across + 0.2, _HIGHEST)
-        figure = Figure(figsize=(width, 0.9 + side * down))
+        side = min(width / across, _HIGHEST)
+        figure = Figure(figsize=(width, 1.0 + side * down))
         axes = list(figure.subplots(down, across, squeeze=False).flat)
+        tallest = 0
         handles: dict[Line2D | Patch, None] = {}
         for panel, function in zip(axes, shown, strict=False):
             handles |= dict.fromkeys([_draw_function(panel, function), _TRUTH_HANDLE])
+            # In as many lines as it takes.
+            title = wrapped(figure, panel.get_title(), mpl.rcParams["axes.titlesize"], side - 0.1)
+            panel.set_title(title)
+            tallest = max(tallest, title.count("\n") - 1)
         for panel, (index, function) in zip(axes[len(shown) :], levels.values(), strict=False):
             _draw_level(panel, found, index, function)
             handles |= dict.fromkeys([_SAMPLES_HANDLE, _TRUTH_HANDLE])
@@ -99,6 +105,7 @@ def figure_of(found: IdentifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
             panel.axis("off")
         if not count:
             axes[0].text(0.5, 0.5, "There is nothing to compare.", ha="center", va="center")
+        figure.set_figheight(1.0 + (side + _TITLE * tallest) * down)
         if handles:
             add_legend(figure, list(handles))
         left = (
@@ -141,22 +148,19 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
         The handle for the legend.
     """
     off = "truth 0" if function.relative is None else f"error {relative_text(function.relative)}"
-    axes.set_title(f"{function_symbol(function.name)}\n{off}")
+    lines = [function_symbol(function.name), off]
     power = _power(np.concatenate([function.truth, function.estimate]))
     truth, estimate = function.truth / 10.0**power, function.estimate / 10.0**power
     alone = _constant(truth) and _constant(estimate)
     if _constant(truth):
-        numbers = f"{_range('truth', function.truth)}\n{_range('estimate', function.estimate)}"
-        axes.text(
-            0.04, 0.97, numbers, transform=axes.transAxes, va="top", fontsize=SMALL, color=QUIET
-        )
+        lines += [_range("truth", function.truth), _range("estimate", function.estimate)]
+    axes.set_title("\n".join(lines))
     if _constant(truth) and not alone:
         axes.hist(estimate, bins=30, color=COLORS[0], alpha=0.6)
-        axes.axvline(truth[0], ymax=1.0 / _HEADROOM, color=_TRUTH, linewidth=1.1)
+        axes.axvline(truth[0], color=_TRUTH, linewidth=1.1)
         axes.set(
             xlabel=_label("estimate", function.unit, power),
             ylabel="states",
-            ylim=(0.0, _HEADROOM * axes.get_ylim()[1]),
         )
         _tidy(axes)
         return _COUNTS_HANDLE
@@ -212,7 +216,7 @@ def _draw_level(axes: Axes, found: IdentifyAnswer, index: int, function: Functio
 def _tidy(axes: Axes) -> None:
     """Make a panel square, with few ticks, so that long numbers do not overlap."""
     axes.set_box_aspect(1)
-    axes.xaxis.set_major_locator(MaxNLocator(3))
+    axes.xaxis.set_major_locator(MaxNLocator(2))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.ticklabel_format(style="plain", useOffset=False)
 
@@ -241,7 +245,7 @@ def function_symbol(name: str) -> str:
     """
     match = _OF.fullmatch(name)
     if match is None:
-        return plain(name)
+        return " ".join(symbol(word) for word in name.split())
     states = ", ".join(symbol(each) for each in match[2].split(", "))
     return f"{symbol(match[1])} of {states}"
 

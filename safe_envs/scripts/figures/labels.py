@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+
+import sympy as sp
 
 from safe_envs.errors import shortened
 from safe_envs.wrappers.decision_log.columns import printable
@@ -17,6 +20,7 @@ _GREEK = frozenset(
 _ACCENTS = ("ddot", "dot", "hat", "bar", "tilde")
 _NAME = re.compile(r"([A-Za-z]+?)(\d*)((?:_[A-Za-z0-9]+)*)")
 _ASSIGNED = re.compile(r"\b[A-Za-z]\w*(?= = )")
+_MEASURED = re.compile(r"(?<=\d) (?=[A-Za-z%]\b)")
 _FACTOR = re.compile(r"(?:√|sqrt)\(?([A-Za-z]+)\)?|([A-Za-z]+|1)(?:\^(-?\d+)|([²³]))?")
 _RAISED = {"²": "2", "³": "3"}
 
@@ -131,8 +135,23 @@ def quantity(name: str, unit: str = "") -> str:
     return labelled(symbol(name), unit)
 
 
+def expression(text: str, units: Mapping[str, str]) -> str:
+    """Return the label of an expression of states, such as a coordinate.
+
+    Args:
+        text: as SymPy prints it.
+        units: of the states, by name.
+    """
+    if text in units:
+        return quantity(text, units[text])
+    states = {name: sp.Symbol(name, real=True) for name in units}
+    parsed = sp.parse_expr(text, local_dict=dict(states))
+    names = {state: symbol(name).strip("$") for name, state in states.items()}
+    return f"${sp.latex(parsed, symbol_names=names)}$"
+
+
 def mathematics(text: str) -> str:
-    """Return a text in which names that are given values are mathematics.
+    """Return a text in which names that are given values are mathematics, and units stay at them.
 
     Args:
         text: such as "sigma_1 = 0.1, dt = 0.05 s".
@@ -140,4 +159,5 @@ def mathematics(text: str) -> str:
     Returns:
         The text, with mathtext.
     """
-    return _ASSIGNED.sub(lambda match: symbol(match.group()), text.replace("$", r"\$"))
+    joined = _MEASURED.sub("\u00a0", text.replace("$", r"\$"))
+    return _ASSIGNED.sub(lambda match: symbol(match.group()), joined)

@@ -178,7 +178,7 @@ class LogPanels:
             f"{end:.2g}" for end, cut in ((low, self._h < low), (high, self._h > high)) if cut.any()
         ]
         if cuts:
-            text = f"h cut off at {' and '.join(cuts)}"
+            text = f"$h$ cut off at {' and '.join(cuts)}"
             panel.set_title(text, loc="right", fontsize=SMALL, color=QUIET, pad=2)
 
     def _numbers(self, section: str) -> np.ndarray:

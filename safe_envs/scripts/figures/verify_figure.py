@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -16,6 +17,7 @@ from safe_envs.scripts.figures.saving import save
 from safe_envs.scripts.figures.style import (
     COLORS,
     DASHES,
+    QUIET,
     STYLE,
     UNSAFE,
     add_legend,
@@ -69,7 +71,7 @@ def figure_of(answer: VerifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
             lines = draw_slice(panels[0], answer)
         if several:
             draw_shares(figure, panels[1], answer)
-        add_legend(figure, _legend(answer))
+        add_legend(figure, _legend(answer, lines))
         title = plain(f"{answer.title}, {answer.filter_text}", 200)
         add_title(figure, f"{title}\n{mathematics(describe_system(problem))}")
         if lines is not None:
@@ -77,13 +79,16 @@ def figure_of(answer: VerifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
     return figure
 
 
-def _legend(answer: VerifyAnswer) -> list[Patch | Line2D]:
+def _legend(answer: VerifyAnswer, lines: ContourSet | None) -> list[Patch | Line2D]:
     found = answer.verification
     handles: list[Patch | Line2D] = []
     if found.safe_set.shortfall > 0.0 or answer.part.shortfall > 0.0:
         handles.append(Patch(color=INFEASIBLE, alpha=0.6, label="no action meets the condition"))
     handles.append(Patch(color=UNSAFE, alpha=0.5, label="unsafe"))
     handles.append(Line2D([], [], color="black", linewidth=1.1, label="$h = 0$"))
+    if lines is not None:
+        levels = ", ".join(f"{level:.3g}" for level in lines.levels)
+        handles.append(Line2D([], [], color=QUIET, linewidth=0.5, label=f"$h =$ {levels}"))
     degree = max(stage.stop - stage.start for stage in found.formulas.stages)
     handles += [
         Line2D([], [], color=COLORS[j - 1], linestyle=DASHES[j], label=f"$b_{j} = 0$")
