@@ -1,11 +1,9 @@
 """Gymnasium environments of safety-critical systems under uncertainty.
 
-Importing this package registers their ids. What is named here is imported when it is first used:
-ids, errors and completion in a shell need no symbolic algebra.
+Importing this package registers their ids, as soon as Gymnasium is imported too. What is named here
+is imported when it is first used: ids, errors and completion in a shell need no symbolic algebra.
 """
 
-from importlib import import_module
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from safe_envs.errors import (
@@ -17,7 +15,9 @@ from safe_envs.errors import (
     SystemDefinitionError,
     SystemDefinitionWarning,
 )
-from safe_envs.systems import ENV_IDS, register_all
+from safe_envs.gymnasium_ids import register_with_gymnasium
+from safe_envs.lazy_attributes import lazy_attributes
+from safe_envs.systems import ENV_IDS
 
 if TYPE_CHECKING:
     from safe_envs.dynamics.sde import ControlAffineSDE
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from safe_envs.scripts.figures.log_figure import plot_log
     from safe_envs.wrappers.decision_log import DecisionLog
     from safe_envs.wrappers.safety_filter import SafetyFilter
+
+    __version__: str
 
 __all__ = [
     "CLF",
@@ -54,32 +56,35 @@ __all__ = [
     "state_problem",
 ]
 
-__version__ = version("safe-envs")
-
 _MODULES = {
-    "Barrier": "problem.barrier",
-    "CLF": "problem.clf",
-    "ControlAffineSDE": "dynamics.sde",
-    "DecisionLog": "wrappers.decision_log",
-    "SafeEnv": "envs.env",
-    "SafeVectorEnv": "envs.vector_env",
-    "SafetyFilter": "wrappers.safety_filter",
-    "SafetyProblem": "problem.problem",
-    "plot_log": "scripts.figures.log_figure",
-    "register": "envs.custom",
-    "state_problem": "problem.builder",
+    "Barrier": "safe_envs.problem.barrier",
+    "CLF": "safe_envs.problem.clf",
+    "ControlAffineSDE": "safe_envs.dynamics.sde",
+    "DecisionLog": "safe_envs.wrappers.decision_log",
+    "SafeEnv": "safe_envs.envs.env",
+    "SafeVectorEnv": "safe_envs.envs.vector_env",
+    "SafetyFilter": "safe_envs.wrappers.safety_filter",
+    "SafetyProblem": "safe_envs.problem.problem",
+    "plot_log": "safe_envs.scripts.figures.log_figure",
+    "register": "safe_envs.envs.custom",
+    "state_problem": "safe_envs.problem.builder",
 }
 
 
+_find, __dir__ = lazy_attributes(__name__, _MODULES, globals())
+
+
 def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
-    return found
+    return _version() if name == "__version__" else _find(name)
 
 
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("safe-envs")
+    except PackageNotFoundError:  # a checkout on PYTHONPATH that is not installed
+        return "0+unknown"
 
 
-register_all()
+register_with_gymnasium()

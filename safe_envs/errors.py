@@ -66,15 +66,27 @@ def shortened(given: Any, most: int = 120) -> str:
     return f"{text[:half]}...({len(text) - 2 * half} more characters)...{text[-half:]}"
 
 
+_FEW = 6
+"""So many allowed names are listed in full, of more of them the nearest three."""
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """Return a phrase that lists the allowed names, the nearest one to `name` first.
+    """Return a phrase that helps to find the allowed name that was meant.
 
     Args:
         name: what was given.
         allowed: names.
+
+    Returns:
+        The nearest name, and the others: all where they are few, else the next two.
     """
     names = list(allowed)
-    close = difflib.get_close_matches(shortened(name), names, n=1, cutoff=0.4)
+    close = difflib.get_close_matches(shortened(name), names, n=3, cutoff=0.4)
+    if len(names) > _FEW:
+        if close:
+            others = f" (or {', '.join(close[1:])})" if close[1:] else ""
+            return f"did you mean {close[0]!r}?{others}"
+        return f"allowed: {', '.join(names[:3])} and {len(names) - 3} more"
     listing = ", ".join(names) if names else "none"
     return f"did you mean {close[0]!r}? (allowed: {listing})" if close else f"allowed: {listing}"
 

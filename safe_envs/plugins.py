@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import sys
-from importlib.metadata import EntryPoints, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoints
 
 CONDITIONS = "safe_envs.conditions"
 POLICIES = "safe_envs.policies"
@@ -22,6 +24,9 @@ def declared(group: str) -> EntryPoints:
 # Every reading of a filter's text asks for the names, and to look through packages takes long.
 @functools.lru_cache(maxsize=16)
 def _on_path(group: str, path: tuple[str, ...]) -> EntryPoints:
+    # It takes as long to import as the rest of a command that prints its help.
+    from importlib.metadata import entry_points
+
     return entry_points(group=group)
 
 

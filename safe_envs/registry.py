@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
-from gymnasium.envs.registration import load_env_creator
-
-from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, nearest, shown
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
+
+if TYPE_CHECKING:
+    from safe_envs.envs.system_env import SystemEnv
+    from safe_envs.problem.problem import SafetyProblem
 
 
 def full_id(env_id: str) -> str:
@@ -23,10 +22,18 @@ def full_id(env_id: str) -> str:
     if not isinstance(env_id, str):
         raise ConfigurationError(f"env_id = {shown(env_id)}; give the id of an env as text")
     for candidate in (env_id, f"safe_envs/{env_id}"):
+        if candidate in ENV_IDS:
+            return candidate
+    # Gymnasium takes longer to import than all that a command needs up to here.
+    import gymnasium as gym
+
+    for candidate in (env_id, f"safe_envs/{env_id}"):
         if candidate in gym.registry:
             return candidate
     name = env_id if "/" in env_id else f"safe_envs/{env_id.removesuffix('-v0')}-v0"
-    raise ConfigurationError(f"unknown env {shown(env_id)}; {nearest(name, ENV_IDS)}")
+    raise ConfigurationError(
+        f"unknown env {shown(env_id)}; {nearest(name, ENV_IDS)}; `safe-envs list` shows all"
+    )
 
 
 def which_env(env_id: str | None, system: str | None) -> str:
@@ -63,13 +70,18 @@ def env_class(env_id: str) -> type[SystemEnv]:
     Raises:
         ConfigurationError: The id is unknown or not of this project.
     """
+    import gymnasium as gym
+    from gymnasium.envs.registration import load_env_creator
+
+    from safe_envs.envs.system_env import SystemEnv
+
     entry_point = gym.spec(full_id(env_id)).entry_point
     creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     if not (isinstance(creator, type) and issubclass(creator, SystemEnv)):
         raise ConfigurationError(
             f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id}"
-            " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium's. For an env of"
-            f" this project: {nearest(env_id, ENV_IDS)}"
+            " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium's. For the envs of"
+            f" this project: `safe-envs list`, such as {ENV_IDS[0]}"
         )
     return creator
 
@@ -86,6 +98,8 @@ def make_problem(env_id: str, **options: Any) -> SafetyProblem:
     Raises:
         ConfigurationError: The id is unknown or not of this project, or an option is not allowed.
     """
+    import gymnasium as gym
+
     found = env_class(env_id)
     if options.get("max_episode_steps") is not None:
         raise ConfigurationError(

@@ -8,17 +8,41 @@ import re
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import sympy as sp
+from formulas import with_latex, with_set_units
 from navigation import short_name
 from PIL import Image
 
 from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.agents import NominalController
 from safe_envs.dynamics.lie import relative_degree
+from safe_envs.rendering.style import PANEL, SCENE
 from safe_envs.wrappers import SafetyFilterWrapper
 
 _SHOWN, _MOST_STEPS = 0.4, 400
 """Fraction of an episode after which the picture is taken, and the most steps until then."""
+
+_TITLES = {
+    "DubinsDisk": "Dubins vehicle in a disk",
+    "DubinsObstacle": "Dubins vehicle and a moving obstacle",
+    "DubinsObstacles": "Dubins vehicle among moving obstacles",
+    "DubinsReach": "Dubins vehicle on its way to a goal",
+    "StochasticDubins": "Dubins vehicle with noise",
+    "QuadrotorAltitude": "Quadrotor: altitude",
+    "Quadrotor": "Quadrotor with twelve states",
+    "QuadrotorLimits": "Quadrotor: altitude and tilt limits",
+    "ACC": "Adaptive cruise control: headway",
+    "ACCGap": "Adaptive cruise control: distance",
+    "Pendulum": "Inverted pendulum",
+    "CubicSDE": "Cubic stochastic differential equation in a parabola",
+    "CubicSDEDisk": "Cubic stochastic differential equation in a disk",
+    "Scalar": "Scalar stochastic differential equation",
+}
+"""Full names for titles; an env without one is titled by its id."""
+
+_THESIS = re.compile(r"\b([Tt])hesis(?= (?:Sec|Eq)\.)")
+_EQUATIONS = "## Equations\n"
 
 _HEADER = (
     "| env | task and safety constraint | states | inputs | degree | filter"
@@ -37,8 +61,10 @@ def env_pages() -> dict[str, str | bytes]:
         name = short_name(env_id)
         env: Any = gym.make(env_id, render_mode="rgb_array")
         problem, (summary, text) = env.unwrapped.problem, _docstring(env)
-        pages[f"envs/{name}.md"] = _page(env_id, problem, summary, text)
-        pages[f"envs/{name}.png"] = _picture(env)
+        frame, caption = _picture(env)
+        pages[f"envs/{name}.png"] = _written(frame)
+        pages[f"envs/{name}-narrow.png"] = _written(_stacked(frame))
+        pages[f"envs/{name}.md"] = _page(env_id, problem, summary, text, caption)
         rows.append(_row(name, problem, summary))
         env.close()
     pages["envs/table.md"] = "\n".join([_HEADER, *rows])
@@ -51,38 +77,52 @@ def _docstring(env: Any) -> tuple[str, str]:
     return summary, text.strip()
 
 
-def _page(env_id: str, problem: SafetyProblem, summary: str, text: str) -> str:
+def _page(env_id: str, problem: SafetyProblem, summary: str, text: str, caption: str) -> str:
     name = short_name(env_id)
-    before, states, after = text.partition("## States\n")
-    return f"""# {name}
+    # Docstrings state the equations for a terminal; here they come from the symbols.
+    before, _, after = text.partition(_EQUATIONS)
+    after = re.sub(r"\A(?:    .*\n)+", "", after)
+    text = "".join([_set(before), _EQUATIONS, _equations(problem), _set(after)])
+    return f"""# {_title(name)}
 
 {summary}
 
-![{name} under its filter](./{name}.png)
+<picture>
+  <source srcset="{name}-narrow.png" media="(max-width: 600px)">
+  <img src="{name}.png" alt="{name}: the scene, the actions and h over time">
+</picture>
 
-*The nominal controller under [`{problem.filter}`](../filters/{problem.filter}.md), seed 0.*
+*{caption}*
 
 ```python
 env = gym.make("{env_id}")
 ```
 
-Control period {problem.dt:g} s, horizon {problem.horizon:g} s. Relative degree {_degrees(problem)}.
-Gains {_gains(problem)}, default filter [`{problem.filter}`](../filters/{problem.filter}.md).
+{_defaults(problem)}
 
-{before}
-The plant and the barriers, as simulated:
-
-{_equations(problem)}
-
-{states}{after}
+{text}
 """
 
 
+def _defaults(problem: SafetyProblem) -> str:
+    return (
+        f"Control period {problem.dt:g} s, horizon {problem.horizon:g} s, relative degree"
+        f" {_degrees(problem)}, gains {_gains(problem)}, default filter {_link(problem)}."
+    )
+
+
+def _title(name: str) -> str:
+    return f"{_TITLES[name]} ({name})" if name in _TITLES else name
+
+
+def _link(problem: SafetyProblem) -> str:
+    return f"[`{problem.filter}`](../filters/{problem.filter}.md)"
+
+
 def _row(name: str, problem: SafetyProblem, summary: str) -> str:
-    filter_name = f"[`{problem.filter}`](../filters/{problem.filter}.md)"
     return (
         f"| [{name}]({name}.md) | {summary} | {problem.plant.n} | {problem.plant.m} |"
-        f" {_degrees(problem)} | {filter_name} |"
+        f" {_degrees(problem)} | {_link(problem)} |"
     )
 
 
@@ -102,9 +142,10 @@ def _gains(problem: SafetyProblem) -> str:
 
 
 def _equations(problem: SafetyProblem) -> str:
-    """Return Markdown with the plant, a line for each state, and the barriers."""
+    """Return Markdown with the equations of the plant, one for each state."""
     plant = problem.plant
-    drift = plant.drift + plant.input_matrix * sp.Matrix(plant.inputs)
+    inputs = plant.input_matrix * sp.Matrix(plant.inputs)
+    drift = plant.drift.applyfunc(_shortest) + inputs.applyfunc(_shortest)
     noise = [f"dW_{{{j + 1}}}" for j in range(plant.diffusion.shape[1])]
     found = []
     for i, state in enumerate(plant.states):
@@ -115,7 +156,6 @@ def _equations(problem: SafetyProblem) -> str:
             if level != 0
         ]
         found.append(f"d{_latex(state)} = {' + '.join(terms) or '0'}")
-    found += [f"{_name(b.name)} = {_latex(b.expression)}" for b in problem.barriers]
     return "\n".join(f"$$\n{equation}\n$$\n" for equation in found)
 
 
@@ -135,21 +175,54 @@ def _factor(expression: Any) -> str:
     return f"\\left({_latex(expression)}\\right)" if expression.is_Add else _latex(expression)
 
 
-def _name(text: str) -> str:
-    return _latex(sp.Symbol(text)) if len(text) < 4 else f"h_{{\\text{{{text}}}}}"
+def _shortest(expression: Any) -> Any:
+    """Return the form with the fewest symbols: a sum, or with common factors taken out."""
+    forms = [expression, sp.factor_terms(expression), sp.factor(expression)]
+    return min(forms, key=lambda form: sum(1 for _ in sp.preorder_traversal(form)))
 
 
-def _picture(env: Any) -> bytes:
-    """Return a frame of an episode under the env's default filter."""
+def _set(text: str) -> str:
+    """Return text of a docstring with its formulas and units set, and links to the thesis."""
+    parts = re.split(r"(\$\$[^$]+\$\$|\$[^$]+\$|`[^`]+`)", text)
+    parts[::2] = [
+        _THESIS.sub(r"[\1hesis](../citing.md#the-thesis)", with_set_units(p)) for p in parts[::2]
+    ]
+    return with_latex("".join(parts))
+
+
+def _picture(env: Any) -> tuple[np.ndarray, str]:
+    """Return a frame of an episode under the env's default filter, and its caption."""
     problem = env.unwrapped.problem
     filtered: Any = SafetyFilterWrapper(env, problem.filter)
     policy = NominalController(problem)
-    observation, _ = filtered.reset(seed=0)
+    observation, info = filtered.reset(seed=0)
+    count = 0
     for _ in range(min(int(_SHOWN * problem.steps), _MOST_STEPS)):
         action, _ = policy.predict(observation)
-        observation, _, terminated, truncated, _ = filtered.step(action)
+        observation, _, terminated, truncated, info = filtered.step(action)
+        count += 1
         if terminated or truncated:
             break
+    mismatch = problem.plant.parameters != problem.model.parameters
+    why = ": the model differs from the plant, see [Mismatch](#mismatch)" if mismatch else ""
+    seen = f" The minimum of $h$ so far is {info['h_min']:.3g}{why}." if info["h_min"] < 0 else ""
+    return filtered.render(), (
+        f"The nominal controller under {_link(problem)} after {count * problem.dt:g} s, seed 0."
+        " Green: the safe set; hatched: $h < 0$. The panel shows the executed action (bar), the"
+        f" nominal action (diamond), and $h$ over time.{seen}"
+    )
+
+
+def _stacked(frame: np.ndarray) -> np.ndarray:
+    """Return a frame with its panel below the scene, for narrow screens."""
+    width = round(SCENE[2])
+    scene, panel = frame[:, :width], frame[:, width:]
+    rest = np.full((len(panel), width - panel.shape[1], 3), PANEL, dtype=np.uint8)
+    half = rest.shape[1] // 2
+    return np.vstack([scene, np.hstack([rest[:, :half], panel, rest[:, half:]])])
+
+
+def _written(frame: np.ndarray) -> bytes:
     written = io.BytesIO()
-    Image.fromarray(filtered.render()).save(written, "PNG", optimize=True)
+    Image.fromarray(frame).save(written, "PNG", optimize=True)
     return written.getvalue()

@@ -81,4 +81,7 @@ def _output(output: Any) -> tuple[str, bytes | None]:
     data = output.get("data", {})
     if "image/png" in data:
         return "", base64.b64decode(data["image/png"])
+    html = data.get("text/html", "")
+    if html and "<script" not in html:
+        return html, None
     return f"```text\n{data.get('text/plain', '')}\n```", None

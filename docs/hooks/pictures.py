@@ -25,6 +25,9 @@ from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
 
+WIDE, NARROW = (1, 2), (2, 1)
+"""Rows and columns of a picture with two parts, on a desktop and on a phone."""
+
 _GRID = 241
 _EPISODES = 1000
 _HORIZON = 10.0
@@ -35,8 +38,10 @@ def pictures() -> dict[str, bytes]:
     """Return PNG files by path."""
     with mpl.rc_context(STYLE):
         return {
-            "assets/chain.png": _written(_chain()),
-            "assets/qp.png": _written(_qp()),
+            "assets/chain.png": _written(_chain(WIDE)),
+            "assets/chain-narrow.png": _written(_chain(NARROW)),
+            "assets/qp.png": _written(_qp(WIDE)),
+            "assets/qp-narrow.png": _written(_qp(NARROW)),
             "assets/bounds.png": _written(_bounds()),
             "assets/control-loop.png": _written(_control_loop()),
         }
@@ -53,11 +58,15 @@ def _problem(env_id: str) -> SafetyProblem:
     return env.unwrapped.problem
 
 
-def _chain() -> Figure:
+def _sheet(layout: tuple[int, int]) -> Figure:
+    return Figure(figsize=(10, 4.5) if layout == WIDE else (5, 9.2))
+
+
+def _chain(layout: tuple[int, int]) -> Figure:
     """Draw C_0, C_1 and the infeasible states of a Dubins vehicle that heads to the right."""
     problem = _problem("safe_envs/StochasticDubins-v0")
-    figure = Figure(figsize=(10, 4.4))
-    for axes, name in zip(figure.subplots(1, 2), ("hocbf", "scbf"), strict=True):
+    figure = _sheet(layout)
+    for axes, name in zip(figure.subplots(*layout), ("hocbf", "scbf"), strict=True):
         safety_filter = SafetyFilter.for_problem(problem, name)
         x, y = np.meshgrid(*[np.linspace(-3.4, 3.4, _GRID)] * 2)
         states = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
@@ -77,8 +86,8 @@ def _chain() -> Figure:
         axes.text(0.0, -2.3, "heading", ha="center", color=QUIET)
         axes.set(
             aspect="equal",
-            xlabel="x (m)",
-            ylabel="y (m)",
+            xlabel="x [m]",
+            ylabel="y [m]",
             title=_title(name, infeasible.sum(), ((h > 0) & (b_1 > 0)).sum()),
         )
     figure.legend(
@@ -90,7 +99,7 @@ def _chain() -> Figure:
             Patch(color=COLORS[3], alpha=0.8, label="infeasible within the input bounds"),
         ],
         loc="outside lower center",
-        ncols=5,
+        ncols=5 if layout == WIDE else 2,
     )
     return figure
 
@@ -121,7 +130,7 @@ def _point() -> tuple[ControlAffineSDE, Barrier]:
     return system, Barrier(x**2 + y**2 - 1)
 
 
-def _qp() -> Figure:
+def _qp(layout: tuple[int, int]) -> Figure:
     """Draw the QP of a filter in the plane of two inputs, at a feasible and an infeasible state."""
     system, barrier = _point()
     safety_filter = SafetyFilter(system, [(barrier, HOCBF((2.0, 2.0)))], bounds=[(-2.0, 2.0)] * 2)
@@ -130,15 +139,17 @@ def _qp() -> Figure:
         system.states, [*constraint.coefficient, constraint.offset], "floats"
     )
     nominal = np.array([1.5, -0.3])
-    figure = Figure(figsize=(10, 4.6))
-    for axes, speed in zip(figure.subplots(1, 2), (1.1, 2.2), strict=True):
+    figure = _sheet(layout)
+    for axes, speed in zip(figure.subplots(*layout), (1.1, 2.2), strict=True):
         state = np.array([-2.0, 0.4, speed, 0.0])
         result = safety_filter.filter(state, nominal)
         _draw_qp(axes, np.array(compiled(*state)), nominal, result)
         verdict = "feasible" if result.feasible else f"infeasible, slack {result.slack[0]:.2f}"
         axes.set_title(f"towards the obstacle at {speed:g} m/s: {verdict}")
     figure.legend(
-        handles=figure.axes[0].get_legend_handles_labels()[0], loc="outside lower center", ncols=3
+        handles=figure.axes[0].get_legend_handles_labels()[0],
+        loc="outside lower center",
+        ncols=3 if layout == WIDE else 2,
     )
     return figure
 
@@ -165,7 +176,7 @@ def _draw_qp(axes: Axes, constraint: np.ndarray, nominal: np.ndarray, result: An
         va="bottom",
         color=QUIET,
     )
-    axes.set(aspect="equal", xlabel="$a_x$ (m/s²)", ylabel="$a_y$ (m/s²)")
+    axes.set(aspect="equal", xlabel="$a_x$ [m/s²]", ylabel="$a_y$ [m/s²]")
 
 
 def _control_loop() -> Figure:
@@ -209,7 +220,7 @@ def _bounds() -> Figure:
     axes.set(
         xlim=(0.0, problem.horizon),
         ylim=(0.0, 1.02),
-        xlabel="horizon T (s)",
+        xlabel="horizon T [s]",
         ylabel="probability of no violation",
     )
     figure.legend(handles=axes.get_legend_handles_labels()[0], loc="outside lower center", ncols=2)

@@ -138,9 +138,11 @@ def _output(words: Sequence[str], fails: bool) -> str:
 
     from safe_envs.scripts.cli import app
     from safe_envs.scripts.options.console import run
+    from safe_envs.scripts.options.wrapping import as_on_a_terminal
 
     command, out, err, status = typer.main.get_command(app), io.StringIO(), io.StringIO(), 0
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+    with redirected[0], redirected[1], as_on_a_terminal():
         try:
             run(lambda: command.main(list(words[1:]), prog_name="safe-envs", standalone_mode=False))
         except SystemExit as end:

@@ -10,11 +10,8 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, named_values, numbers
-from safe_envs.validators import numbers_in
 
 Reader = Callable[[str, Any], Any]
 """From the name of an option and its text (texts, where it is repeatable) to its value."""
@@ -198,6 +195,11 @@ def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[st
     """
     if noise is None:
         return {}
+    # Not imported before it is needed: a command reads the options first.
+    import numpy as np
+
+    from safe_envs.validators import numbers_in
+
     names = problem.noise
     if not names:
         advice = (

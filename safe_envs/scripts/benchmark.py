@@ -10,13 +10,12 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.tables import print_rows
 
 _ADVICE = "give what `safe-envs benchmark --json FILE` wrote"
 
@@ -44,7 +43,7 @@ def benchmark(
         figures |= found
         _print(console, found, earlier)
     if sides := benchmark_figures.side_by_side(figures):
-        console.print(_engines(sides))
+        _print_engines(console, sides)
     write_result(json, lambda: figures)
 
 
@@ -54,9 +53,9 @@ def _print(console: Console, figures: Mapping[str, float], earlier: Mapping[str,
 
     # Tails have a table of their own, and stand in this one only to be compared.
     if any(name in earlier or not latency.is_latency(name) for name in figures):
-        console.print(_table(figures, earlier))
+        _print_figures(console, figures, earlier)
     if tails := latency.rows_of(figures):
-        console.print(_latency(tails))
+        _print_latency(console, tails)
     sys.stdout.flush()
 
 
@@ -78,8 +77,10 @@ def _read_figures(path: Path) -> dict[str, float]:
     return found
 
 
-def _table(figures: Mapping[str, float], earlier: Mapping[str, float]) -> Table:
-    """Return the figures, and where there are earlier ones, those and the ratio to them."""
+def _print_figures(
+    console: Console, figures: Mapping[str, float], earlier: Mapping[str, float]
+) -> None:
+    """Print the figures, and where there are earlier ones, those and the ratio to them."""
     from safe_envs.scripts.reports.benchmark_cases import NUM_ENVS
     from safe_envs.scripts.reports.latency import is_latency
 
@@ -88,33 +89,32 @@ def _table(figures: Mapping[str, float], earlier: Mapping[str, float]) -> Table:
         f" {NUM_ENVS}"
     )
     titles = ("figure", *["earlier", "figure / earlier"] * bool(earlier))
-    table = make_table("pr", first, *titles, tight=False)
+    rows = []
     for name, value in figures.items():
         if is_latency(name) and name not in earlier:
             continue
         before = earlier.get(name)
         ratio = ["-", "-"] if not before else [f"{before:.3g}", f"{value / before:.2f}"]
-        table.add_row(name, f"{value:.3g}", *ratio * bool(earlier))
-    return table
+        rows.append((name, f"{value:.3g}", *ratio * bool(earlier)))
+    print_rows(console, "pr", (first, *titles), rows)
 
 
-def _latency(tails: Mapping[str, Sequence[float]]) -> Table:
-    """Return the times of single decisions: the middle and the tail of their distribution."""
+def _print_latency(console: Console, tails: Mapping[str, Sequence[float]]) -> None:
+    """Print the times of single decisions: the middle and the tail of their distribution."""
     from safe_envs.scripts.reports.latency import COLUMNS
 
-    table = make_table("pr", "one decision, microseconds of processor time", *COLUMNS, tight=False)
-    for name, values in tails.items():
-        table.add_row(name, *(f"{value:.1f}" for value in values))
-    return table
+    titles = ("one decision, microseconds of processor time", *COLUMNS)
+    rows = [(name, *(f"{value:.1f}" for value in values)) for name, values in tails.items()]
+    print_rows(console, "pr", titles, rows)
 
 
-def _engines(sides: Mapping[str, tuple[float, float]]) -> Table:
-    """Return the speeds of the engines side by side."""
-    table = make_table("pr", "engines side by side", "numpy", "compiled", "ratio", tight=False)
-    for name, (numpy_engine, compiled) in sides.items():
-        ratio = compiled / numpy_engine
-        table.add_row(name, f"{numpy_engine:.3g}", f"{compiled:.3g}", f"{ratio:.2f}")
-    return table
+def _print_engines(console: Console, sides: Mapping[str, tuple[float, float]]) -> None:
+    """Print the speeds of the engines side by side."""
+    rows = [
+        (name, f"{numpy_engine:.3g}", f"{compiled:.3g}", f"{compiled / numpy_engine:.2f}")
+        for name, (numpy_engine, compiled) in sides.items()
+    ]
+    print_rows(console, "pr", ("engines side by side", "numpy", "compiled", "ratio"), rows)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import text_options, value_options
+from safe_envs.scripts.options import figure_options, text_options, value_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -20,7 +20,12 @@ def best(
     env: EnvOptions,
     leaving: value_options.Leaving = "violation",
     knowledge: Annotated[
-        str, typer.Option(metavar="plant|model", help="In whose world: the env's, or the model's.")
+        str,
+        typer.Option(
+            metavar="plant|model",
+            callback=text_options.KNOWLEDGE,
+            help="In whose world: the env's, or the model's.",
+        ),
     ] = "plant",
     cells: value_options.Cells = None,
     inputs: value_options.Inputs = None,
@@ -54,6 +59,7 @@ def best(
             help=f"Draw the value over the coordinates of the grid: {text_options.FORMATS}",
         ),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print how safe any policy can be from the env's starts, and how safe a greedy policy is.
 
@@ -75,6 +81,7 @@ def best(
     require_whole("seed", seed, 0)
     reads = [*text_options.inputs_of(env.system), *([("--table", table)] if table else [])]
     text_options.require_outputs(json, plot, inputs=reads)
+    figure_options.width_of(size)
     if table is not None:
         require_writable(table)
     settings = ValueSettings(
@@ -100,7 +107,7 @@ def best(
     if plot is not None:
         from safe_envs.scripts.figures.best_figure import draw
 
-        draw(answer, policy.table, plot)
+        draw(answer, policy.table, plot, size)
 
 
 if __name__ == "__main__":

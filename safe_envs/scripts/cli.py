@@ -2,50 +2,125 @@
 
 from __future__ import annotations
 
-from safe_envs.scripts.benchmark import benchmark
-from safe_envs.scripts.best import best
-from safe_envs.scripts.certify import certify
-from safe_envs.scripts.check import check
-from safe_envs.scripts.demo import demo
-from safe_envs.scripts.doctor import doctor
-from safe_envs.scripts.evaluate import evaluate
-from safe_envs.scripts.export import export
-from safe_envs.scripts.frontier import frontier
-from safe_envs.scripts.identify import identify
-from safe_envs.scripts.leaderboard import leaderboard
-from safe_envs.scripts.listing import list_envs
-from safe_envs.scripts.options.app import make_app, run_app
-from safe_envs.scripts.render import render
-from safe_envs.scripts.reproduce.command import reproduce
-from safe_envs.scripts.study import study
-from safe_envs.scripts.sweep import sweep
-from safe_envs.scripts.sweep_report import sweep_report
-from safe_envs.scripts.train import train
-from safe_envs.scripts.verify import verify
+from safe_envs.scripts.options.app import CommandEntry, make_app, run_app
 
-app = make_app(
-    {
-        "evaluate": evaluate,
-        "identify": identify,
-        "train": train,
-        "leaderboard": leaderboard,
-        "study": study,
-        "best": best,
-        "verify": verify,
-        "certify": certify,
-        "check": check,
-        "frontier": frontier,
-        "export": export,
-        "render": render,
-        "reproduce": reproduce,
-        "sweep": sweep,
-        "sweep-report": sweep_report,
-        "list": list_envs,
-        "doctor": doctor,
-        "demo": demo,
-        "benchmark": benchmark,
-    }
+_EVALUATE = "Evaluate and train"
+_PROVE = "Prove and bound"
+_SHOW = "Use, show and reproduce"
+_TOOLS = "Tools"
+
+COMMANDS = tuple(
+    CommandEntry(name, panel, f"safe_envs.scripts.{place}", about)
+    for name, panel, place, about in (
+        (
+            "evaluate",
+            _EVALUATE,
+            "evaluate:evaluate",
+            "Print the safety rate of a policy under each filter, and compare the filters in"
+            " pairs.",
+        ),
+        (
+            "identify",
+            _EVALUATE,
+            "identify:identify",
+            "Learn of a system by a method, and print how far what was learned is from the truth.",
+        ),
+        (
+            "train",
+            _EVALUATE,
+            "train:train",
+            "Train an agent, evaluate it on the way, and keep the last and the best policy.",
+        ),
+        (
+            "leaderboard",
+            _EVALUATE,
+            "leaderboard:leaderboard",
+            "Train agents on envs, with and without filters, and compare safety, return and cost.",
+        ),
+        (
+            "study",
+            _EVALUATE,
+            "study:study",
+            "Train the agents of a study with several seeds, and compare them with and without"
+            " filters.",
+        ),
+        (
+            "sweep",
+            _EVALUATE,
+            "sweep:sweep",
+            "Evaluate each cell of a sweep: one env, filter, policy, seed and set of parameters.",
+        ),
+        (
+            "sweep-report",
+            _EVALUATE,
+            "sweep_report:sweep_report",
+            "Draw the safety rates of a sweep with 95 % bands, and list its worst and its failed"
+            " cells.",
+        ),
+        (
+            "best",
+            _PROVE,
+            "best:best",
+            "Print how safe any policy can be from the env's starts, and how safe a greedy policy"
+            " is.",
+        ),
+        (
+            "verify",
+            _PROVE,
+            "verify:verify",
+            "Print where a filter's conditions cannot be met, and its bounds next to a simulation.",
+        ),
+        (
+            "certify",
+            _PROVE,
+            "certify:certify",
+            "Look for a polynomial psi that bounds how safe episodes are, and prove the bound.",
+        ),
+        (
+            "check",
+            _PROVE,
+            "check:check",
+            "Check the certificate in a file: what it states, and whether that is so.",
+        ),
+        (
+            "frontier",
+            _PROVE,
+            "frontier:frontier",
+            "Print the largest returns that can be had at each risk, next to those of filters.",
+        ),
+        (
+            "export",
+            _SHOW,
+            "export:export",
+            "Write a filter as C99: filter.h, filter.c, a self-test, CMakeLists.txt and README.md.",
+        ),
+        (
+            "render",
+            _SHOW,
+            "render:render",
+            "Draw an episode: the scene to scale, the safe set, the trail, and the filtered"
+            " actions.",
+        ),
+        (
+            "reproduce",
+            _SHOW,
+            "reproduce.command:reproduce",
+            "Compute the tables and figures of the thesis, and compare them with the printed ones.",
+        ),
+        (
+            "demo",
+            _SHOW,
+            "demo:demo",
+            "Train PPO briefly without a filter, then compare it with the nominal controller.",
+        ),
+        ("list", _TOOLS, "listing:list_envs", "List the registered envs."),
+        ("doctor", _TOOLS, "doctor:doctor", "Check the installation."),
+        ("benchmark", _TOOLS, "benchmark:benchmark", "Measure the speed of filters and envs."),
+    )
 )
+"""All commands, in the order of the help."""
+
+app = make_app(COMMANDS)
 
 
 def main() -> None:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import evaluation_options as of
-from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options import figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.options.text_results import write_text_result
+
+if TYPE_CHECKING:
+    from safe_envs.agents.evaluation.results import Evaluation
 
 
 @with_env
@@ -39,8 +43,11 @@ def evaluate(
     jobs: of.Jobs = None,
     engine: text_options.Engine = "auto",
     json: of.JsonOut = None,
+    latex: of.Latex = None,
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
+    timing: of.Timing = False,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print the safety rate of a policy under each filter, and compare the filters in pairs.
 
@@ -54,7 +61,8 @@ def evaluate(
     Monte Carlo would need. For the columns see `docs/guides/evaluate.md`.
     """
     reads = text_options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec)
-    text_options.require_outputs(json, plot, episodes_out=episodes_out, inputs=reads)
+    text_options.require_outputs(json, plot, episodes_out=episodes_out, latex=latex, inputs=reads)
+    figure_options.width_of(size)
     common: dict[str, Any] = {
         "filters": list(dict.fromkeys(filters)) if filters else None,
         "trust": trust,
@@ -72,6 +80,7 @@ def evaluate(
             "--filter-spec": filter_spec,
             "--refine": refine,
             "--plot": plot,
+            "--latex": latex,
             "--best": best,
             "--closed-loop": closed_loop,
             "--policy best": policy == "best",
@@ -82,7 +91,7 @@ def evaluate(
             "--num-envs": num_envs is not None,
         }
         sizes = {"particles": particles, "repetitions": repetitions}
-        _evaluate_rare(json, refused, env.full_id, policy, common | _given(sizes))
+        _evaluate_rare((json, timing), refused, env.full_id, policy, common | _given(sizes))
         return
     if particles is not None or repetitions is not None:
         raise ConfigurationError(
@@ -95,38 +104,40 @@ def evaluate(
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id
-    _evaluate(problem, policy, refine, (json, plot), common)
+    found = _evaluate(problem, policy, refine, (json, timing), common)
+    write_text_result(latex, found.to_latex)
+    if plot is not None:
+        from safe_envs.scripts.figures.evaluation_figure import draw
+
+        draw(found, plot, size)
 
 
 def _evaluate(
     problem: Any,
     policy: str,
     refine: bool,
-    outputs: tuple[Path | None, Path | None],
+    outputs: tuple[Path | None, bool],
     arguments: dict[str, Any],
-) -> None:
-    """Evaluate, print and write."""
+) -> Evaluation:
+    """Evaluate, print and write, and return what was found with the control period as given."""
     from safe_envs.agents.evaluation import evaluate, refinement
     from safe_envs.scripts.reports.evaluation_report import print_evaluation, print_refinement
 
-    json, plot = outputs
+    json, timing = outputs
     found: Any
     with progress_bar("Evaluating") as progress:
         run: Any = refinement.refine if refine else evaluate.evaluate
         found = run(problem, policy, progress=progress, **arguments)
     first = found.evaluations[0] if refine else found
-    print_evaluation(stdout(), first)
+    print_evaluation(stdout(), first, timing)
     if refine:
         print_refinement(stdout(), found)
     write_result(json, found.document)
-    if plot is not None:
-        from safe_envs.scripts.figures.evaluation_figure import draw
-
-        draw(first, plot)
+    return first
 
 
 def _evaluate_rare(
-    json: Path | None,
+    outputs: tuple[Path | None, bool],
     refused: Mapping[str, Any],
     problem: Any,
     policy: str,
@@ -147,7 +158,8 @@ def _evaluate_rare(
         )
     with progress_bar("Splitting") as progress:
         found = estimate_rare(problem, policy, progress=progress, **arguments)
-    print_rare(stdout(), found)
+    json, timing = outputs
+    print_rare(stdout(), found, timing)
     write_result(json, found.document)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -33,13 +33,19 @@ def export(
         typer.Option(
             "--filter",
             metavar="NAME",
+            callback=early_checks.known_filter,
             autocompletion=completion.filters,
             help="As for evaluate: hocbf:p=2,8, promise:p=0.99, ... By default the env's own.",
         ),
     ] = None,
     knowledge: text_options.Knowledge = "model",
     objective: Annotated[
-        str, typer.Option(metavar="nearest|clf", help="To the proposed input, or the env's goal.")
+        str,
+        typer.Option(
+            metavar="nearest|clf",
+            callback=early_checks.one_of("objective", ("nearest", "clf")),
+            help="To the proposed input, or the env's goal.",
+        ),
     ] = "nearest",
     float32: Annotated[
         bool, typer.Option("--float32", help="Compute in single precision.")

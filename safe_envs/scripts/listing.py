@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, stdout, write_result
-from safe_envs.scripts.reports.tables import make_table
 from safe_envs.systems import ENV_IDS
 
 if TYPE_CHECKING:
@@ -17,20 +16,24 @@ _COLUMNS = ("states", "inputs", "degree", "filter", "noise", "dt", "horizon")
 
 def list_envs(json: Json = None) -> None:
     """List the registered envs."""
-    from rich.markup import escape
+    from rich.text import Text
 
     from safe_envs.registry import env_class, make_problem
+    from safe_envs.scripts.reports.tables import print_columns
+    from safe_envs.text_tables import Column
 
     require_result(json)
-    table = make_table("pl", "id, and what is to be kept safe", *_COLUMNS)
-    table.columns[0].max_width = 50
     rows = []
     for env_id in ENV_IDS:
         about = " ".join((env_class(env_id).__doc__ or "").strip().partition("\n\n")[0].split())
         rows.append({"env_id": env_id, "about": about, **_defaults(make_problem(env_id))})
-        cells = [_cell(name, rows[-1][name]) for name in _COLUMNS]
-        table.add_row(f"[bold]{env_id}[/]\n{escape(about)}\n", *cells)
-    stdout().print(table)
+    ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")
+    abouts = Column("what is to be kept safe", tuple(row["about"] for row in rows), "p")
+    settings = [
+        Column(name, tuple(_cell(name, row[name]) for row in rows), "l", part=1 + (i > 2))
+        for i, name in enumerate(_COLUMNS)
+    ]
+    print_columns(stdout(), [ids], [abouts, *settings])
     write_result(json, lambda: {"envs": rows})
 
 

@@ -12,7 +12,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
-from safe_envs.scripts.options import evaluation_options, text_options
+from safe_envs.scripts.options import early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -39,6 +39,7 @@ def render(
         typer.Option(
             "--filter",
             metavar="NAME",
+            callback=early_checks.known_filter,
             help="As for evaluate: none, scbf, hocbf:p=2,8, ... By default the env's own.",
         ),
     ] = None,

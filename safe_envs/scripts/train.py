@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -25,6 +25,7 @@ def train(
         typer.Option(
             metavar="NAME",
             autocompletion=completion.algorithms,
+            callback=early_checks.known_algorithm,
             help="ppo, a2c, sac or td3; with a limit on violations ppo-lag or sac-lag.",
         ),
     ],
@@ -40,6 +41,7 @@ def train(
         typer.Option(
             "--filter",
             metavar="NAME",
+            callback=early_checks.known_filters,
             autocompletion=completion.filters,
             help=(
                 "Filter in the loop; none by default. A learned one with its file:"
@@ -173,7 +175,7 @@ def train(
         threads=threads,
         engine=engine,
     )
-    from safe_envs.agents.policies.base import POLICY_FILE
+    from safe_envs.agents.policies.names import POLICY_FILE
     from safe_envs.agents.training.trainer import train as train_agent
 
     # The policy itself is written at the very end.

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options import completion, early_checks, figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -22,6 +22,7 @@ def verify(
         typer.Option(
             "--filter",
             metavar="NAME",
+            callback=early_checks.known_filter,
             autocompletion=completion.filters,
             help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own.",
         ),
@@ -31,6 +32,7 @@ def verify(
         str,
         typer.Option(
             metavar="NAME|FOLDER|FILE",
+            callback=early_checks.known_policy,
             autocompletion=completion.policies,
             help="Who acts in the simulation, as for evaluate.",
         ),
@@ -63,6 +65,7 @@ def verify(
             ),
         ),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print where a filter's conditions cannot be met, and its bounds next to a simulation.
 
@@ -87,6 +90,7 @@ def verify(
     require_engine(engine)
     inputs = text_options.inputs_of(env.system, policy, [filter_name or ""])
     text_options.require_outputs(json, plot, inputs=inputs)
+    figure_options.width_of(size)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     # An unknown policy is an error before the search, and without a simulation too.
@@ -110,7 +114,7 @@ def verify(
     if plot is not None:
         from safe_envs.scripts.figures.verify_figure import draw
 
-        draw(answer, plot)
+        draw(answer, plot, size)
 
 
 if __name__ == "__main__":

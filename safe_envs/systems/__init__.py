@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from safe_envs.envs.spec import register_system
-
 MODULES = {
     "DubinsDisk": "dubins",
     "DubinsObstacle": "dubins_obstacle",
@@ -31,6 +29,8 @@ CUSTOM_ID = "safe_envs/Custom-v0"
 
 def register_all() -> None:
     """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
+    from safe_envs.envs.spec import register_system
+
     register_system(CUSTOM_ID, "safe_envs.envs.custom:Custom", "safe_envs.envs.custom:CustomVector")
     for name, module in MODULES.items():
         register_system(

@@ -155,11 +155,15 @@ class ACC(SystemEnv):
 
     ## Description
     The lead drives at 20 m/s and the desired speed is 22 m/s: the gap grows while the car
-    accelerates, then closes, and the desired speed has to be given up.
+    accelerates, then closes, and the car has to give up the desired speed.
 
     ## Equations
-    dx_1 = (u - F_r)/M dt + sigma_1 dW, dx_2 = 0, dx_3 = (x_2 - x_1) dt, with the drag F_r = f_0 +
-    f_1 x_1 + f_2 x_1^2; f_0 = .1 N, f_1 = 5 N s/m, f_2 = .25 N s^2/m^2, M = 1650 kg
+        dx_1 = (u - F_r)/M dt + sigma_1 dW
+        dx_2 = 0
+        dx_3 = (x_2 - x_1) dt
+
+    with the drag $F_r = f_0 + f_1 x_1 + f_2 x_1^2$, $f_0 = .1$ N, $f_1 = 5$ N s/m, $f_2 = .25$ N
+    s^2/m^2, and the mass $M = 1650$ kg.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -177,40 +181,46 @@ class ACC(SystemEnv):
     The states.
 
     ## Barrier
-    h = x_3 - tau x_1 with tau = 1.8 s, of relative degree 1. It is unbounded above, so that h/sup h
-    is no bound on the probability of staying safe. Gain 1. Default filter: `scbf`.
+    $$h = x_3 - tau x_1$$
+
+    with $tau = 1.8$ s, of relative degree 1. It is unbounded above, so $h/sup h$ gives no bound on
+    the probability of staying safe. Gain 1. Default filter: `scbf`.
 
     ## Noise
-    `sigma_1` = 1 m/s/sqrt(s). Of the thesis' three-dimensional Wiener process only this channel
-    acts.
+    `sigma_1` = 1 m/s/sqrt(s). Only this channel of the three-dimensional Wiener process in the
+    thesis acts.
 
     ## Mismatch
     None.
 
     ## Backup
-    `brake`: full braking until the car is slower than its lead, then its speed is kept. The
-    terminal set is in closed form, without noise: with it nothing is guaranteed.
+    `brake`: full braking until the car is slower than its lead, then it keeps its speed. The
+    terminal set is in closed form, without noise: with noise there is no guarantee.
 
     ## Reward
-    1/(1 + ((x_1 - 22)/4)^2) a step, in (0, 1].
+    $$1/(1 + ((x_1 - 22)/4)^2)$$
+
+    at each step, in (0, 1].
 
     ## Nominal controller
-    Min-norm CLF law of V = (x_1 - 22)^2: AV + 5 V <= d, at the cost 2 u^2/M^2 + .02 d^2. With the
-    weights and the condition of the thesis (1/2 each, AV <= d) u stays near 0.
+    Minimum-norm controller from the control Lyapunov function (CLF) $V = (x_1 - 22)^2$: the
+    condition $A V + 5 V <= d$ at the cost $2 u^2/M^2 + .02 d^2$. With the weights and the condition
+    of the thesis (1/2 each, $A V <= d$) u stays near 0.
 
     ## Start
-    `thesis`: (15, 20, 150).
+    `thesis`: $(15, 20, 150)$.
 
     ## Episode end
-    Terminated outside the workspace, so at a crash or a stop; truncated after 100 s = 2000 steps.
+    Terminated outside the workspace, hence at a crash or a stop; truncated after 100 s = 2000
+    steps.
 
     ## Arguments
     `tau=1.8`, the headway in s; `rate=5.0` and `slack_weight=0.02` of the goal; for all others see
     `SystemEnv`.
 
     ## Source
-    Thesis Sec. 4.3.1. It does not give tau, and has tr(Sigma' Sigma V_xx) where tr(Sigma
-    Sigma' V_xx) is meant.
+    Thesis Sec. 4.3.1. It does not give tau, and its trace in the generator of V has the two factors
+    of the diffusion in the wrong order.
     """
 
     problem_factory = staticmethod(acc)

@@ -104,12 +104,14 @@ class ACCGap(SystemEnv):
     """A car that wants to drive faster than the one ahead is to keep a minimum distance.
 
     ## Description
-    The car of `ACC` with the lead's speed as a parameter and noise in the gap too. It starts 5 m
-    from the edge.
+    The car of `ACC`, with the speed of the lead as a parameter and noise in the gap too. It starts
+    5 m from the edge of the safe set.
 
     ## Equations
-    dv = (u - F_r)/M dt + sigma_1 dW_1, dz = (v_f - v) dt + sigma_2 dW_2, with F_r and M as in `ACC`
-    and v_f = 20 m/s
+        dv = (u - F_r)/M dt + sigma_1 dW_1
+        dz = (v_f - v) dt + sigma_2 dW_2
+
+    with $F_r$ and $M$ as in `ACC` and $v_f = 20$ m/s.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -123,12 +125,15 @@ class ACCGap(SystemEnv):
     | `u` | force at the wheels | N | [-.3 M g, .3 M g] = [-4855.95, 4855.95] |
 
     ## Observation
-    The states, and the closeness exp(-z/50), which tells small gaps apart when long ones are about.
+    The states, and the closeness $exp(-z/50)$, which distinguishes small gaps where long ones also
+    occur.
 
     ## Barrier
-    h = (z - D)^5 with D = 10 m, of relative degree 2 and unbounded above. Its derivatives vanish at
-    the edge, and with them what a condition can ask for; z - D (`power` 1) is the plain
-    alternative. Gains 1 and 1. Default filter: `scbf`.
+    $$h = (z - D)^5$$
+
+    with $D = 10$ m, of relative degree 2 and unbounded above. Its derivatives vanish at the edge of
+    the safe set, and so does all that a condition can require there; $z - D$ (`power` 1) is the
+    plain alternative. Gains 1 and 1. Default filter: `scbf`.
 
     ## Noise
     `sigma_1` = .5 m/s/sqrt(s), `sigma_2` = .5 m/sqrt(s).
@@ -137,31 +142,34 @@ class ACCGap(SystemEnv):
     None.
 
     ## Backup
-    `brake`: full braking until the car is slower than its lead, then its speed is kept. The
-    terminal set is in closed form, without noise: with it nothing is guaranteed.
+    `brake`: full braking until the car is slower than its lead, then it keeps its speed. The
+    terminal set is in closed form, without noise: with noise there is no guarantee.
 
     ## Reward
-    exp(-z/50)/(1 + ((v - 22)/4)^2) a step, in (0, 1]: others cut into a long gap. Without the
-    second factor nothing would pull an agent towards the edge, since in the long run it drives as
-    fast as the lead at any gap.
+    $$exp(-z/50)/(1 + ((v - 22)/4)^2)$$
+
+    at each step, in (0, 1]: other cars cut into a long gap. The first factor rewards a short gap;
+    without it nothing would lead an agent to the edge of the safe set, since in the long run it
+    drives as fast as the lead at any gap.
 
     ## Nominal controller
-    Min-norm CLF law of V = (v - 22)^2: AV + V <= d, at the cost 2 u^2/M^2 + 2 d^2. The weights are
-    chosen by us, so that the speed is reached within the episode.
+    Minimum-norm controller from the control Lyapunov function (CLF) $V = (v - 22)^2$: the condition
+    $A V + V <= d$ at the cost $2 u^2/M^2 + 2 d^2$. The weights are not from the thesis; with them
+    the car reaches the speed within the episode.
 
     ## Start
-    `thesis`: (10, 15).
+    `thesis`: $(10, 15)$.
 
     ## Episode end
-    Terminated outside the workspace, so at a crash or a stop; truncated after 30 s = 3000 steps.
+    Terminated outside the workspace, hence at a crash or a stop; truncated after 30 s = 3000 steps.
 
     ## Arguments
     `distance=10.0` in m and `power=5`, an odd exponent, of the barrier; `rate=1.0` and
     `slack_weight=2.0` of the goal; for all others see `SystemEnv`.
 
     ## Source
-    Thesis Sec. 6.3.2, which does not give v_f. Its b_1 lacks the noise term and its b_2 has wrong
-    coefficients; here both are derived.
+    Thesis Sec. 6.3.2, which does not give $v_f$. Its $b_1$ lacks the noise term and its $b_2$ has
+    wrong coefficients; here both are derived.
     """
 
     problem_factory = staticmethod(acc_gap)

@@ -122,11 +122,14 @@ class CubicSDE(SystemEnv):
     """A cubic planar system, whose noise and control vanish together, is to stay in a parabola.
 
     ## Description
-    The state starts near the edge and is to come to the origin. Where x_2 = 0 the input does
-    nothing.
+    The state starts near the edge of the safe set, and the goal is the origin. Where $x_2 = 0$ the
+    input has no effect.
 
     ## Equations
-    dx_1 = (-a x_1 - x_2) dt, dx_2 = (x_1^3 + x_2 u) dt + k x_2 dW, with a = .6
+        dx_1 = (-a x_1 - x_2) dt
+        dx_2 = (x_1^3 + x_2 u) dt + k x_2 dW
+
+    with $a = .6$.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -142,9 +145,11 @@ class CubicSDE(SystemEnv):
     The states.
 
     ## Barrier
-    h = offset - x_1 - x_2^2 with offset 1, of relative degree 1. C is unbounded and so is h, so
-    that h/sup h is no bound on the probability of staying safe. The condition cannot be met at x_2
-    = 0, x_1 < 0. Gain 2. Default filter: `scbf`.
+    $$h = offset - x_1 - x_2^2$$
+
+    with offset 1, of relative degree 1. The safe set is unbounded and so is $h$, so $h/sup h$ gives
+    no bound on the probability of staying safe. The condition cannot be met at $x_2 = 0$, $x_1 <
+    0$. Gain 2. Default filter: `scbf`.
 
     ## Noise
     `k` = .1 1/sqrt(s).
@@ -154,13 +159,16 @@ class CubicSDE(SystemEnv):
     neglects it.
 
     ## Reward
-    exp(-x_1^2 - x_2^2) a step, in (0, 1].
+    $$exp(-x_1^2 - x_2^2)$$
+
+    at each step, in (0, 1].
 
     ## Nominal controller
-    Min-norm CLF law of V = x_1^2 + x_2^2: AV + V <= d, at the cost u^2 + d^2.
+    Minimum-norm controller from the control Lyapunov function (CLF) $V = x_1^2 + x_2^2$: the
+    condition $A V + V <= d$ at the cost $u^2 + d^2$.
 
     ## Start
-    `near-edge`: uniform where 0 < h < .5 in [-3, 1] x [-2, 2].
+    `near-edge`: uniform where $0 < h < .5$ in the box from $(-3, -2)$ to $(1, 2)$.
 
     ## Episode end
     Terminated outside the workspace, truncated after 2 s = 200 steps.
@@ -170,8 +178,8 @@ class CubicSDE(SystemEnv):
     `SystemEnv`.
 
     ## Source
-    Thesis Sec. 5.4.2, which prints the differential of the states' derivatives where that of the
-    states is meant, and calls C compact.
+    Thesis Sec. 5.4.2, which prints the differential of the derivatives of the states in place of
+    that of the states, and calls the safe set compact.
     """
 
     problem_factory = staticmethod(cubic_sde)
@@ -181,11 +189,14 @@ class CubicSDEDisk(SystemEnv):
     """A cubic planar system with additive noise is to stay in a disk.
 
     ## Description
-    The drift of `CubicSDE` with constant noise in both states. The input works in proportion to
-    x_2, the noise everywhere.
+    The drift of `CubicSDE` with constant noise in both states. The effect of the input is
+    proportional to $x_2$; the noise acts everywhere.
 
     ## Equations
-    dx_1 = (-a x_1 - x_2) dt + sigma_1 dW_1, dx_2 = (x_1^3 + x_2 u) dt + sigma_2 dW_2, with a = .6
+        dx_1 = (-a x_1 - x_2) dt + sigma_1 dW_1
+        dx_2 = (x_1^3 + x_2 u) dt + sigma_2 dW_2
+
+    with $a = .6$.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -201,8 +212,10 @@ class CubicSDEDisk(SystemEnv):
     The states.
 
     ## Barrier
-    h = r^2 - x_1^2 - x_2^2, of relative degree 1, with sup h = r^2. The thesis' bound h/sup h does
-    not apply: at x_2 = 0, abs(x_1) < .258 the condition cannot be met (Ah(0) = -.08). Gain 2.
+    $$h = r^2 - x_1^2 - x_2^2$$
+
+    of relative degree 1, with $sup h = r^2$. The bound $h/sup h$ of the thesis does not apply: at
+    $x_2 = 0$, $abs(x_1) < .258$ the condition cannot be met ($A h = -.08$ at the origin). Gain 2.
     Default filter: `scbf`.
 
     ## Noise
@@ -212,13 +225,15 @@ class CubicSDEDisk(SystemEnv):
     None by default.
 
     ## Reward
-    exp(-4 (h/r^2)^2) a step, in (0, 1]: as near to the edge as can be. Our choice.
+    $$exp(-4 (h/r^2)^2)$$
+
+    at each step, in (0, 1]: largest at the edge of the safe set. Not from the thesis.
 
     ## Nominal controller
-    0, as the thesis has it.
+    0, as in the thesis.
 
     ## Start
-    `uniform` in the disk. `thesis-1`: (-.1, .7). `thesis-2`: (-.1, .8).
+    `uniform` in the disk. `thesis-1`: $(-.1, .7)$. `thesis-2`: $(-.1, .8)$.
 
     ## Episode end
     Terminated outside the workspace, truncated after 1 s = 100 steps.
@@ -227,7 +242,7 @@ class CubicSDEDisk(SystemEnv):
     `barrier={"radius": 1.0}`, r; for all others see `SystemEnv`.
 
     ## Source
-    Thesis Sec. 6.3.1, whose Ah has x_1 x_2 for 2 x_1 x_2, and sigma_2^2 twice.
+    Thesis Sec. 6.3.1, whose $A h$ has $x_1 x_2$ in place of $2 x_1 x_2$, and $sigma_2^2$ twice.
     """
 
     problem_factory = staticmethod(cubic_sde_disk)

@@ -201,12 +201,14 @@ class DubinsDisk(SystemEnv):
     """A vehicle at constant speed, faster than its designer believes, is to stay in a disk.
 
     ## Description
-    The vehicle cannot stop or slow down, only turn. Its task is to ride a circle that lies partly
-    beyond the edge of the safe disk, so that a policy that only wants reward leaves the disk in
-    every round.
+    The vehicle cannot stop or slow down; it can only turn. Its task is to follow a circle that lies
+    partly outside the safe disk, so a policy that maximizes the reward alone leaves the disk in
+    every lap.
 
     ## Equations
-    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
+        dx = v cos(theta) dt + sigma_1 dW_1
+        dy = v sin(theta) dt + sigma_2 dW_2
+        dtheta = omega dt
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -220,41 +222,45 @@ class DubinsDisk(SystemEnv):
     | `omega` | turn rate | rad/s | [-pi, pi] (assumed) |
 
     ## Observation
-    x, y, cos(theta), sin(theta).
+    $x$, $y$, $cos(theta)$, $sin(theta)$.
 
     ## Barrier
-    h = r^2 - x^2 - y^2, of relative degree 2. Where the heading is radial the input does not reach
-    its second derivative: the condition can be met there only if b_2 >= 0 without it, which at the
-    centre needs p_1 p_2 >= 2 v^2/r^2. Hence the gains 1 and 2 in place of the thesis' 1 and 1,
-    which miss that for v = .8. Default filter: `hocbf`.
+    $$h = r^2 - x^2 - y^2$$
+
+    of relative degree 2. Where the heading is radial, the input does not act on the second
+    derivative of $h$: the condition can be met there only if $b_2 >= 0$ without it, which at the
+    centre requires $p_1 p_2 >= 2 v^2/r^2$. The gains are therefore 1 and 2; those of the thesis, 1
+    and 1, are too small for $v = .8$ m/s. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` in m/sqrt(s), both 0: the system is deterministic.
 
     ## Mismatch
-    The plant has v = .8 m/s, the model v = .5 m/s. A filter that trusts the model lets h settle
-    near -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
+    The plant has $v = .8$ m/s, the model $v = .5$ m/s. With a filter that uses the model, $h$
+    settles near $-2 v_model (v_plant - v_model)/(p_1 p_2) = -.15$ m^2.
 
     ## Backup
-    `left` and `right`: turn at the full rate, once the circle of the turn fits into the disk, and
-    drive straight on before. The terminal set is in closed form. With noise nothing is guaranteed,
-    nor with knowledge of the model: its circles are smaller than the plant's, and every episode
-    ends unsafe. Take knowledge of the plant, or a model with its speed.
+    `left` and `right`: drive straight on until the circle of the tightest turn fits into the disk,
+    then turn at the full rate. The terminal set is in closed form. With noise there is no
+    guarantee, and none with knowledge of the model alone: its turning circles are smaller than the
+    plant's, and every episode ends unsafe. Use `knowledge="plant"`, or a model with the plant's
+    speed.
 
     ## Reward
-    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
-    (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
-    circle alone would reward turning on the spot. Our choice.
+    $$(1 + d/R cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2)$$
+
+    at each step, at most about 1, where $d$ is the distance from $(.5 r, 0)$, $R = .75 r$, and $a$
+    the angle between the heading and the counterclockwise tangent. Without the factor with $a$,
+    turning on the spot would pay. Not from the thesis.
 
     ## Nominal controller
     Turns towards a course that leads onto that circle and around it.
 
     ## Start
-    `feasible`: uniform in the disk and in heading, restricted to where b_1 > 0 for the plant's
-    default speed and the default gains, since from elsewhere no filter of these gains is guaranteed
-    to succeed. `uniform`: without that condition. `thesis`: (.9, .1, 0), which is such a start
-    outside the set b_1 >= 0, for all gains that the thesis tries. `valid`: (0, .1, 0), which is
-    inside.
+    `feasible`: uniform in the disk and in heading, restricted to where $b_1 > 0$ for the plant's
+    default speed and the default gains, since a filter with these gains guarantees nothing
+    elsewhere. `uniform`: without that restriction. `thesis`: $(.9, .1, 0)$, which lies outside the
+    set $b_1 >= 0$ for all gains that the thesis tries. `valid`: $(0, .1, 0)$, which lies inside.
 
     ## Episode end
     Terminated outside the workspace, truncated after 50 s = 1000 steps.

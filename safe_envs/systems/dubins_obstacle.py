@@ -144,12 +144,15 @@ class DubinsObstacle(SystemEnv):
     """A vehicle at constant speed heads for a goal, and an obstacle moves across its way.
 
     ## Description
-    The straight way to the goal leads through the place where the obstacle will be. The vehicle
-    cannot slow down: it has to turn aside. The obstacle does not react.
+    The straight path to the goal leads through the place where the obstacle will be. The vehicle
+    cannot slow down; it has to turn aside. The obstacle does not react.
 
     ## Equations
-    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
-    dx_o = v_o dt, dy_o = 0
+        dx = v cos(theta) dt + sigma_1 dW_1
+        dy = v sin(theta) dt + sigma_2 dW_2
+        dtheta = omega dt
+        dx_o = v_o dt
+        dy_o = 0
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -166,41 +169,43 @@ class DubinsObstacle(SystemEnv):
     | `omega` | turn rate | rad/s | [-pi, pi] (assumed) |
 
     ## Observation
-    x, y, cos(theta), sin(theta), and the position of the obstacle seen from the vehicle, x_o - x
-    and y_o - y.
+    The position, $cos(theta)$, $sin(theta)$, and the position of the obstacle relative to the
+    vehicle, $x_o - x$ and $y_o - y$.
 
     ## Barrier
-    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .5 m, of relative degree 2. Gains 1 and 1.
-    Default filter: `hocbf`.
+    $$h = (x - x_o)^2 + (y - y_o)^2 - r_O^2$$
+
+    with $r_O = .5$ m, of relative degree 2. Gains 1 and 1. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
 
     ## Mismatch
-    The plant has v = .8 m/s, the model v = .5 m/s; both know the obstacle's v_o = .5 m/s.
+    The plant has $v = .8$ m/s, the model $v = .5$ m/s; both know the speed of the obstacle, $v_o =
+    .5$ m/s.
 
     ## Reward
-    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in
-    units of v dt; and 10 on arrival. The sum of the progress is what the distance shrank by:
-    neither circling nor leaving the workspace pays.
+    The cosine of the angle between heading and goal at each step, in $[-1, 1]$, which is the
+    progress in units of $v dt$; and 10 on arrival. The sum of the progress is the decrease of the
+    distance, so neither circling nor leaving the workspace pays.
 
     ## Nominal controller
     Turns towards the goal with gain 2 1/s.
 
     ## Start
-    `spread`: vehicle uniform within .5 (m, m, rad) of (-2, -2, 0), obstacle at (-1, 0). `thesis`:
-    exactly there.
+    `spread`: vehicle uniform within .5 (m, m, rad) of $(-2, -2, 0)$, obstacle at $(-1, 0)$.
+    `thesis`: exactly there.
 
     ## Episode end
-    Terminated within .3 m of the goal (3, 1.5) or outside the workspace, truncated after 15 s = 300
-    steps.
+    Terminated within .3 m of the goal $(3, 1.5)$ or outside the workspace, truncated after 15 s =
+    300 steps.
 
     ## Arguments
-    `barrier={"radius": 0.5}`, the obstacle's radius r_O in m; for all others see `SystemEnv`.
+    `barrier={"radius": 0.5}`, the radius of the obstacle in m; for all others see `SystemEnv`.
 
     ## Source
-    Thesis Sec. 3.5.1, moving obstacle avoidance. The derivatives of h printed there forget the
-    obstacle's velocity; with the obstacle as a state they are right by construction.
+    Thesis Sec. 3.5.1, moving obstacle avoidance. The derivatives of $h$ printed there omit the
+    velocity of the obstacle; with the obstacle as a state they are right by construction.
     """
 
     problem_factory = staticmethod(dubins_obstacle)

@@ -117,18 +117,20 @@ class DubinsObstacles(SystemEnv):
 
     ## Description
     The vehicle cannot slow down, only turn, and has to find gaps that open and close. The obstacles
-    do not react, and the vehicle is faster than they are. Each has a barrier of its own, so that a
+    do not react, and the vehicle is faster than they are. Each obstacle has its own barrier, so a
     filter has to meet N conditions with one input.
 
     ## Equations
-    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
-    dphase_i = +-w_o dt
+        dx = v cos(theta) dt + sigma_1 dW_1
+        dy = v sin(theta) dt + sigma_2 dW_2
+        dtheta = omega dt
+        dphase_i = +-w_o dt
 
-    Obstacle i is at x_i = c_xi + R_o cos(phase_i), y_i = c_yi + R_o sin(phase_i), where R_o = .6 m
-    and w_o = .6 rad/s, so that it moves at .36 m/s; the odd ones turn to the left, the even ones to
-    the right. The centres lie like the seeds of a sunflower, in a field of radius F = 1.35 sqrt(N)
-    m around the origin, so far apart that obstacles of r_O < .44 m never touch. With E = F + R_o +
-    r_O + 1 m, the way leads from x < -E to (E, 0).
+    Obstacle i is at $x_i = c_xi + R_o cos(phase_i)$, $y_i = c_yi + R_o sin(phase_i)$, where $R_o =
+    .6$ m and $w_o = .6$ rad/s, so it moves at .36 m/s; obstacles with odd numbers turn to the left,
+    the others to the right. The centres are arranged like the seeds of a sunflower, in a field of
+    radius $F = 1.35 sqrt(N)$ m around the origin, so far apart that obstacles of $r_O < .44$ m
+    never touch. With $E = F + R_o + r_O + 1$ m, the path leads from $x < -E$ to $(E, 0)$.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -143,44 +145,49 @@ class DubinsObstacles(SystemEnv):
     | `omega` | turn rate | rad/s | [-pi, pi] |
 
     ## Observation
-    x, y, cos(theta), sin(theta), and the position of each obstacle seen from the vehicle, x_i - x
-    and y_i - y. An obstacle's velocity follows from where it is.
+    The position, $cos(theta)$, $sin(theta)$, and the position of each obstacle relative to the
+    vehicle, $x_i - x$ and $y_i - y$. The velocity of an obstacle follows from its position.
 
     ## Barrier
-    `h_1` to `h_N`: h_i = (x - x_i)^2 + (y - y_i)^2 - r_O^2 with r_O = .4 m, each of relative degree
-    2. The input loses its hold on h_i where the vehicle heads straight for the obstacle or away
-    from it. Gains 3 and 5 for each: smaller ones keep such a distance that the constraints of
-    several obstacles contradict each other more often. Default filter: `hocbf`.
+    `h_1` to `h_N`:
+
+    $$h_i = (x - x_i)^2 + (y - y_i)^2 - r_O^2$$
+
+    with $r_O = .4$ m, each of relative degree 2. The input does not act on $h_i$ where the vehicle
+    heads straight for the obstacle or away from it. Gains 3 and 5 for each: with smaller gains the
+    vehicle keeps a larger distance, and the constraints of several obstacles contradict each other
+    more often. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
 
     ## Mismatch
-    None: plant and model have v = .8 m/s and w_o = .6 rad/s. What is hard is the number of
+    None: plant and model have $v = .8$ m/s and $w_o = .6$ rad/s. The difficulty is the number of
     barriers.
 
     ## Reward
-    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in
-    units of v dt; and 10 on arrival.
+    The cosine of the angle between heading and goal at each step, in $[-1, 1]$, which is the
+    progress in units of $v dt$; and 10 on arrival.
 
     ## Nominal controller
-    Turns towards the goal with gain 2 1/s, whatever is in the way.
+    Turns towards the goal with gain 2 1/s, and ignores the obstacles.
 
     ## Start
-    `spread`: x uniform in [-E - 1, -E], y within F of 0, heading within .5 rad of 0, phases
-    uniform. No obstacle comes nearer to these places than 1 m, so that the vehicle starts in the
-    set that the filter keeps.
+    `spread`: x uniform in $[-E - 1, -E]$, y within $F$ of 0, heading within .5 rad of 0, phases
+    uniform. No obstacle comes nearer to these places than 1 m, so the vehicle starts in the set
+    that the filter keeps.
 
     ## Episode end
-    Terminated within .3 m of the goal or outside the workspace, truncated after the time for four
-    times E, 26 s for N = 5.
+    Terminated within .3 m of the goal or outside the workspace, truncated after the time in which
+    the vehicle covers four times $E$: 26 s for N = 5.
 
     ## Arguments
-    `num_obstacles=5`, N, from 1 to 20; `radius=0.4`, r_O in m. For all others see `SystemEnv`.
+    `num_obstacles=5`, N, from 1 to 20; `radius=0.4`, the radius of the obstacles in m. For all
+    others see `SystemEnv`.
 
     ## Source
-    The vehicle of thesis Eq. (3.27) and the barrier of Sec. 3.5.1, which has one obstacle; the
-    field is our choice.
+    The vehicle of thesis Eq. (3.27) and the barrier of Sec. 3.5.1, which has one obstacle. The
+    field is not from the thesis.
     """
 
     problem_factory = staticmethod(dubins_obstacles)

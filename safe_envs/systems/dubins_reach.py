@@ -72,15 +72,19 @@ class DubinsReach(SystemEnv):
     """A vehicle with noise heads for a goal, and an obstacle moves across its way.
 
     ## Description
-    As `DubinsObstacle`, with noise in the position and in a small workspace: what counts is to
-    reach the goal before the obstacle hits, "always safe & eventually goal". The obstacle's path is
-    known from the start, so that three coordinates and the time say everything. Nothing waits: the
-    vehicle cannot slow down, and the workspace ends 2 m from the centre. A step is .2 m long, five
-    cells of a table with 100 cells along x and y, whose bounds are close then.
+    As `DubinsObstacle`, with noise in the position and in a small workspace: the task is to reach
+    the goal before a collision with the obstacle, "always safe & eventually goal". The path of the
+    obstacle is known from the start, so three coordinates and the time describe the state. The
+    vehicle cannot slow down, and the workspace ends 2 m from the centre. In one step it moves by .2
+    m, which is five cells of a table with 100 cells along x and y; the bounds of such a table are
+    close to each other.
 
     ## Equations
-    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
-    dx_o = 0, dy_o = v_o dt
+        dx = v cos(theta) dt + sigma_1 dW_1
+        dy = v sin(theta) dt + sigma_2 dW_2
+        dtheta = omega dt
+        dx_o = 0
+        dy_o = v_o dt
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -95,45 +99,47 @@ class DubinsReach(SystemEnv):
     | `omega` | turn rate | rad/s | [-3, 3] |
 
     ## Observation
-    x, y, cos(theta), sin(theta), and the position of the obstacle seen from the vehicle, x_o - x
-    and y_o - y.
+    The position, $cos(theta)$, $sin(theta)$, and the position of the obstacle relative to the
+    vehicle, $x_o - x$ and $y_o - y$.
 
     ## Barrier
-    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .4 m, of relative degree 2. Gains 1 and 2.
-    Default filter: `hocbf`, which ignores the noise.
+    $$h = (x - x_o)^2 + (y - y_o)^2 - r_O^2$$
+
+    with $r_O = .4$ m, of relative degree 2. Gains 1 and 2. Default filter: `hocbf`, which ignores
+    the noise.
 
     ## Regions
-    `gate`, the disk of radius .4 m around (-.6, 1.1), for sequences: "always safe & eventually
-    (gate then goal)" leads around the obstacle's path.
+    `gate`, the disk of radius .4 m around $(-.6, 1.1)$, for sequences: "always safe & eventually
+    (gate then goal)" leads around the path of the obstacle.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both .2.
 
     ## Mismatch
-    None: plant and model have v = 1 m/s and v_o = .7 m/s; `plant={"v": 1.2}` or `model={"v_o":
+    None: plant and model have $v = 1$ m/s and $v_o = .7$ m/s; `plant={"v": 1.2}` or `model={"v_o":
     0.5}` makes them differ.
 
     ## Reward
-    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in
-    units of v dt; and 10 on arrival. Neither circling nor leaving the workspace pays.
+    The cosine of the angle between heading and goal at each step, in $[-1, 1]$, which is the
+    progress in units of $v dt$; and 10 on arrival. Neither circling nor leaving the workspace pays.
 
     ## Nominal controller
     Turns towards the goal with gain 2 1/s.
 
     ## Start
-    `spread`: vehicle uniform within (.2 m, .2 m, .5 rad) of (-1.5, -1, .4), obstacle at (0, -1.2).
-    `fixed`: exactly there.
+    `spread`: vehicle uniform within (.2 m, .2 m, .5 rad) of $(-1.5, -1, .4)$, obstacle at $(0,
+    -1.2)$. `fixed`: exactly there.
 
     ## Episode end
-    Terminated within .3 m of the goal (1.4, 1) or outside the workspace, truncated after 6 s = 30
+    Terminated within .3 m of the goal $(1.4, 1)$ or outside the workspace, truncated after 6 s = 30
     steps.
 
     ## Arguments
-    `barrier={"radius": 0.4}`, the obstacle's radius r_O in m; for all others see `SystemEnv`.
+    `barrier={"radius": 0.4}`, the radius of the obstacle in m; for all others see `SystemEnv`.
 
     ## Source
-    Our own: the vehicle of the thesis' Eq. (3.27) and Sec. 4.3.2 in a task of the kind of thesis
-    Sec. 3.5.1.
+    Not from the thesis: the vehicle of its Eq. (3.27) and Sec. 4.3.2, in a task like that of Sec.
+    3.5.1.
     """
 
     problem_factory = staticmethod(dubins_reach)

@@ -92,12 +92,14 @@ class Pendulum(SystemEnv):
     """An inverted pendulum, with noise that grows with its angle, is to stay near the top.
 
     ## Description
-    The pendulum falls over when it is left alone. The task is to lean it a little beyond the edge
-    of the safe ellipse.
+    The pendulum falls over if it is left alone. The task is to lean it a little beyond the edge of
+    the safe ellipse.
 
     ## Equations
-    dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2)) dt,
-    with m = 1 kg, l = .7 m, g = 10 m/s^2
+        dtheta = thetadot dt + sigma theta dW
+        dthetadot = (g/l sin(theta) + u/(m l^2)) dt
+
+    with $m = 1$ kg, $l = .7$ m, $g = 10$ m/s^2.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -114,9 +116,10 @@ class Pendulum(SystemEnv):
     The states.
 
     ## Barrier
-    h = c - x' P x with c = .2 and P = [[sqrt(3), 1], [1, sqrt(3)]], of relative degree 1, with sup
-    h = c. In the ellipse abs(theta) and abs(thetadot) stay below .416. Gain 5. Default filter:
-    `scbf`.
+    $$h = c - sqrt(3) theta^2 - 2 theta thetadot - sqrt(3) thetadot^2$$
+
+    with $c = .2$, of relative degree 1, with $sup h = c$. In the ellipse $abs(theta)$ and
+    $abs(thetadot)$ stay below .416. Gain 5. Default filter: `scbf`.
 
     ## Noise
     `sigma` = .1 1/sqrt(s).
@@ -126,17 +129,19 @@ class Pendulum(SystemEnv):
     who neglects it.
 
     ## Backup
-    `upright`: u = -15 theta - 16 thetadot. Its terminal set is proved when a filter is made, for
-    the numbers of the problem, without noise: with it nothing is guaranteed.
+    `upright`: $u = -15 theta - 16 thetadot$. Its terminal set is proved for the numbers of the
+    problem when a filter is made, without noise: with noise there is no guarantee.
 
     ## Reward
-    exp(-(5 (theta - .4))^2) a step, in (0, 1]. Our choice: at rest there h = -.08.
+    $$exp(-(5 (theta - .4))^2)$$
+
+    at each step, in (0, 1]. At rest at its maximum $h = -.08$. Not from the thesis.
 
     ## Nominal controller
-    0, as the thesis has it.
+    0, as in the thesis.
 
     ## Start
-    `uniform` in the ellipse. `near-origin`: (.1, .1).
+    `uniform` in the ellipse. `near-origin`: $(.1, .1)$.
 
     ## Episode end
     Terminated outside the workspace, truncated after 2 s = 200 steps.

@@ -186,24 +186,23 @@ class Quadrotor(SystemEnv):
     """The altitude of a quadrotor with all its twelve states and four rotors is to stay in a band.
 
     ## Description
-    The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a filter adds is
-    shared among four rotors, and acts along a body axis that tilts.
+    The task of `QuadrotorAltitude` with the full dynamics: the thrust that a filter adds is shared
+    among four rotors, and acts along a body axis that tilts.
 
     ## Equations
-    Positions and angles integrate their rates. With noise sigma_i dW_i on the three accelerations,
-
-        xddot   = (cos(phi) sin(theta) cos(psi) + sin(phi) sin(psi)) U_1/m
-        yddot   = (cos(phi) sin(theta) sin(psi) - sin(phi) cos(psi)) U_1/m
-        zddot   = -g + cos(phi) cos(theta) U_1/m
-        phiddot   = thetadot psidot (I_y - I_z)/I_x + l/I_x U_2
-        thetaddot = phidot psidot (I_z - I_x)/I_y + l/I_y U_3
-        psiddot   = phidot thetadot (I_x - I_y)/I_z + 1/I_z U_4
-
+        Positions and angles integrate their rates; i = 1, ..., 4, O_i = rotor_i:
+        dxdot   = (cos(phi) sin(theta) cos(psi) + sin(phi) sin(psi)) U_1/m dt + sigma_x dW_1
+        dydot   = (cos(phi) sin(theta) sin(psi) - sin(phi) cos(psi)) U_1/m dt + sigma_y dW_2
+        dzdot   = (-g + cos(phi) cos(theta) U_1/m) dt + sigma_z dW_3
+        dphidot   = (thetadot psidot (I_y - I_z)/I_x + l/I_x U_2) dt
+        dthetadot = (phidot psidot (I_z - I_x)/I_y + l/I_y U_3) dt
+        dpsidot   = (phidot thetadot (I_x - I_y)/I_z + 1/I_z U_4) dt
         U_1 = k_t (O_1 + O_2 + O_3 + O_4),  U_2 = k_t (O_4 - O_2),  U_3 = k_t (O_1 - O_3)
-        U_4 = k_d (O_1 - O_2 + O_3 - O_4),  O_i = Omega_i^2
+        U_4 = k_d (O_1 - O_2 + O_3 - O_4)
 
-    Assumed, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z =
-    .013 kg m^2, k_t = 3.13e-5 N s^2, k_d = 7.5e-7 N m s^2.
+    where the inputs are the squares of the rotor speeds. Assumed, in the range of a small research
+    quadrotor: $l = .23$ m, $I_x = I_y = .0075$ kg m^2, $I_z = .013$ kg m^2, $k_t = 3.13e-5$ N s^2,
+    $k_d = 7.5e-7$ N m s^2, $g = 9.81$ m/s^2.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -221,24 +220,28 @@ class Quadrotor(SystemEnv):
     | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], an assumption |
 
     ## Observation
-    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t), and its
-    rate.
+    The states, in order, without psi; then $cos(psi)$, $sin(psi)$, $z_ref = 5 + 2.5 sin(t)$, and
+    the rate of the reference.
 
     ## Barrier
-    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
-    on h at z = c, where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
+    $$h = 1 - ((z - c)/p)^4$$
+
+    with $c = 5$ m and $p = 2$ m, of relative degree 2. The input does not act on $h$ at $z = c$,
+    where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
 
     ## Mismatch
-    The plant has m = .6 kg, the model m = .4 kg.
+    The plant has $m = .6$ kg, the model $m = .4$ kg.
 
     ## Reward
-    exp(-(z - z_ref)^2) a step, in (0, 1].
+    $$exp(-(z - z_ref)^2)$$
+
+    at each step, in (0, 1].
 
     ## Nominal controller
-    U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through the roll and pitch
+    $U_1$ as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through the roll and pitch
     angles, for the torques; and the rotor speeds by the inverse of the mixing.
 
     ## Start

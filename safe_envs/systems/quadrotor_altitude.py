@@ -157,7 +157,8 @@ class QuadrotorAltitude(SystemEnv):
     ends.
 
     ## Equations
-    dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW
+        dz = zdot dt
+        dzdot = (-g + U_1/m) dt + sigma_z dW
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -171,32 +172,39 @@ class QuadrotorAltitude(SystemEnv):
     | `U_1` | thrust | N | [0, 12], twice the plant's weight (assumed) |
 
     ## Observation
-    z, zdot, the reference z_ref = 5 + 2.5 sin(t) at the time t of the observation, and its rate.
+    $z$, $zdot$, the reference $z_ref = 5 + 2.5 sin(t)$ at the time t of the observation, and the
+    rate of the reference.
 
     ## Barrier
-    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
-    on h at z = c, where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
+    $$h = 1 - ((z - c)/p)^4$$
+
+    with $c = 5$ m and $p = 2$ m, of relative degree 2. The input does not act on $h$ at $z = c$,
+    where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_z` of the acceleration in m/s/sqrt(s), 0.
 
     ## Mismatch
-    The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much acceleration
-    again as the thrust gives.
+    The plant has $m = .6$ kg, the model $m = .4$ kg: the designer expects one and a half times the
+    acceleration that the thrust gives.
 
     ## Backup
-    `hover`: thrust brakes to a hover in the middle of the band. Its terminal set is proved when a
-    filter is made, for the numbers of the problem: for the plant with knowledge of the plant.
+    `hover`: thrust brakes to a hover in the middle of the band. Its terminal set is proved for the
+    numbers of the problem when a filter is made: for the plant, with knowledge of the plant.
 
     ## Reward
-    exp(-(z - z_ref)^2) a step, in (0, 1].
+    $$exp(-(z - z_ref)^2)$$
+
+    at each step, in (0, 1].
 
     ## Nominal controller
-    U_1 = m (g + 6 e + 4 edot), e = z_ref - z, with the model's mass. The thesis names a PID
-    controller without its gains.
+    $$U_1 = m (g + 6 e + 4 edot)$$
+
+    with $e = z_ref - z$ and the model's mass. The thesis mentions a PID controller without its
+    gains.
 
     ## Start
-    `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0. `thesis`: (5, 0).
+    `spread`: z uniform within .5 m of 5 m, $zdot$ within .5 m/s of 0. `thesis`: $(5, 0)$.
 
     ## Episode end
     Terminated outside the workspace, truncated after 30 s = 600 steps.
@@ -205,8 +213,8 @@ class QuadrotorAltitude(SystemEnv):
     `barrier={"center": 5.0, "half_width": 2.0}`, c and p in m; for all others see `SystemEnv`.
 
     ## Source
-    Thesis Sec. 3.5.2, Eq. (3.31) with phi = theta = 0, (3.32). Eq. (3.33) has wrong signs in L_f^2
-    h and L_g L_f h, and zdot in place of its square; nothing here depends on it.
+    Thesis Sec. 3.5.2, Eq. (3.31) with $phi = theta = 0$, (3.32). Eq. (3.33) has wrong signs in two
+    Lie derivatives of $h$, and $zdot$ in place of its square; nothing here depends on it.
     """
 
     problem_factory = staticmethod(quadrotor_altitude)

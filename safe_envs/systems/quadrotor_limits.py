@@ -101,8 +101,8 @@ class QuadrotorLimits(SystemEnv):
 
     ## Description
     The quadrotor follows an altitude that leaves the band at both ends, and sways from side to side
-    faster than the tilt limit allows. Thrust serves the floor and the ceiling, and torques the
-    tilt; the same four rotors, within their speeds, give both.
+    faster than the tilt limit allows. Thrust serves the floor and the ceiling, and torques serve
+    the tilt; both come from the same four rotors, within their speed limits.
 
     ## Equations
     Those of `Quadrotor`.
@@ -123,37 +123,39 @@ class QuadrotorLimits(SystemEnv):
     | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the hover |
 
     ## Observation
-    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t) and its rate,
-    x_ref = 2 sin(1.5 t) and its rate.
+    The states, in order, without psi; then $cos(psi)$, $sin(psi)$, $z_ref = 5 + 2.5 sin(t)$ and its
+    rate, $x_ref = 2 sin(1.5 t)$ and its rate.
 
     ## Barrier
     | name | h | relative degree | gains |
     |---|---|---|---|
-    | `floor` | z - z_min, z_min = 3 m | 2 | 2, 8 |
-    | `ceiling` | z_max - z, z_max = 7 m | 2 | 2, 8 |
-    | `tilt` | cos(phi) cos(theta) - cos(a), a = .5 rad | 2 | 3, 12 |
+    | `floor` | $z - z_min$, $z_min = 3$ m | 2 | 2, 8 |
+    | `ceiling` | $z_max - z$, $z_max = 7$ m | 2 | 2, 8 |
+    | `tilt` | $cos(phi) cos(theta) - cos(a)$, $a = .5$ rad | 2 | 3, 12 |
 
-    The angle from the thrust to the vertical is to stay below a. In level flight no torque reaches
-    the second derivative of the last one: the condition can be met there only if phidot^2 +
-    thetadot^2 <= p_1 p_2 (1 - cos(a)), so that a limit below about .3 rad needs larger gains.
-    Default filter: `hocbf`.
+    The angle between the thrust and the vertical is to stay below $a$. In level flight no torque
+    acts on the second derivative of the last barrier: the condition can be met there only if
+    $phidot^2 + thetadot^2 <= p_1 p_2 (1 - cos(a))$, so a limit below about .3 rad needs larger
+    gains. Default filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
 
     ## Mismatch
-    None: plant and model have m = .6 kg. What is hard is the number of barriers and inputs.
+    None: plant and model have $m = .6$ kg. The difficulty is the number of barriers and inputs.
 
     ## Backup
-    `level out`: torques bring roll and pitch back, and the thrust brakes to a hover in the middle
-    of the band. Its terminal set is proved when a filter is made, for the numbers of the problem.
-    Where the vehicle drifts to meanwhile is not part of it.
+    `level out`: torques bring roll and pitch back to 0, and the thrust brakes to a hover in the
+    middle of the band. Its terminal set is proved for the numbers of the problem when a filter is
+    made. The horizontal drift of the vehicle in the meantime is not part of it.
 
     ## Reward
-    exp(-(z - z_ref)^2 - (x - x_ref)^2) a step, in (0, 1].
+    $$exp(-(z - z_ref)^2 - (x - x_ref)^2)$$
+
+    at each step, in (0, 1].
 
     ## Nominal controller
-    That of `Quadrotor`, with x_ref in place of 0.
+    That of `Quadrotor`, with $x_ref$ in place of 0.
 
     ## Start
     `spread`: z uniform in the middle quarter of the band, zdot within .5 m/s of 0, psi within .5
@@ -163,11 +165,11 @@ class QuadrotorLimits(SystemEnv):
     Terminated outside the workspace, truncated after 30 s = 600 steps.
 
     ## Arguments
-    `floor=3.0`, `ceiling=7.0` in m, within (0, 10); `tilt=0.5` in rad, within (0, pi/3). For all
-    others see `SystemEnv`.
+    `floor=3.0`, `ceiling=7.0` in m, within $(0, 10)$; `tilt=0.5` in rad, within $(0, pi/3)$. For
+    all others see `SystemEnv`.
 
     ## Source
-    The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30); barriers and task are our choice.
+    The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30). Barriers and task are not from the thesis.
     """
 
     problem_factory = staticmethod(quadrotor_limits)

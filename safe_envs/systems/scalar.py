@@ -63,11 +63,11 @@ class Scalar(SystemEnv):
     """An unstable scalar system with noise is to stay below a limit.
 
     ## Description
-    The smallest system on which the conditions differ: near the limit a reciprocal one asks for
-    unbounded control.
+    The smallest system on which the conditions differ: near the limit a reciprocal condition
+    requires unbounded control.
 
     ## Equations
-    dx = (x + u) dt + sigma dW
+        dx = (x + u) dt + sigma dW
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -83,7 +83,9 @@ class Scalar(SystemEnv):
     The state.
 
     ## Barrier
-    h = limit - x, of relative degree 1 and unbounded above. Gain 1. Default filter: `scbf`.
+    $$h = limit - x$$
+
+    of relative degree 1 and unbounded above. Gain 1. Default filter: `scbf`.
 
     ## Noise
     `sigma` = .2 1/sqrt(s) (assumed).
@@ -92,16 +94,19 @@ class Scalar(SystemEnv):
     None.
 
     ## Reward
-    exp(-(2 (x/limit - 1))^2) a step, in (0, 1]: as near to the limit as can be. Our choice.
+    $$exp(-(2 (x/limit - 1))^2)$$
+
+    at each step, in (0, 1]: largest at the limit. Not from the thesis.
 
     ## Nominal controller
-    u = limit - 2 x: it makes the closed loop dx = (limit - x) dt + sigma dW. Our choice.
+    $u = limit - 2 x$, which makes the closed loop $dx = (limit - x) dt + sigma dW$. Not from the
+    thesis.
 
     ## Start
-    `spread`: uniform in (-.9 limit, .9 limit). `origin`: 0. Our choice.
+    `spread`: uniform in $(-.9 limit, .9 limit)$. `origin`: 0. Not from the thesis.
 
     ## Episode end
-    Terminated outside the workspace, truncated after 5 s = 500 steps. Our choice.
+    Terminated outside the workspace, truncated after 5 s = 500 steps. Not from the thesis.
 
     ## Arguments
     `barrier={"limit": 1.0}`; for all others see `SystemEnv`.

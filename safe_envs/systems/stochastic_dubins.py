@@ -44,7 +44,9 @@ class StochasticDubins(SystemEnv):
     As `DubinsDisk`, with a known speed, a larger disk and noise in the position.
 
     ## Equations
-    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
+        dx = v cos(theta) dt + sigma_1 dW_1
+        dy = v sin(theta) dt + sigma_2 dW_2
+        dtheta = omega dt
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -58,34 +60,39 @@ class StochasticDubins(SystemEnv):
     | `omega` | turn rate | rad/s | [-10, 10] |
 
     ## Observation
-    x, y, cos(theta), sin(theta).
+    $x$, $y$, $cos(theta)$, $sin(theta)$.
 
     ## Barrier
-    h = r^2 - x^2 - y^2, of relative degree 2. Default filter: `scbf`, whose order-2 condition
-    cannot stay feasible on a compact set: with the full box it is met in about four steps of five.
-    Gains for the other conditions: 1, 1.
+    $$h = r^2 - x^2 - y^2$$
+
+    of relative degree 2. Default filter: `scbf`, whose condition of order 2 cannot stay feasible on
+    a compact set: with the default input bounds it is met in about four of five steps. Gains of the
+    other conditions: 1, 1.
 
     ## Noise
     `sigma_1`, `sigma_2` = .2 m/sqrt(s).
 
     ## Mismatch
-    None: plant and model have v = 2 m/s.
+    None: plant and model have $v = 2$ m/s.
 
     ## Reward
-    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
-    (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
-    circle alone would reward turning on the spot. Our choice.
+    $$(1 + d/R cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2)$$
+
+    at each step, at most about 1, where $d$ is the distance from $(.5 r, 0)$, $R = .75 r$, and $a$
+    the angle between the heading and the counterclockwise tangent. Without the factor with $a$,
+    turning on the spot would pay. Not from the thesis.
 
     ## Nominal controller
-    Turns towards a course that leads onto that circle and around it. Our choice.
+    Turns towards a course that leads onto that circle and around it. Not from the thesis.
 
     ## Start
-    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model.
-    `uniform`: without that condition.
+    `inward`: uniform in the disk and in heading, restricted to where $A h > 0$ for the model.
+    `uniform`: without that restriction.
 
     ## Episode end
-    Terminated outside the workspace, truncated after 5 s = 100 steps. At a control period of 50 ms
-    some short exits go unseen, so that a safety rate is a little higher than with a smaller one.
+    Terminated outside the workspace, truncated after 5 s = 100 steps. With a control period of 50
+    ms some short exits are not observed, so a safety rate is a little higher than with a shorter
+    one.
 
     ## Arguments
     `barrier={"radius": 3.0}`, the radius r in m; for all others see `SystemEnv`.

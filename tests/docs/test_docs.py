@@ -7,10 +7,12 @@ import base64
 import json
 import re
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
+from types import SimpleNamespace
 from typing import Any
 
 import nbformat
@@ -22,6 +24,7 @@ from matplotlib import pyplot as plt
 import safe_envs
 from safe_envs import ENV_IDS, agents, wrappers
 from safe_envs.agents.rare_events.estimate import estimate_rare
+from safe_envs.registry import make_problem
 from safe_envs.wrappers import CONDITIONS, LEARNED
 
 pytestmark = pytest.mark.slow
@@ -78,7 +81,8 @@ def test_every_page_is_in_the_navigation(pages_in_navigation: list[str]):
 @pytest.mark.parametrize("name", [*CONDITIONS, *LEARNED, "certified"])
 def test_page_of_a_condition_has_equation_guarantee_and_example(name: str, hook: Any):
     text = (DOCS / "filters" / f"{name}.md").read_text()
-    assert text.startswith(f"# {name}\n\n$$")
+    assert re.match(rf"# [A-Z][a-z-]+ .* \(.+\)\n\nName: `{name}`.*\n\n\$\$", text)
+    assert "**Source.** " in text
     assert all(
         f"**{part}" in text for part in ("When to use.", "Guarantee.", "Outside its assumptions.")
     )
@@ -181,6 +185,70 @@ def test_everything_public_is_in_the_reference(package: Any):
         module = getattr(getattr(package, name), "__module__", "")
         places = {f"{package.__name__}.{name}", f"{module}.{name}", module}
         assert places & shown or f"`{package.__name__}.{name}`" in written, name
+
+
+def test_formulas_of_docstrings_become_latex(hook: Any):
+    latex_of = hook("formulas").latex_of
+    assert latex_of("h = r^2 - x_1^2") == "h = r^{2} - x_{1}^{2}"
+    assert latex_of("2 v/(a b)") == r"2\, v/\left(a\, b\right)"
+    assert latex_of("2 v/(a b)", display=True) == r"\frac{2\, v}{a\, b}"
+    assert latex_of("(a + b)/c d", display=True) == r"\frac{a + b}{c}\, d"
+    assert latex_of("(a) (b)/c", display=True) == r"\frac{\left(a\right)\, \left(b\right)}{c}"
+    assert latex_of("exp(-.5 thetadot) <= 3e-5") == (
+        r"\exp\left({-0.5\, \dot{\theta}}\right) \leq 3 \cdot 10^{-5}"
+    )
+    assert latex_of("z_ref = abs(x' P)") == r"z_{\mathrm{ref}} = \lvert x^\top\, P \rvert"
+    for wrong in ("a +", "(a", "a ? b", "a) b", "="):
+        with pytest.raises(ValueError, match=r"has|is"):
+            latex_of(wrong)
+
+
+def test_pages_of_envs_have_each_equation_once_and_in_mathematics(hook: Any):
+    pages = hook("environments").env_pages()
+    for env_id in ENV_IDS:
+        name = env_id.split("/")[1].removesuffix("-v0")
+        page = pages[f"envs/{name}.md"]
+        assert re.match(rf"# .+ \({name}\)\n", page)
+        prose = re.sub(r"```.*?```|\$\$.*?\$\$|\$.*?\$|`[^`]*`", "", page, flags=re.DOTALL)
+        assert not re.search(
+            r"\^|theta|sqrt\(|exp\(|[a-z]_[a-z0-9]\b", re.sub(r"\(.*?\)", "", prose)
+        )
+        equations = page.split("## Equations")[1].split("## States")[0]
+        assert equations.count("$$\nd") == len(make_problem(env_id).plant.states)
+        assert page.split("## Barrier")[1].split("## Noise")[0].count("$$") in (0, 2)
+        assert {f"envs/{name}.png", f"envs/{name}-narrow.png"} <= set(pages)
+
+
+def test_the_repository_is_that_of_the_project_file(hook: Any, tmp_path: Path):
+    repository, config = hook("repository"), SimpleNamespace(repo_url="https://example.org/me")
+    text = "before <!-- link to the repository -->"
+    assert "[Repository](https://example.org/me)" in repository.on_page_markdown(text, config)
+    assert repository.on_page_markdown(text, SimpleNamespace(repo_url=None)) == "before "
+    (tmp_path / "pyproject.toml").write_text('[project.urls]\nRepository = "https://a.b/c"\n')
+    assert repository.repository_url(tmp_path / "pyproject.toml") == "https://a.b/c"
+
+
+def test_abbreviations_are_in_the_glossary():
+    glossary = (DOCS / "glossary.md").read_text()
+    for short in re.findall(
+        r"^\*\[(\w+?)s?\]", (DOCS / "assets/abbreviations.txt").read_text(), re.M
+    ):
+        assert re.search(rf"^\| {short} \|", glossary, re.MULTILINE), short
+
+
+def test_citations_are_the_same_everywhere():
+    cff = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    entries = re.findall(r"```bibtex\n(.*?)```", (DOCS / "citing.md").read_text(), re.DOTALL)
+    readme = (ROOT / "README.md").read_text()
+    assert len(entries) == 2
+    assert all(entry in readme for entry in entries)
+    assert cff["title"] in entries[0]
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert cff["version"] == version
+    assert f"{{{version}}}" in entries[0]
+    (thesis,) = (work for work in cff["references"] if work["type"] == "thesis")
+    assert thesis["title"] in entries[1]
+    assert thesis["authors"][0]["family-names"] in entries[1]
 
 
 def test_references_exist():

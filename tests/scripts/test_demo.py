@@ -20,7 +20,7 @@ def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, c
     for path in folder.iterdir():
         assert str(path) in out
         assert path.is_dir() or path.stat().st_size > 5000
-    assert out.count("safe [95 % interval]") == 2
+    assert "\n".join(out.split()).count("safe\n[95\n%") == 2
     assert "policy nominal" in out
     for name in demo.FILTERS:
         assert sum(line.startswith(name) for line in out.splitlines()) == 2

@@ -33,7 +33,7 @@ def learned(safe_envs_command, tmp_path):
 
 def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
     status, out, err = evaluate(
-        "--filter", "scbf", "--filter", "bayesian-scbf", "--json", "out.json"
+        "--filter", "scbf", "--filter", "bayesian-scbf", "--json", "out.json", "--timing"
     )
     assert (status, err) == (0, "")
     document = strictly("out.json")
@@ -93,7 +93,7 @@ def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate)
     assert f"{100 * min(row['learning']['rates']):.1f} %" in out
     assert row["episodes"] == 40
     bound = robust["posterior_bound"]
-    assert f" {bound_text(bound['probability'], bound['word'])} " in out
+    assert f" {bound_text(bound['probability'], bound['word'])}\n" in out
     assert f", {bound['word']} given the posterior, with probability delta" in out
     for text in (
         "20 episodes x 2 identifications",

@@ -19,8 +19,10 @@ from safe_envs.agents.evaluation.targets import Env, make_target
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import make_policy, policy_file
+from safe_envs.agents.policies.names import policy_file
+from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.integrators import Integrator
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
@@ -82,7 +84,8 @@ class ResolvedEvaluation:
         for settings in self._alone.values():
             settings.require_fit(self.problem, spec.objective)
         self._in_use: list[lone_filters.LoneFilter] = []
-        self._texts = {name: _checked(name, self.problem) for name in texts}
+        known = self.problem.plant if spec.knowledge == "plant" else self.problem.model
+        self._texts = {name: _checked(name, self.problem, known) for name in texts}
         self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
         if self.target.filter_spec is not None and self.learning.missing():
             raise ConfigurationError(
@@ -258,8 +261,14 @@ def _require_third_party(spec: EvaluationSpec) -> None:
         )
 
 
-def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """Return the text of a filter with all parameters; None where it has to be learned first."""
+def _checked(name: str, problem: SafetyProblem, known: ControlAffineSDE) -> str | None:
+    """Return the text of a filter with all parameters; None where it has to be learned first.
+
+    Args:
+        name: of the filter, as it was given.
+        problem: whose barriers it is for.
+        known: the system that it knows.
+    """
     if name == UNFILTERED:
         return UNFILTERED
     if UNFILTERED in name.split("+"):
@@ -274,7 +283,11 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
     if learned_parts(name):
         require_readable(name, problem)
         return None
-    return spec_of(parse_conditions(name, problem))
+    conditions = parse_conditions(name, problem)
+    # What does not suit a barrier is an error before tables are read, which may take long.
+    for condition, barrier in zip(conditions, problem.barriers, strict=True):
+        condition.constraint(known, barrier)
+    return spec_of(conditions)
 
 
 def _describe(problem: SafetyProblem) -> dict[str, Any]:

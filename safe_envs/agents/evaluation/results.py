@@ -8,21 +8,25 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.bound_text import continuous_text, held_text
 from safe_envs.agents.evaluation.comparison import Comparison
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.evaluation_table import evaluation_table
+from safe_envs.agents.evaluation.frames import frame_of, row_columns
+from safe_envs.agents.evaluation.html_table import html_table
+from safe_envs.agents.evaluation.latex_table import latex_table
 from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
 from safe_envs.agents.evaluation.safe_flags import SafeFlags
-from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
+from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.agents.evaluation.yardstick import best_document
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.text_tables import markdown_of, text_of
 from safe_envs.wrappers.learning import LearnedModel
 
-_TEXT_TITLES = ("continuous", "min h, median", "violations", "intervened", "infeasible", "return")
+_WIDTH = 80
+"""Of texts, in characters."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,9 @@ class Timing:
     rows: list[FilterTiming]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Evaluation:
-    """The result of `evaluate`. `print` shows it as a table.
+    """The result of `evaluate`. `print` and notebooks show it as a table.
 
     Attributes:
         problem: what was simulated.
@@ -157,7 +161,7 @@ class Evaluation:
                     found.setdefault(key, []).append(values)
         return {key: np.concatenate(parts) for key, parts in found.items()}
 
-    def to_dataframe(self, episodes: bool = False) -> Any:
+    def to_frame(self, episodes: bool = False) -> Any:
         """Return a pandas DataFrame with a row for each filter, or for each episode.
 
         Args:
@@ -167,43 +171,30 @@ class Evaluation:
             ConfigurationError: pandas is not installed, or the episodes were not kept: see
                 `episodes`.
         """
-        try:
-            import pandas as pd  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise ConfigurationError(
-                "to_dataframe needs pandas, which is not installed: pip install pandas, or use"
-                " rows or episode_columns()"
-            ) from error
-        if episodes:
-            return pd.DataFrame(self.episode_columns())
-        nested = ("curve", "posterior_bound", "learning")
-        return pd.DataFrame(
-            [{k: v for k, v in row.as_dict().items() if k not in nested} for row in self.rows]
-        )
+        return frame_of(self.episode_columns() if episodes else row_columns(self))
+
+    def to_latex(self) -> str:
+        """Return the table and the comparisons for a paper, in LaTeX with booktabs."""
+        return latex_table(self)
+
+    def to_markdown(self) -> str:
+        """Return the table in Markdown, in parts that fit a page."""
+        table = evaluation_table(self)
+        tables = [markdown_of(each) for each in table.arranged(_WIDTH)]
+        return "\n\n".join([tables[0], *table.facts, *tables[1:]])
+
+    @property
+    def about(self) -> str:
+        """Policy, number of episodes, and seed."""
+        seed, policy = self.config["seed"], self.config["policy"]["name"]
+        return f"policy {policy} | {self.spec.episodes} episodes | seed {seed}"
 
     def __str__(self) -> str:
-        level = f"{100 * self.spec.confidence:.10g}"
-        titles = ("filter", "held input", f"safe [{level} % interval]", *_TEXT_TITLES)
-        table = [titles, *map(_text_cells, self.rows)]
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        lines = [
-            "  ".join(f"{cell:{'<' if i == 0 else '>'}{widths[i]}}" for i, cell in enumerate(cells))
-            for cells in table
-        ]
-        heading = f"{self.title}, policy {self.rows[0].policy}, {self.spec.episodes} episodes"
-        return "\n".join([heading, *lines])
+        table = evaluation_table(self).short()
+        tables = map(text_of, table.arranged(_WIDTH))
+        return "\n\n".join([f"{self.title} | {self.about}", *tables, *table.facts])
 
+    __repr__ = __str__
 
-def _text_cells(row: EvaluationRow) -> tuple[str, ...]:
-    filtered = row.filter != UNFILTERED
-    return (
-        row.filter,
-        held_text(row),
-        percent_in(row.safety_rate, row.ci_low, row.ci_high),
-        continuous_text(row),
-        f"{row.min_h_median:.3g}",
-        str(row.violations),
-        percent(row.intervention_rate) if filtered else "-",
-        percent(row.infeasible_rate) if filtered else "-",
-        f"{row.return_mean:.4g}",
-    )
+    def _repr_html_(self) -> str:
+        return html_table(self)

@@ -1,16 +1,15 @@
-"""The interface of a policy, its bases, and the name of the file of a saved one."""
+"""The interface of a policy, and its bases."""
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from safe_envs.agents.policies.names import POLICY_FILE as POLICY_FILE
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
 from safe_envs.errors import ConfigurationError, InvalidInputError, NotCompilableError
@@ -20,9 +19,6 @@ BLOCK = 128
 
 CHOOSE = "def choose(observation, step, k0, k1, data, work):\n"
 """How the function of a compiled program begins; see `Policy.source`."""
-
-POLICY_FILE = "policy.npz"
-"""Name of the file of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
 
 Spaces = tuple[gym.Space[Any], gym.Space[Any]]
 """The spaces of observations and of actions."""
@@ -182,18 +178,6 @@ def checked_observation(observation: Any, width: int) -> np.ndarray:
             f"the observation has shape {given.shape}; the policy takes ({width},) or (B, {width})"
         )
     return given
-
-
-def saved_policy_file(path: Path) -> Path | None:
-    """Return the file of a policy that was saved as data; None where the path names no such one.
-
-    Args:
-        path: of its folder, or of the file itself.
-    """
-    # Unlike a path, os.path takes any text for the name of a file.
-    if os.path.isdir(path):
-        return path / POLICY_FILE
-    return path if path.suffix == ".npz" else None
 
 
 def require_spaces(

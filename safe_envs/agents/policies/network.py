@@ -9,11 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.base import (
-    POLICY_FILE,
-    require_spaces,
-    saved_policy_file,
-)
+from safe_envs.agents.policies.base import require_spaces
+from safe_envs.agents.policies.names import POLICY_FILE, saved_policy_file
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, shortened

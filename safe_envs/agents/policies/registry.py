@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import os
-import re
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.base import POLICY_FILE, Policy, Spaces, saved_policy_file
+from safe_envs.agents.policies.base import Policy, Spaces
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.custom import as_policy
+from safe_envs.agents.policies.names import (
+    POLICIES,
+    POLICY_FILE,
+    is_place,
+    require_policy,
+    saved_policy_file,
+)
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
 from safe_envs.agents.policies.third_party import ModelPolicy
 from safe_envs.envs.env import action_box, observation_box
-from safe_envs.errors import ConfigurationError, nearest, shown
-from safe_envs.object_import import load_object, resolved
+from safe_envs.errors import ConfigurationError
+from safe_envs.object_import import load_object
 from safe_envs.plugins import POLICIES as POLICY_PLUGINS
-from safe_envs.plugins import load_plugin, module_of, plugin_names
+from safe_envs.plugins import load_plugin, plugin_names
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
 
@@ -28,11 +33,6 @@ _NAMED: dict[str, Any] = {
     "random": RandomPolicy,
     "best": BestPolicy,
 }
-
-POLICIES = tuple(_NAMED)
-"""Names that `make_policy` knows without any other package."""
-
-_PLACE = re.compile(r".+\.py:\w+|[^\W\d]\w*(\.\w+)*:\w+")
 
 
 def make_policy(
@@ -75,18 +75,13 @@ def make_policy(
         return _NAMED[name](problem)
     if name in plugin_names(POLICY_PLUGINS):
         return as_policy(load_plugin(POLICY_PLUGINS, name), problem, spaces)
-    if _is_place(name):
+    if is_place(name):
         return as_policy(load_object(name), problem, spaces)
     if saved_policy_file(Path(name)) is not None:
         from safe_envs.agents.policies.network import load_policy
 
         return load_policy(name, problem)
-    if not os.path.isfile(name):
-        known = (*POLICIES, *plugin_names(POLICY_PLUGINS))
-        raise ConfigurationError(
-            f"unknown policy {shown(name)}; {nearest(name, known)}, FILE.py:NAME, a folder of"
-            " `safe-envs train`, or the path of a Stable-Baselines3 .zip: there is no such file"
-        )
+    require_policy(name)
     return _make_of_archive(
         Path(name), spaces or (observation_box(problem), action_box(problem)), trust
     )
@@ -122,34 +117,3 @@ def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
             " holds no code"
         )
     return SB3Policy(path, *spaces)
-
-
-def policy_file(name: str) -> Path | None:
-    """Return the file that `make_policy` reads; None for the name of a policy and MODULE:NAME."""
-    if name in POLICIES or name in plugin_names(POLICY_PLUGINS):
-        return None
-    if _is_place(name):
-        source = name.rpartition(":")[0]
-        return Path(source) if source.endswith(".py") else None
-    return saved_policy_file(Path(name)) or Path(name)
-
-
-def policy_module(name: str) -> str | None:
-    """Return the module of a policy that is MODULE:NAME or of a package; None for others."""
-    if name in POLICIES:
-        return None
-    if name in plugin_names(POLICY_PLUGINS):
-        return module_of(POLICY_PLUGINS, name)
-    source = name.rpartition(":")[0]
-    return source if _is_place(name) and not source.endswith(".py") else None
-
-
-def absolute_policy(name: str) -> str:
-    """Return the name of a policy with the whole path of its file, valid in any folder."""
-    if _is_place(name):
-        return resolved(name)
-    return os.path.realpath(name) if policy_file(name) and os.path.exists(name) else name
-
-
-def _is_place(name: str) -> bool:
-    return _PLACE.fullmatch(name) is not None and not os.path.exists(name)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import absolute_policy, policy_file, policy_module
+from safe_envs.agents.policies.names import absolute_policy, policy_file, policy_module
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.wrappers.conditions.text_parts import files_of, modules_of, with_absolute_paths
 

@@ -5,33 +5,164 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.scripts.options.console import Quiet, quietly, run, with_quiet
+from safe_envs.scripts.options.help_text import (
+    GroupedCommand,
+    heading,
+    sections_of,
+    write_sections,
+)
 
 _NAME = "safe-envs"
 
 
-def make_app(commands: Mapping[str, Callable[..., None]]) -> typer.Typer:
-    """Return the app of some commands.
+@dataclass(frozen=True)
+class CommandEntry:
+    """A command as the help lists it; its module is imported when it is used.
+
+    Attributes:
+        name: of the command.
+        panel: group of the help that it is in.
+        place: MODULE:NAME of its function, whose parameters are the options.
+        about: first sentence of its help.
+    """
+
+    name: str
+    panel: str
+    place: str
+    about: str
+
+
+class _Commands(MutableMapping[str, Any]):
+    """Commands by name, each made when it is first asked for."""
+
+    def __init__(self, entries: Sequence[CommandEntry]) -> None:
+        self.entries = {entry.name: entry for entry in entries}
+        self._made: dict[str, Any] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._made:
+            module, _, function = self.entries[name].place.partition(":")
+            self._made[name] = _made(name, getattr(import_module(module), function))
+        return self._made[name]
+
+    def __setitem__(self, name: str, command: Any) -> None:
+        self._made[name] = command
+
+    def __delitem__(self, name: str) -> None:
+        del self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self.entries, **self._made})
+
+    def __len__(self) -> int:
+        return len({**self.entries, **self._made})
+
+
+class _Group(TyperGroup):
+    """A group whose help lists the commands in groups, without importing them."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands."""
+        return list(self.commands)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the name, the command and the rest of a command line.
+
+        Raises:
+            ConfigurationError: There is no such command.
+        """
+        if not args[0].startswith("-") and args[0] not in self.commands:
+            raise ConfigurationError(
+                f"unknown command {shown(args[0])}; {nearest(args[0], self.commands)};"
+                f" `{_NAME} --help` lists all"
+            )
+        return super().resolve_command(ctx, args)
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands and then the options of all; called to format the help."""
+        found: dict[str, list[tuple[str, str]]] = {}
+        entries = getattr(self.commands, "entries", {}).values()
+        for entry in entries:
+            found.setdefault(entry.panel, []).append((entry.name, entry.about))
+        write_sections(formatter, found)
+        options = [row for rows in sections_of(self.get_params(ctx)).values() for row in rows]
+        write_sections(formatter, {"Options": options})
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write what to do next."""
+        with formatter.section(heading("More")):
+            formatter.write_text("`safe-envs COMMAND --help` lists the options of a command.")
+
+
+def make_app(entries: Sequence[CommandEntry]) -> typer.Typer:
+    """Return the app of commands, which imports a command when it is used.
 
     Args:
-        commands: functions with the options as parameters, by the name of the command.
+        entries: in the order of the help.
     """
-    app = typer.Typer(name=_NAME, no_args_is_help=True, pretty_exceptions_enable=False)
+
+    class OfEntries(_Group):
+        def __init__(self, **attributes: Any) -> None:
+            super().__init__(**attributes)
+            self.commands = _Commands(entries)
+
+    app = _bare_app(OfEntries)
 
     @app.callback()
-    def options_of_all(context: typer.Context, quiet: Quiet = False) -> None:
+    def options_of_all(
+        context: typer.Context,
+        quiet: Quiet = False,
+        version: Annotated[
+            bool,
+            typer.Option(
+                "--version", help="Print the version.", is_eager=True, callback=_print_version
+            ),
+        ] = False,
+    ) -> None:
         """Safety-critical systems as Gymnasium envs, and safety filters over any policy."""
         context.with_resource(quietly(quiet))
 
-    for name, command in commands.items():
-        app.command(name, help=_unwrapped(inspect.getdoc(command)))(with_quiet(command))
     return app
+
+
+def _bare_app(group: type[TyperGroup]) -> typer.Typer:
+    return typer.Typer(
+        name=_NAME,
+        cls=group,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+
+
+def _made(name: str, function: Callable[..., None]) -> Any:
+    """Return the command of a function with its options as parameters."""
+    app = _bare_app(TyperGroup)
+    text = _unwrapped(inspect.getdoc(function))
+    app.command(name, help=text, cls=GroupedCommand)(with_quiet(function))
+    # With a callback Typer makes a group of any number of commands.
+    app.callback()(lambda: None)
+    found: Any = typer.main.get_command(app)
+    return found.commands[name]
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from safe_envs import __version__
+
+        typer.echo(f"{_NAME} {__version__}")
+        raise typer.Exit
 
 
 def run_app(app: typer.Typer, *words: str) -> None:
@@ -41,7 +172,9 @@ def run_app(app: typer.Typer, *words: str) -> None:
         app: with the commands.
         *words: before those of the command line.
     """
-    run(lambda: _command(app)([*words, *sys.argv[1:]], prog_name=_NAME))
+    arguments = [*words, *sys.argv[1:]]
+    status = run(lambda: _command(app).main(arguments, prog_name=_NAME, standalone_mode=False))
+    sys.exit(status if isinstance(status, int) else 0)
 
 
 def run_alone(name: str, command: Callable[..., None]) -> None:
@@ -51,11 +184,14 @@ def run_alone(name: str, command: Callable[..., None]) -> None:
         name: of the command.
         command: the function with its options as parameters.
     """
-    run_app(make_app({name: command}), name)
+    place = f"{command.__module__}:{command.__name__}"
+    app = make_app([CommandEntry(name, "Commands", place, "")])
+    _command(app).commands[name] = _made(name, command)
+    run_app(app, name)
 
 
 def _unwrapped(text: str | None) -> str:
-    """Return paragraphs as one line each, which Typer wraps to the width of the terminal."""
+    """Return paragraphs as one line each, which are wrapped to the width of the terminal."""
     return re.sub(r"(?<!\n)\n(?!\n)", " ", text or "")
 
 

@@ -4,32 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from safe_envs import plugins
 from safe_envs.systems import ENV_IDS
-
-FILTERS = (
-    "none",
-    "cbf",
-    "ecbf",
-    "hocbf",
-    "rcbf",
-    "srcbf",
-    "szcbf",
-    "scbf",
-    "learned-hocbf",
-    "ddscbf",
-    "bayesian-scbf",
-    "certified",
-    "promise",
-    "backup",
-)
-"""Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""
-
-POLICIES = ("nominal", "clf", "zero", "random", "best")
-"""Names of policies, as `safe_envs.agents.policies.registry` knows them."""
-
-ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ppo-lag", "sac-lag")
-"""Names of algorithms, as `safe_envs.agents.training.hyperparameters` knows them."""
 
 
 def env_ids(incomplete: str) -> list[str]:
@@ -53,10 +28,23 @@ def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
 
 def filters(incomplete: str) -> list[str]:
     """Names of filters, those of installed packages too."""
-    return words((*FILTERS, *plugins.plugin_names(plugins.CONDITIONS)))(incomplete)
+    from safe_envs.wrappers.conditions.names import BY_THEMSELVES, condition_names
+
+    return words(("none", *condition_names(), *BY_THEMSELVES))(incomplete)
 
 
-policies, algorithms = words(POLICIES), words(ALGORITHMS)
+def policies(incomplete: str) -> list[str]:
+    """Names of policies."""
+    from safe_envs.agents.policies.names import POLICIES
+
+    return words(POLICIES)(incomplete)
+
+
+def algorithms(incomplete: str) -> list[str]:
+    """Names of algorithms."""
+    from safe_envs.agents.training.hyperparameters import ALGORITHMS
+
+    return words(ALGORITHMS)(incomplete)
 
 
 def artefacts(incomplete: str) -> list[str]:

@@ -5,31 +5,29 @@ from __future__ import annotations
 import errno
 import functools
 import inspect
-import io
 import json
 import os
-import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-from rich.table import Table
-from rich.text import Text
 
 from safe_envs.atomic_io import require_writable, write_json
-from safe_envs.errors import SafeEnvsError, shortened
+from safe_envs.errors import SafeEnvsError, nearest, shortened, shown
 from safe_envs.scripts.options.number_options import strict
 
-_LEAST_WIDTH = 104
-_PIPE_WIDTH = 240
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+_UsageError: Any = typer.BadParameter.__mro__[1]
+"""The error of a command line that Typer cannot read, whichever Click it builds on."""
+
 _LONGEST = 2000
 """Characters of an error, at most: messages of third-party code or files have any length."""
 
@@ -46,6 +44,9 @@ _UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", 
 
 STDOUT = Path("-")
 """The file of --json that means standard output, where nothing else is printed then."""
+
+_TO_STDOUT = ("json", "json_file", "latex")
+"""Parameters of commands whose file may be standard output."""
 
 Quiet = Annotated[
     bool,
@@ -68,35 +69,6 @@ class _Terminal:
 
     quiet = False
     silent = False
-
-
-class _Tables(Console):
-    """A console that leaves out all but tables."""
-
-    def print(self, *objects: Any, **how: Any) -> None:
-        tables = [found for found in objects if isinstance(found, Table)]
-        if tables:
-            super().print(*tables, **how)
-
-
-class _Trimmed(io.TextIOBase):
-    """A stream without the blanks at the ends of the lines of a table."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The encoding, which decides on the characters that draw tables."""
-        return self._stream.encoding
-
-    def write(self, text: str, /) -> int:
-        """Write whole lines, as a console does."""
-        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
-
-    def flush(self) -> None:
-        """See `io.TextIOBase`."""
-        self._stream.flush()
 
 
 @contextmanager
@@ -126,7 +98,7 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
-        with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
+        with quietly(quiet, silent=STDOUT in map(arguments.get, _TO_STDOUT)):
             command(**arguments)
 
     option = inspect.Parameter(
@@ -156,21 +128,24 @@ def with_signature(
 
 
 def stdout() -> Console:
-    """Return the console for results, wide enough for tables."""
-    kind = _Tables if _Terminal.quiet else Console
-    if sys.stdout.isatty():
-        return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
-    trimmed: Any = _Trimmed(sys.stdout)
-    return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
+    """Return the console for results, as wide as the terminal; without one, 80 characters."""
+    from safe_envs.scripts.options.result_console import result_console
+
+    return result_console(_Terminal.quiet, _Terminal.silent)
 
 
-def say(console: Console, text: str | Text) -> None:
-    """Print a text as it is, in lines of any length.
+def say(console: Console, text: str | Text, wrap: bool = True) -> None:
+    """Print a text: on a terminal in lines of its width, elsewhere in lines as they are.
 
     Args:
         console: to print on.
         text: to print; markup in a str is not interpreted.
+        wrap: whether the lines may be wrapped; a command that is to be copied may not.
     """
+    if wrap:
+        from safe_envs.scripts.options.wrapping import wrapped_for
+
+        text = wrapped_for(console, text)
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
@@ -202,16 +177,26 @@ def write_result(path: Path | None, document: Callable[[], Any]) -> None:
         write_json(path, document())
 
 
-def run(command: Callable[[], object]) -> None:
-    """Run a command; an error of the user ends it with a message and the exit status 2."""
+def run(command: Callable[[], object]) -> object:
+    """Run a command, and return what it returns.
+
+    An error of the user ends the process with a message and the exit status 2.
+    """
     try:
         with _terminable():
             try:
-                command()
+                return command()
             finally:
                 sys.stdout.flush()
     except SafeEnvsError as error:
         _fail(str(error))
+    except _UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            error.show()
+            sys.exit(2)
+        _fail(_usage_text(error))
+    except typer.Abort:
+        sys.exit(130)
     except BrokenPipeError:
         # The reader of the output has closed it.
         _drop_output()
@@ -268,12 +253,29 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _usage_text(error: Any) -> str:
+    """Return what is wrong with a command line, in one line, and how to see what it takes."""
+    kind, parameter = type(error).__name__, getattr(error, "param", None)
+    text = error.message or error.format_message()
+    if parameter is not None:
+        option = max(parameter.opts, key=len)
+        name = option if option.startswith("-") else parameter.metavar or parameter.name
+        if kind != "MissingParameter":
+            return f"{name} {text}"
+        text = f"{name} is missing"
+    elif kind == "NoSuchOption":
+        given = str(error.option_name)
+        options = [name for each in error.ctx.command.params for name in each.opts]
+        text = f"unknown option {shown(given)}; {nearest(given, options)}"
+    command = error.ctx.command_path if error.ctx is not None else "safe-envs"
+    return f"{' '.join(text.split()).rstrip('.')}; `{command} --help` shows the options"
+
+
 def _fail(message: str) -> NoReturn:
-    Console(stderr=True).print(
-        f"[bold red]Error:[/] [red]{escape(shortened(message, _LONGEST))}[/]",
-        soft_wrap=True,
-        highlight=False,
-    )
+    colour = False if os.environ.get("NO_COLOR") else None
+    title = typer.style("Error:", fg="red", bold=True)
+    text = typer.style(shortened(message, _LONGEST), fg="red")
+    typer.echo(f"{title} {text}", err=True, color=colour)
     sys.exit(2)
 
 
@@ -286,12 +288,7 @@ def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
     if _Terminal.quiet or not sys.stderr.isatty():
         yield None
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=1.0)
-        yield lambda done: bar.update(task, completed=done)
+    from safe_envs.scripts.options.result_console import progress
+
+    with progress(what) as tell:
+        yield tell

@@ -22,9 +22,8 @@ def _annotation(option: Field[Any]) -> Any:
     """Return the annotation by which typer reads an option."""
     text = list[str] if option.metadata["repeatable"] else str
     kind = _KINDS[option.name] if option.metadata["reader"] is None else text | None
-    return Annotated[
-        kind, typer.Option(metavar=option.metadata["metavar"], help=option.metadata["help"])
-    ]
+    given = {name: option.metadata[name] for name in ("metavar", "help")}
+    return Annotated[kind, typer.Option(min=option.metadata["least"], **given)]
 
 
 def _flag(name: str) -> str:
@@ -35,7 +34,7 @@ _OPTIONS: dict[str, Any] = {
     "env_id": Annotated[
         str | None,
         typer.Argument(
-            metavar="[ENV_ID]",
+            metavar="ENV_ID",
             help="Registered id; `safe-envs list` shows all.",
             show_default=False,
             autocompletion=completion.env_ids,
@@ -98,6 +97,10 @@ class EnvOptions:
             if value is not None
         }
 
+    def require_known(self) -> None:
+        """Raise ConfigurationError where the env is unknown or an option cannot be read."""
+        _ = self.full_id, self.arguments
+
     def evaluate_command(self, *words: str) -> str:
         """Return a command line that evaluates something in the same env, quoted for a shell.
 
@@ -130,7 +133,11 @@ def with_env(command: Callable[..., None], without: Sequence[str] = ()) -> Calla
             for name, value in given.items()
             if name not in ("env_id", "system") and value not in (None, [])
         }
-        command(env=EnvOptions(given["env_id"], given["system"], changes), **arguments)
+        env = EnvOptions(given["env_id"], given["system"], changes)
+        # A third-party env need not be among the ids; its name shows to be wrong when it is made.
+        if not arguments.get("filter_spec"):
+            env.require_known()
+        command(env=env, **arguments)
 
     found: list[inspect.Parameter] = []
     for parameter in inspect.signature(command, eval_str=True).parameters.values():

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options import completion, early_checks, text_options
 
 LEARNED_PARAMETERS = (
     "learned-hocbf:p=..:level=.95:eps=.. (quantile of the held-out errors that is the margin, or"
@@ -22,6 +22,7 @@ Filters = Annotated[
         "--filter",
         metavar="NAME",
         autocompletion=completion.filters,
+        callback=early_checks.known_filters,
         help=(
             "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf,"
             " ddscbf, bayesian-scbf; certified:file=FILE, of a barrier certificate; with "
@@ -38,6 +39,7 @@ Policy = Annotated[
     typer.Option(
         metavar="NAME|FOLDER|FILE",
         autocompletion=completion.policies,
+        callback=early_checks.known_policy,
         help=(
             "nominal, clf, zero, random, best (as safe as a table shows to be possible), a policy"
             " of your own as FILE.py:NAME, a folder of `safe-envs train`, or with --trust a .zip of"
@@ -59,6 +61,7 @@ Objective = Annotated[
     str,
     typer.Option(
         metavar="nearest|clf",
+        callback=early_checks.one_of("objective", ("nearest", "clf")),
         help="Of the filters: the action nearest to the policy's, or the joint QP with the goal.",
     ),
 ]
@@ -70,15 +73,20 @@ Learned = Annotated[
         help="What `safe-envs identify` wrote, for the learned filters. Repeatable.",
     ),
 ]
-Episodes = Annotated[int | None, typer.Option(help="Episodes for each filter. [1000]")]
+Episodes = Annotated[int | None, typer.Option(min=1, help="Episodes for each filter. [1000]")]
 Repeats = Annotated[
     int,
     typer.Option(
-        help="How often to learn, with new seeds: intervals are over identifications too."
+        min=1, help="How often to learn, with new seeds: intervals are over identifications too."
     ),
 ]
 Confidence = Annotated[
-    float, typer.Option(metavar="C", help="Of all intervals, above 0 and below 1.")
+    float,
+    typer.Option(
+        metavar="C",
+        callback=early_checks.between_0_and_1("confidence"),
+        help="Of all intervals, above 0 and below 1.",
+    ),
 ]
 Refine = Annotated[
     bool,
@@ -113,6 +121,7 @@ Monitoring = Annotated[
     str,
     typer.Option(
         metavar="discrete|continuous",
+        callback=early_checks.one_of("monitoring", ("discrete", "continuous")),
         help="Check h at control instants only, or by Brownian bridges between them too.",
     ),
 ]
@@ -132,15 +141,16 @@ Repetitions = Annotated[
 ]
 NumEnvs = Annotated[
     int | None,
-    typer.Option(help="Episodes side by side; it changes the speed, not the answer. [1024]"),
+    typer.Option(min=1, help="Episodes side by side; it changes the speed, not the answer. [1024]"),
 ]
 Jobs = Annotated[
     int | None,
     typer.Option(
+        min=1,
         help=(
             "Processes, or threads of the compiled engine; they change the speed, not the answer."
             " [1, or all]"
-        )
+        ),
     ),
 ]
 JsonOut = Annotated[
@@ -152,6 +162,20 @@ JsonOut = Annotated[
             " nothing else there."
         ),
     ),
+]
+Latex = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help=(
+            "Write the table and the comparisons in LaTeX, with booktabs; - for stdout, and nothing"
+            " else there."
+        ),
+    ),
+]
+Timing = Annotated[
+    bool,
+    typer.Option("--timing", help="Print the times too: of learning, and steps per second."),
 ]
 EpisodesOut = Annotated[
     Path | None,

@@ -32,6 +32,8 @@ def strict(parameter: inspect.Parameter) -> inspect.Parameter:
 
 
 def _reader(kind: type[int] | type[float], least: float | None) -> Callable[[Any], int | float]:
+    what = "a whole number" if kind is int else "a number"
+
     def read(text: Any) -> int | float:
         try:
             # A default is a number already.
@@ -39,11 +41,9 @@ def _reader(kind: type[int] | type[float], least: float | None) -> Callable[[Any
         except ValueError:
             number = None
         if number is None or (kind is int and not isinstance(number, int)):
-            raise typer.BadParameter(
-                f"{shown(text)} is not a valid {'integer' if kind is int else 'float'}."
-            )
+            raise typer.BadParameter(f"= {shown(text)}; give {what}")
         if least is not None and number < least:
-            raise typer.BadParameter(f"{shown(number)} is not in the range x>={least}.")
+            raise typer.BadParameter(f"= {shown(number)}; give {what} from {least}")
         return kind(number)
 
     return read

@@ -12,9 +12,15 @@ import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.scripts.options import early_checks
 from safe_envs.scripts.options.console import STDOUT
 
-Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
+KNOWLEDGE = early_checks.one_of("knowledge", ("model", "plant"))
+
+Knowledge = Annotated[
+    str,
+    typer.Option(metavar="model|plant", callback=KNOWLEDGE, help="What the filters know."),
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -25,11 +31,12 @@ Trust = Annotated[
         ),
     ),
 ]
-Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 Engine = Annotated[
     str,
     typer.Option(
         metavar="auto|numpy|compiled",
+        callback=early_checks.one_of("engine", ("auto", "numpy", "compiled")),
         help=(
             "What simulates: NumPy, or a program that is compiled once, which needs Numba. auto"
             " takes that for long runs."
@@ -45,6 +52,7 @@ def require_outputs(
     *,
     out: Path | None = None,
     episodes_out: Path | None = None,
+    latex: Path | None = None,
     inputs: Iterable[tuple[str, Path]] = (),
 ) -> None:
     """Check, before any work, that --out, --json and --plot can be written to different files.
@@ -54,6 +62,7 @@ def require_outputs(
         plot: of --plot, if given.
         out: of --out, where a command has it.
         episodes_out: of --episodes-out, where a command has it.
+        latex: of --latex, where a command has it.
         inputs: options and the files that they read, which are not to be overwritten.
 
     Raises:
@@ -63,10 +72,11 @@ def require_outputs(
     for option, path in (
         ("--out", out),
         ("--json", json),
+        ("--latex", latex),
         ("--episodes-out", episodes_out),
         ("--plot", plot),
     ):
-        if path is None or (option == "--json" and path == STDOUT):
+        if path is None or (option in ("--json", "--latex") and path == STDOUT):
             continue
         require_writable(path)
         place = os.path.realpath(path)
@@ -88,8 +98,8 @@ def _require_format(path: Path) -> None:
     # Not imported before it is needed: completion has to be quick.
     from matplotlib.backend_bases import FigureCanvasBase
 
-    # pgf is left out: it needs a TeX installation.
-    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})
+    # pgf is left out, which needs a TeX installation, and svgz, which holds the time.
+    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf", "svgz"})
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in formats:
         raise ConfigurationError(
@@ -116,7 +126,7 @@ def inputs_of(
     Returns:
         Pairs of option and file.
     """
-    from safe_envs.agents.policies.registry import policy_file
+    from safe_envs.agents.policies.names import policy_file
 
     for option, place in (("--system", system), ("--filter-spec", filter_spec)):
         source = (place or "").rpartition(":")[0]

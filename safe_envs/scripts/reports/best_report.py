@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.best_text import COMPUTED, outwards
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import COMPUTED, outwards
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.tables import print_rows
 
 _COUNTED = {
     "violation": "leaving the workspace in the safe set counts as a violation",
@@ -63,23 +63,24 @@ def print_best(console: Console, answer: BestAnswer) -> None:
     word = ("met", "some policy meets it as often", "no policy meets it more often")
     if not found.specification:
         word = ("safe", "some policy is at least as safe", "no policy is safer")
-    table = make_table("lrl", "", word[0], "")
+    rows: list[tuple[str, str, str]] = []
     if found.lower is None or found.upper is None:
         ends = ("withheld", "withheld")
     else:
         ends = tuple(f"{end} %" for end in outwards(found.lower, found.upper))
-    table.add_row("lower", ends[0], word[1])
+    rows.append(("lower", ends[0], word[1]))
     s = found.simulated
     if s is not None:
         rate = percent_in(s.rate, s.low, s.high)
         told = f"greedy policy, {s.episodes} episodes, seed {s.seed}, {100 * s.confidence:g} %"
-        table.add_row("simulated", rate, f"{told} interval")
-    table.add_row("upper", ends[1], word[2])
+        rows.append(("simulated", rate, f"{told} interval"))
+    rows.append(("upper", ends[1], word[2]))
     if s is not None:
-        table.add_row(
-            "P(leave)", percent(s.leave_rate), f"of the greedy policy, while still {word[0]}"
-        )
-    print_whole(console, table)
+        told = f"of the greedy policy, while still {word[0]}"
+        rows.append(("P(leave)", percent(s.leave_rate), told))
+    console.print()
+    print_rows(console, "lrp", ("", word[0], ""), rows)
+    console.print()
     for line in _grid_lines(found):
         say(console, line)
     if found.contradiction:

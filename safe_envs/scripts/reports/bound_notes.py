@@ -1,4 +1,4 @@
-"""The bounds of filters in the table of an evaluation: columns that read as a chain, and notes.
+"""Notes on the bounds of filters in the table of an evaluation.
 
 Lower bound for held input <= measured rate <= attainable upper bound is one claim, of the env's own
 steps. The bound for continuous control is another one, and stands by itself.
@@ -8,21 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.bound_text import continuous_text, held_text
 from safe_envs.agents.evaluation.held_input import NO_FILTER
-from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.scripts.reports.best_text import outwards
 from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.wrappers.conditions.text_parts import name_by_itself, names_promise
 
-CHAIN = (
-    "from left to right, for the env's own steps: the bound for held input, the measured rate, and"
-    " what any policy can attain."
-)
-"""What the columns of the chain are."""
+CHAIN = "bound, held input <= safe <= attainable is a chain: all three are of the env's own steps."
+"""What the numbers of the chain are."""
 
 PROVED = (
     "continuous control, >=: proved at these starts for every policy, if the filter acts at every"
@@ -36,44 +29,6 @@ ESTIMATED = (
     " number undecided, for which a search found no counterexample; not a bound that is proved."
 )
 """What an estimated bound for continuous control is."""
-
-
-def chain_titles(interval: str, best: AttainableSafety | None) -> list[str]:
-    """Return the titles of the columns with the bounds and the rate.
-
-    Args:
-        interval: name of the interval of the rate.
-        best: attainable safety, if it is known.
-    """
-    attainable = ["attain-\nable"] * _is_known(best)
-    return ["bound,\nheld input", f"safe [{interval}]", *attainable, "bound,\ncontinuous"]
-
-
-def chain_cells(row: EvaluationRow, best: AttainableSafety | None) -> list[str]:
-    """Return the cells of these columns.
-
-    Args:
-        row: of an evaluation.
-        best: attainable safety, if it is known.
-    """
-    rate = percent_in(row.safety_rate, row.ci_low, row.ci_high)
-    return [held_text(row), rate, *attainable_text(best), continuous_text(row)]
-
-
-def attainable_text(best: AttainableSafety | None) -> list[str]:
-    """Return the upper end of the attainable safety, rounded up; none where it is not known.
-
-    Args:
-        best: attainable safety, if it is known; only a certified end stands after a sign.
-    """
-    if best is None or best.lower is None or best.upper is None:
-        return []
-    return [f"{'<= ' * is_certified(best)}{outwards(best.lower, best.upper)[1]} %"]
-
-
-def is_certified(best: AttainableSafety) -> bool:
-    """Return whether the upper end of the attainable safety is of a table that was checked."""
-    return best.check is not None and best.check.upper is not None
 
 
 def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
@@ -141,7 +96,3 @@ def _of_drawn_starts(rows: Sequence[EvaluationRow]) -> list[str]:
 
 def _any(rows: Sequence[BoundSummary], word: str) -> bool:
     return any(row.continuous_word == word for row in rows)
-
-
-def _is_known(best: AttainableSafety | None) -> bool:
-    return bool(attainable_text(best))

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
+from safe_envs.agents.evaluation.best_text import COMPUTED, attainable_text, is_certified
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
 from safe_envs.agents.evaluation.bound_text import (
     bound_text,
@@ -16,10 +17,8 @@ from safe_envs.agents.evaluation.bound_text import (
 )
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import COMPUTED
-from safe_envs.scripts.reports.bound_notes import attainable_text, is_certified
 from safe_envs.scripts.reports.quantities import share_text, state_text
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.results import HOLDING, Bound
 
@@ -57,17 +56,14 @@ def print_bounds(console: Console, answer: VerifyAnswer) -> None:
         if len(starts) == 1
         else f"on average over {len(starts)} starts {problem.start!r}"
     )
-    heading = f"{escape(where)}, T = {problem.duration:g} s"
-    console.print(
-        f"\n[bold]Bounds on the probability of no violation[/] {heading}", highlight=False
-    )
-    titles = ("", "bound", "value", "status", "why")
-    table = make_table("lprp", *titles, indent=True)
+    title = ("\nBounds on the probability of no violation", "bold")
+    say(console, Text.assemble(title, f" {where}, T = {problem.duration:g} s"))
+    rows = []
     for i, bound in enumerate(bounds, start=1):
         empty = bound.status in HOLDING and not bound.value
-        status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
-        table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
-    console.print(table)
+        status = Text.assemble((bound.status, _COLORS[bound.status]), ", but empty" * empty)
+        rows.append((str(i), bound.name, _value(bound), status, bound.reason))
+    print_rows(console, "lprpp", ("", "bound", "value", "status", "why"), rows)
     statuses = {bound.status for bound in bounds}
     for text in [_PROVED] * ("proved" in statuses) + [_ESTIMATED] * ("estimated" in statuses):
         say(console, text)
@@ -90,15 +86,15 @@ def print_measurements(console: Console, answer: VerifyAnswer) -> None:
     for found in answer.measurements:
         at = "" if found.state is None else f", {state_text(answer.problem, found.state)}"
         episodes = f"{found.episodes} episodes of the policy {answer.policy}"
-        heading = escape(f"from {found.start}{at}: {episodes}")
-        console.print(f"\n[bold]Measured[/] {heading}", highlight=False, soft_wrap=True)
+        heading = f" from {found.start}{at}: {episodes}"
+        say(console, Text.assemble(("\nMeasured", "bold"), heading))
         names = [bound.name for bound in found.horizons[0].bounds]
         titles = [f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names]
-        table = make_table("r", "T", "no violation [95 % interval]", *titles, indent=True)
+        rows = []
         for horizon in found.horizons:
-            rate = escape(percent_in(horizon.rate, horizon.ci_low, horizon.ci_high))
-            table.add_row(f"{horizon.time:g} s", rate, *_cells(horizon, names))
-        console.print(table)
+            rate = percent_in(horizon.rate, horizon.ci_low, horizon.ci_high)
+            rows.append((f"{horizon.time:g} s", rate, *_cells(horizon, names)))
+        print_rows(console, "r", ("T", "no violation [95 % interval]", *titles), rows)
         if found.repeats:
             say(console, "Nothing is random here: all episodes are one and the same.")
     if answer.measurements:
@@ -114,18 +110,21 @@ def print_chain(console: Console, answer: VerifyAnswer) -> None:
     """
     chain, problem = answer.chain, answer.problem
     heading = f"from the start {problem.start!r}, up to {problem.duration:g} s"
-    console.print(f"\n[bold]The env's own steps[/] {escape(heading)}", highlight=False)
+    say(console, Text.assemble(("\nThe env's own steps", "bold"), f" {heading}"))
     attainable = attainable_text(chain.best)
-    titles = ("bound,\nheld input", "safe [95 % interval]", *["attain-\nable"] * len(attainable))
-    table = make_table("r", *titles, "bound,\ncontinuous", indent=True)
+    titles = (
+        "bound, held\u00a0input",
+        "safe [95 % interval]",
+        *["attain\u00adable"] * len(attainable),
+        "bound, contin\u00aduous",
+    )
     rate = (
         "not measured"
         if chain.rate is None or chain.ci_low is None or chain.ci_high is None
         else percent_in(chain.rate, chain.ci_low, chain.ci_high)
     )
     cells = (held_text(chain.bounds), rate, *attainable, continuous_text(chain.bounds))
-    table.add_row(*map(escape, cells))
-    console.print(table)
+    print_rows(console, "r", titles, [cells], names=0)
     held = chain.bounds.held_note
     if held:
         none = chain.bounds.held_bound is None
@@ -151,11 +150,11 @@ def _value(bound: Bound) -> str:
     return f"({share_text(bound.value)})" if _in_brackets(bound) else share_text(bound.value)
 
 
-def _cells(horizon: Horizon, names: Sequence[str]) -> Iterator[str]:
+def _cells(horizon: Horizon, names: Sequence[str]) -> Iterator[str | Text]:
     bounds = {bound.name: bound for bound in horizon.bounds}
     for name in names:
         value = "" if bounds[name].value is None else _value(bounds[name])
-        contradicted = f"[red]{f'contradicted {value}'.strip()}[/]"
+        contradicted = Text(f"contradicted {value}".strip(), style="red")
         yield contradicted if name in horizon.contradicted else value or "withheld"
 
 

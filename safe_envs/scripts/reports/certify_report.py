@@ -15,7 +15,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.synthesis.certify import Certification
 from safe_envs.wrappers.value.look_ahead import LookAhead
@@ -54,7 +54,7 @@ class CertifyAnswer:
             degrees.append(
                 {
                     "degree": a.degree,
-                    "coefficients": a.members,
+                    "coeffi\u00adcients": a.members,
                     "program": c and c.program,
                     "sampled": c and c.mean,
                     "proved": j and (None if j.numbers.reason else j.mean),
@@ -104,11 +104,11 @@ def print_certification(console: Console, answer: CertifyAnswer) -> None:
     told = f" | barrier certificate for {whose} | start {problem.start}\n{describe_system(problem)}"
     say(console, Text.assemble((answer.title, "bold"), told))
     judged = {j.degree: j for j in found.judgements}
-    titles = ("degree", "coefficients", "linear\nprogram", "sampled", "proved", "a", "boxes")
-    table = make_table("r", *titles, "seconds")
+    titles = ("degree", "coeffi\u00adcients", "linear program", "sampled", "proved", "a", "boxes")
+    rows = []
     for a in found.attempts:
         c, j = a.candidate, judged.get(a.degree)
-        table.add_row(
+        cells = (
             str(a.degree),
             str(a.members),
             percent(c.program if c else None),
@@ -118,9 +118,14 @@ def print_certification(console: Console, answer: CertifyAnswer) -> None:
             f"{j.numbers.boxes:,}" if j else "-",
             f"{a.seconds + (j.seconds if j else 0.0):.1f}",
         )
-    print_whole(console, table)
+        rows.append(cells)
+    console.print()
+    print_rows(console, "r", (*titles, "seconds"), rows)
+    console.print()
     for line in (*_result_lines(answer), *_missing_lines(found)):
         say(console, line)
+    if found.certificate is not None:
+        say_written(console, answer.out)
 
 
 def _result_lines(answer: CertifyAnswer) -> list[str]:
@@ -157,13 +162,22 @@ def _result_lines(answer: CertifyAnswer) -> list[str]:
             f"No policy is safer than {percent(answer.upper)} with the env's own held input"
             " (computed; another claim than this one, of continuous control)"
         )
-    if answer.out is not None:
-        lines.append(f"Written to {answer.out}; check it with: safe-envs check {answer.out}")
     lines.append(
         "Note: the bound is of continuous control; the env holds its input for"
         f" {answer.problem.dt:g} s."
     )
     return lines
+
+
+def say_written(console: Console, out: Path | None) -> None:
+    """Print where a certificate is, and the command that checks it.
+
+    Args:
+        console: to print on.
+        out: its file, if one was asked for.
+    """
+    if out is not None:
+        say(console, f"Written to {out}; check it with: safe-envs check {out}", wrap=False)
 
 
 def _missing_lines(found: Certification) -> list[str]:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from safe_envs.errors import shortened
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.certificates.certificate import AnyCertificate, HeldCertificate
 from safe_envs.wrappers.certificates.check_result import CheckResult
 from safe_envs.wrappers.certificates.statements import EnvDifference
@@ -134,20 +134,25 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     say(console, answer.env.text)
     for name, result in answer.found.items():
         say(console, f"\nBy {_BY[name]}:")
-        table = make_table("llrrp", "statement", "word", "boxes", "seconds", "")
+        rows = []
         for part in result.parts:
             at = "" if part.state is None else f"at ({', '.join(f'{x:.6g}' for x in part.state)})"
             note = "; ".join(text for text in (at, part.reason) if text)
             boxes = f"{part.boxes:,}" if part.boxes else ""
             seconds = f"{part.seconds:.2f}" if part.seconds else ""
-            table.add_row(part.name, part.word, boxes, seconds, note)
-        print_whole(console, table)
+            rows.append((part.name, part.word, boxes, seconds, note))
+        console.print()
+        print_rows(console, "plrrp", ("statement", "word", "boxes", "seconds", ""), rows)
+        console.print()
     if answer.starts:
-        table = make_table("lr", names, "bound" if answer.word == "checked" else "not proved")
+        rows = []
         for start, bound in zip(answer.starts, answer.bounds(), strict=True):
             percent = math.floor(1e4 * bound) / 1e2
-            table.add_row(", ".join(f"{x:g}" for x in start), f">= {percent:.2f} %")
-        print_whole(console, table)
+            rows.append((", ".join(f"{x:g}" for x in start), f">= {percent:.2f} %"))
+        titles = (names, "bound" if answer.word == "checked" else "not proved")
+        console.print()
+        print_rows(console, "pr", titles, rows)
+        console.print()
     proof = "a proof of its bound" if answer.word == "checked" else "no proof of its bound"
     held = (
         f"for input that is held for {float(c.period):g} s"

@@ -8,31 +8,26 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from safe_envs.agents.evaluation.best_text import best_line, best_notes
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
-from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.evaluation_table import (
+    compared,
+    describe,
+    evaluation_table,
+    interval_name,
+    points,
+)
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
-from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import best_line, best_notes, times_column
-from safe_envs.scripts.reports.bound_notes import bound_notes, chain_cells, chain_titles
+from safe_envs.scripts.reports.bound_notes import bound_notes
 from safe_envs.scripts.reports.engine_notes import engine_notes
-from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.learned_notes import learned_notes
+from safe_envs.scripts.reports.tables import print_columns, print_rows
 
-_COLUMNS = (
-    "min h\nmedian",
-    "min h\n5 %",
-    "viola-\ntions",
-    "inter-\nvened",
-    "infeas-\nible",
-    "effort",
-    "return",
-    "steps/s",
-)
 _VERDICTS = {
     "converged": "converged, {}",
     "not resolved": "not resolved, {}: more episodes are needed",
@@ -41,38 +36,29 @@ _VERDICTS = {
 }
 
 
-def print_evaluation(console: Console, evaluation: Evaluation) -> None:
+def print_evaluation(console: Console, evaluation: Evaluation, timing: bool = False) -> None:
     """Print a heading, a row for each filter, comparisons, and notes.
 
     Args:
         console: to print on.
         evaluation: to print.
+        timing: whether to print the times too, which depend on the machine.
     """
-    interval = _interval(evaluation)
+    interval = interval_name(evaluation)
     say(console, heading(evaluation))
     if evaluation.best:
         say(console, best_line(evaluation.best))
-    learned = learned_columns(evaluation.rows)
-    times = times_column(evaluation.best, evaluation.rows)
-    extra = [*learned, *["times un-\navoidable"] * bool(times)]
-    chain = chain_titles(interval, evaluation.best)
-    table = make_table("pr", "filter", *chain, *extra, *_COLUMNS)
-    for i, (row, speed) in enumerate(zip(evaluation.rows, evaluation.timing.rows, strict=True)):
-        cells = [*[cell(row, speed) for cell in learned.values()], *times[i : i + 1]]
-        rest = _cells(row, speed.steps_per_second)
-        table.add_row(Text(row.filter), *chain_cells(row, evaluation.best), *cells, *rest)
-    print_whole(console, table)
-    compared = (
-        []
-        if evaluation.is_deterministic
-        else [c for c in evaluation.comparisons if UNFILTERED not in (c.first, c.second)]
-    )
-    if compared:
+    table = evaluation_table(evaluation, timing)
+    console.print()
+    print_columns(console, [table.names], table.columns, table.facts)
+    console.print()
+    differences = compared(evaluation)
+    if differences:
         say(console, f"Difference of the safety rates on the same episodes [{interval}]:")
-    for comparison in compared:
-        say(console, f"  {_describe(comparison)}")
-    notes = _notes(evaluation)
-    if compared and notes:
+    for comparison in differences:
+        say(console, f"  {describe(comparison)}")
+    notes = _notes(evaluation, timing)
+    if differences and notes:
         console.print()
     for note in notes:
         say(console, f"Note: {note}")
@@ -85,22 +71,25 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         console: to print on.
         refinement: to print.
     """
-    interval = _interval(refinement.evaluations[0])
+    interval = interval_name(refinement.evaluations[0])
     say(
         console,
         f"\nRefinement: safe [{interval}] with smaller control periods, from the same seeds but"
         " with noise that is not coupled",
     )
-    table = make_table("pr", "filter", *[f"dt = {dt:g} s" for dt in refinement.periods])
+    rows = []
     for row in refinement.rows:
         rates = zip(row.safety_rate, row.ci_low, row.ci_high, strict=True)
-        table.add_row(Text(row.filter), *[percent_in(*rate) for rate in rates])
-    print_whole(console, table)
+        rows.append([row.filter, *(percent_in(*rate) for rate in rates)])
+    titles = ("filter", *(f"dt = {dt:g} s" for dt in refinement.periods))
+    console.print()
+    print_rows(console, "lr", titles, rows)
+    console.print()
     if refinement.evaluations[0].is_deterministic:
         say(console, "Nothing is random here: what changes with the period, changes for sure.")
         return
     for row in refinement.rows:
-        change = _points(row.change, row.change_low, row.change_high)
+        change = points(row.change, row.change_low, row.change_high)
         say(console, f"  {row.filter}: {_VERDICTS[row.verdict].format(change, row.withheld)}")
     reach = f"{100 * TOLERANCE:g} points"
     say(
@@ -168,23 +157,7 @@ def describe_plant(problem: SafetyProblem) -> str:
     return f"{told}, {mismatch}"
 
 
-def _interval(evaluation: Evaluation) -> str:
-    return f"{100 * evaluation.config['confidence']:.10g} % interval"
-
-
-def _describe(comparison: Comparison) -> str:
-    first, second, p = comparison.first, comparison.second, comparison.mcnemar_p
-    difference = _points(comparison.difference, comparison.ci_low, comparison.ci_high)
-    if p is None:
-        return f"{first} - {second}: {difference}, over identifications and episodes"
-    return (
-        f"{first} - {second}: {difference}, McNemar p {'< 1e-10' if p < 1e-10 else f'= {p:.2g}'}"
-        f" (safe with one only: {first} {comparison.only_first}, {second}"
-        f" {comparison.only_second})"
-    )
-
-
-def _notes(evaluation: Evaluation) -> list[str]:
+def _notes(evaluation: Evaluation, timing: bool) -> list[str]:
     """Return what has to be known to read the table."""
     steps = evaluation.problem.steps
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
@@ -198,7 +171,9 @@ def _notes(evaluation: Evaluation) -> list[str]:
             notes.append(early_end(row.filter, "mean episode", length, steps))
     if evaluation.config["monitoring"] == "continuous":
         notes += bridge_notes(evaluation.problem)
-    notes += engine_notes([(row.filter, row.engine, row.jobs) for row in evaluation.timing.rows])
+    if timing:
+        speeds = evaluation.timing.rows
+        notes += engine_notes([(row.filter, row.engine, row.jobs) for row in speeds])
     if evaluation.is_deterministic:
         notes.append(
             "nothing is random here (no noise, a fixed start, a deterministic policy), so that all"
@@ -252,25 +227,3 @@ def early_end(name: str, which: str, length: float, steps: int) -> str:
         f"with {name} the {which} ends after {length:.1f} of {steps} steps, at the goal or outside"
         " the workspace; its safety is that of the instants until then."
     )
-
-
-def _cells(row: EvaluationRow, speed: float) -> list[str]:
-    filtered = row.filter != UNFILTERED
-    return [
-        f"{row.min_h_median:.3g}",
-        f"{row.min_h_p05:.3g}",
-        str(row.violations),
-        percent(row.intervention_rate) if filtered else "-",
-        percent(row.infeasible_rate) if filtered else "-",
-        "-" if row.effort_mean is None else f"{row.effort_mean:.3g}",
-        f"{row.return_mean:.4g}",
-        _thousands(speed),
-    ]
-
-
-def _points(difference: float, low: float, high: float) -> str:
-    return f"{100 * difference:+.1f} points [{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def _thousands(number: float) -> str:
-    return f"{number / 1e6:.2f} M" if number >= 1e6 else f"{number / 1e3:.0f} k"

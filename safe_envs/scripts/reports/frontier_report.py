@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.tables import print_rows
 
 _COUNTED = {
     "violation": "leaving the workspace counts as a violation",
@@ -37,18 +37,21 @@ def print_report(console: Console, title: str, found: Frontier) -> None:
         f"violations {confidence}",
         f"return {confidence}",
         "below the curve",
-        "least violations\nfor this return",
+        "least violations for this return",
     )
-    table = make_table("lr", *titles)
-    for point in (*found.points, *found.attained):
-        table.add_row(
+    rows = [
+        (
             point.name,
             percent_in(point.violation_rate, point.violation_low, point.violation_high),
             _return(point),
             f"{found.cost(point):.4g}",
             percent(found.needed(point)),
         )
-    print_whole(console, table)
+        for point in (*found.points, *found.attained)
+    ]
+    console.print()
+    print_rows(console, "lr", titles, rows)
+    console.print()
     grid = "x".join(map(str, values.safe_grid.counts))
     names = ", ".join(map(str, values.given.small.symbols))
     for line in (

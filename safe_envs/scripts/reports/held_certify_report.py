@@ -13,8 +13,9 @@ from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.certify_report import say_written
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.synthesis.held_synthesis import HeldAttempt, HeldCertification
 
 
@@ -67,11 +68,11 @@ class HeldCertifyAnswer:
             f" | start {self.problem.start}\n{describe_system(self.problem)}"
         )
         say(console, Text.assemble((self.title, "bold"), told))
-        titles = ("degree", "coefficients", "linear\nprogram", "sampled", "proved", "boxes")
-        table = make_table("r", *titles, "seconds")
+        titles = ("degree", "coeffi\u00adcients", "linear program", "sampled", "proved", "boxes")
+        rows = []
         for a in self.found.attempts:
             b = a.bound
-            table.add_row(
+            cells = (
                 str(a.degree),
                 str(a.members),
                 percent(None if a.program is None else max(0.0, a.program)),
@@ -80,9 +81,14 @@ class HeldCertifyAnswer:
                 f"{b.boxes:,}" if b else "-",
                 f"{a.seconds:.1f}",
             )
-        print_whole(console, table)
+            rows.append(cells)
+        console.print()
+        print_rows(console, "r", (*titles, "seconds"), rows)
+        console.print()
         for line in self._lines():
             say(console, line)
+        if self.found.certificate is not None:
+            say_written(console, self.out)
 
     def _lines(self) -> list[str]:
         found, c = self.found, self.found.certificate
@@ -111,8 +117,6 @@ class HeldCertifyAnswer:
             f" {m1} + {m2} + {e}, which costs {100 * lost * c.steps:.2g} % of c = 1",
             f"found and proved in {found.seconds:.3g} s",
         ]
-        if self.out is not None:
-            lines.append(f"Written to {self.out}; check it with: safe-envs check {self.out}")
         return [*lines, *notes]
 
 

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.identify_answer import STATES, Function, IdentifyAnswer
 from safe_envs.scripts.reports.quantities import relative_text
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.tables import print_rows
 
 _MOST_NAMED = 8
 _ERRORS = {
@@ -52,12 +51,12 @@ def print_report(console: Console, found: IdentifyAnswer) -> None:
     if record.errors:
         kind = _ERRORS[record.settings.get("way", found.learned.method)]
         say(console, Text.assemble(("\nHeld-out errors", "bold"), f": {kind}"))
-        console.print(_errors_table(record.errors))
+        _print_errors(console, record.errors)
     shown = [function for function in found.compared if not function.vanishes]
     if shown:
         what = f"the plant and what was learned of it at {STATES} fresh states"
         say(console, Text.assemble(("\nTruth against estimate", "bold"), f": {what}"))
-        console.print(_functions_table(shown))
+        _print_functions(console, shown)
     names = [function.name for function in found.compared if function.vanishes]
     if names:
         more = len(names) - _MOST_NAMED
@@ -67,11 +66,12 @@ def print_report(console: Console, found: IdentifyAnswer) -> None:
         console.print()
     for note in found.notes:
         say(console, f"Note: {note}")
-    say(console, f"\nWritten to {found.out}; to use it:\n  {found.use}")
+    say(console, f"\nWritten to {found.out}; to use it:")
+    say(console, f"  {found.use}", wrap=False)
 
 
-def _errors_table(errors: Mapping[str, float]) -> Table:
-    """Return errors by name, with a column for each kind if all names are "what kind"."""
+def _print_errors(console: Console, errors: Mapping[str, float]) -> None:
+    """Print errors by name, with a column for each kind if all names are "what kind"."""
     split = [tuple(name.rpartition(" ")[::2]) for name in errors]
     whats, kinds = (list(dict.fromkeys(parts)) for parts in zip(*split, strict=True))
     if len(split) < len(whats) * len(kinds) or not all(
@@ -79,16 +79,14 @@ def _errors_table(errors: Mapping[str, float]) -> Table:
     ):
         whats, kinds, split = list(errors), ["error"], [(name, "error") for name in errors]
     values = dict(zip(split, errors.values(), strict=True))
-    table = make_table("pr", "of", *kinds, indent=True)
-    for what in whats:
-        table.add_row(Text(what), *[_number(values[what, kind]) for kind in kinds])
-    return table
+    rows = [(what, *(_number(values[what, kind]) for kind in kinds)) for what in whats]
+    print_rows(console, "lr", ("of", *kinds), rows)
 
 
-def _functions_table(functions: Sequence[Function]) -> Table:
+def _print_functions(console: Console, functions: Sequence[Function]) -> None:
     units = any(function.unit for function in functions)
     titles = ("function", "truth, rms", "error, rms", "relative", "largest error")
-    table = make_table("prrrrl", *titles, *["unit"] * units, indent=True)
+    rows = []
     for function in functions:
         relative = "-" if function.relative is None else relative_text(function.relative)
         cells = [
@@ -97,8 +95,8 @@ def _functions_table(functions: Sequence[Function]) -> Table:
             relative,
             _number(function.largest),
         ]
-        table.add_row(Text(function.name), *cells, *([function.unit] if units else []))
-    return table
+        rows.append((function.name, *cells, *([function.unit] if units else [])))
+    print_rows(console, "lrrrrl", (*titles, *["unit"] * units), rows)
 
 
 def _number(value: float) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.quantities import state_text
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.judge import JudgeResult
 
@@ -26,13 +26,17 @@ def print_statements(console: Console, answer: VerifyAnswer) -> None:
     statements = answer.statements
     if not statements:
         return
-    console.print(f"\n[bold]Hypotheses, judged[/] {answer.judged_region}", highlight=False)
-    table = make_table("plrp", "statement", "word", "boxes", "where, or why not", indent=True)
-    for text, verdict in statements:
-        word = f"[{_COLORS[verdict.word]}]{verdict.word}[/]"
-        why = escape(_why(answer.problem, verdict))
-        table.add_row(escape(text), word, f"{verdict.boxes:,}", why)
-    console.print(table)
+    say(console, Text.assemble(("\nHypotheses, judged", "bold"), f" {answer.judged_region}"))
+    rows = [
+        (
+            text,
+            Text(verdict.word, style=_COLORS[verdict.word]),
+            f"{verdict.boxes:,}",
+            _why(answer.problem, verdict),
+        )
+        for text, verdict in statements
+    ]
+    print_rows(console, "plrp", ("statement", "word", "boxes", "where, or why not"), rows)
     if any(verdict.word == "undecided" for _, verdict in statements):
         say(
             console,

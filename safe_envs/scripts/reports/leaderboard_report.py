@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.best_text import best_notes, best_text
 from safe_envs.agents.evaluation.rate_text import percent_in
-from safe_envs.scripts.reports.best_text import best_notes, best_text
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:

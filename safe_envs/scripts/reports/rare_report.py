@@ -12,44 +12,52 @@ from safe_envs.agents.rare_events.rows import RareRow
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.engine_notes import engine_notes
 from safe_envs.scripts.reports.evaluation_report import early_end, heading_of, unsafe_starts
-from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.scripts.reports.tables import print_rows
 
 _COLUMNS = (
     "method",
     "levels",
-    "simulated\nsteps",
-    "plain episodes\nneeded",
-    "violations in\nplain episodes",
-    "steps/s",
+    "simu\u00adlated steps",
+    "plain episodes needed",
+    "violations in plain episodes",
 )
 
 
-def print_rare(console: Console, answer: RareEvaluation) -> None:
+def print_rare(console: Console, answer: RareEvaluation, timing: bool = False) -> None:
     """Print a heading, a row for each filter, and what has to be known to read them.
 
     Args:
         console: to print on.
         answer: to print.
+        timing: whether to print the speed too, which depends on the machine.
     """
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
     how = f"{config['repetitions']} repetitions of {config['particles']} particles"
     say(console, heading_of(config, answer.problem, f"rare violations, {how}"))
-    table = make_table("pr", "filter", f"P(violation) [{interval}]", *_COLUMNS)
-    for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
-        table.add_row(Text(row.filter), *_cells(row, speed["steps_per_second"]))
-    print_whole(console, table)
+    titles = ("filter", f"P(violation) [{interval}]", *_COLUMNS, *["steps/s"] * timing)
+    rows = [
+        (row.filter, *_cells(row), *[_speed(row, speed["steps_per_second"])] * timing)
+        for row, speed in zip(answer.rows, answer.timing["rows"], strict=True)
+    ]
+    console.print()
+    print_rows(console, "lr", titles, rows)
+    console.print()
     reasons = Table.grid()
     for reason in dict.fromkeys(row.reason for row in answer.rows if row.reason):
         names = ", ".join(row.filter for row in answer.rows if row.reason == reason)
         reasons.add_row(Text(f"Splitting cannot work here for {names}: {reason}.", overflow="fold"))
     if reasons.row_count:
         console.print(reasons)
-    for note in _notes(answer):
+    for note in _notes(answer, timing):
         say(console, note)
 
 
-def _cells(row: RareRow, speed: float) -> list[str]:
+def _speed(row: RareRow, speed: float) -> str:
+    return _large(speed) if row.steps else "-"
+
+
+def _cells(row: RareRow) -> list[str]:
     plain, needed = row.plain, row.plain_episodes_needed
     return [
         "none, see below"
@@ -60,11 +68,10 @@ def _cells(row: RareRow, speed: float) -> list[str]:
         _large(row.steps) if row.steps else "-",
         _large(needed) if needed else "-",
         f"{plain.violations} of {plain.episodes}" if plain else "-",
-        _large(speed) if row.steps else "-",
     ]
 
 
-def _notes(answer: RareEvaluation) -> list[str]:
+def _notes(answer: RareEvaluation, timing: bool) -> list[str]:
     rows, steps = answer.rows, answer.problem.steps
     notes = [f"doubt the estimate of {row.filter}: {row.doubt}." for row in rows if row.doubt]
     notes += [
@@ -75,9 +82,9 @@ def _notes(answer: RareEvaluation) -> list[str]:
     plain = [row.plain for row in rows if row.plain]
     if plain:
         notes += unsafe_starts(plain[0].outside / plain[0].episodes)
-    notes += engine_notes(
-        [(each["filter"], each["engine"], each["jobs"]) for each in answer.timing["rows"]]
-    )
+    if timing:
+        speeds = answer.timing["rows"]
+        notes += engine_notes([(each["filter"], each["engine"], each["jobs"]) for each in speeds])
     notes += [
         early_end(row.filter, "mean episode without a violation", length, steps)
         for row in rows

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.text import Text
 
+from safe_envs.agents.evaluation.best_text import ends_text, times_text
 from safe_envs.agents.evaluation.bound_text import bound_cells
 from safe_envs.agents.evaluation.rate_text import percent, rate_of
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.evaluation.yardstick import times_between
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.best_text import ends_text, times_text
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.tables import print_columns
+from safe_envs.text_tables import Column, without_empty
 
 if TYPE_CHECKING:
     from safe_envs.agents.jobs.job import JobOutcome
@@ -24,9 +24,6 @@ Row = dict[str, Any]
 
 _SHOWN = 10
 _SAFE = "safe [95 % interval]"
-_CONTINUOUS = "continuous_bound"
-_BEST_TITLES = ("best", "times unavoidable")
-_TITLES = ("min h 5 %", "violations", "intervened", "infeasible", "return")
 _DOCUMENTS = ("row", "config", "versions", "files")
 
 
@@ -47,36 +44,41 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
         f" {missing} are missing.",
     )
     shown = _worst(rows, worst)
-    best = _BEST_TITLES if any(row["best_lower"] is not None for row in shown) else ()
-    bounded = any(row[name] is not None for row in shown for name in ("held_bound", _CONTINUOUS))
-    held, continuous = (("held input",), ("continuous",)) if bounded else ((), ())
-    titles = (*names, *held, _SAFE, *best, *continuous, *_TITLES)
-    table = make_table("l" * len(names) + "r", *titles, tight=False)
-    for row in shown:
-        filtered = row["filter"] != UNFILTERED
-        rates = [
-            row[name] if filtered else None for name in ("intervention_rate", "infeasible_rate")
-        ]
-        bounds = bound_cells(row)
-        table.add_row(
-            *(Text(_value(row[name])) for name in names),
-            *bounds[: len(held)],
-            rate_of(row),
-            *_best_cells(row)[: len(best)],
-            *bounds[1 : 1 + len(continuous)],
-            f"{row['min_h_p05']:.3g}",
-            str(row["violations"]),
-            *map(percent, rates),
-            f"{row['return_mean']:.4g}",
-        )
-    if table.row_count:
-        say(console, f"\nThe {table.row_count} worst:")
-        console.print(table)
+    if shown:
+        say(console, f"\nThe {len(shown)} worst:")
+        swept = [Column(name, tuple(_value(row[name]) for row in shown), "l") for name in names]
+        print_columns(console, swept, _columns(shown))
     if failed:
         say(console, "\nFailed:")
     for row in failed:
         told = ", ".join(f"{name} = {_value(row[name])}" for name in names)
         say(console, f"  {told or 'the only cell'}: {row['error']}")
+
+
+def _columns(rows: Sequence[Row]) -> list[Column]:
+    """Return the columns on safety, those that some cell has something for, and on behavior."""
+    bounds = [bound_cells(row) for row in rows]
+    bests = [_best_cells(row) for row in rows]
+    cells = {
+        "held input": [held for held, _ in bounds],
+        _SAFE: list(map(rate_of, rows)),
+        "best": [best for best, _ in bests],
+        "times un\u00adavoidable": [times for _, times in bests],
+        "contin\u00aduous": [continuous for _, continuous in bounds],
+        "viola\u00adtions": [str(row["violations"]) for row in rows],
+    }
+    safety, _ = without_empty([Column(title, tuple(each)) for title, each in cells.items()])
+    behavior = {
+        "min\u00a0h 5\u00a0%": [f"{row['min_h_p05']:.3g}" for row in rows],
+        "inter\u00advened": [_share(row, "intervention_rate") for row in rows],
+        "infeas\u00adible": [_share(row, "infeasible_rate") for row in rows],
+        "return": [f"{row['return_mean']:.4g}" for row in rows],
+    }
+    return [*safety, *(Column(title, tuple(each), part=1) for title, each in behavior.items())]
+
+
+def _share(row: Row, name: str) -> str:
+    return percent(row[name] if row["filter"] != UNFILTERED else None)
 
 
 def report_document(index: dict[str, Any], rows: Sequence[Row], worst: int) -> dict[str, Any]:

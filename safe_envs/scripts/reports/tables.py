@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import zip_longest
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+from safe_envs.text_lines import wrapped
+from safe_envs.text_tables import Column, FittedTable, arranged, columns_of
 
 _WIDEST = 1000
 
@@ -41,8 +47,76 @@ def print_whole(console: Console, table: Table) -> None:
         console: to print on; it is widened.
         table: with columns of any width.
     """
+    console.print()
+    print_full(console, table)
+    console.print()
+
+
+def print_full(console: Console, table: Table) -> None:
+    """Print a table in full width.
+
+    Args:
+        console: to print on; it is widened while it does.
+        table: with columns of any width.
+    """
     widest = console.options.update(max_width=_WIDEST)
-    console.width = max(console.width, console.measure(table, options=widest).maximum)
-    console.print()
-    console.print(table)
-    console.print()
+    width = max(console.width, console.measure(table, options=widest).maximum)
+    console.print(table, width=width)
+
+
+def print_rows(
+    console: Console,
+    kinds: str,
+    titles: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    names: int = 1,
+) -> None:
+    """Print rows as tables that fit the console.
+
+    Args:
+        console: to print on.
+        kinds: a letter for each column; see `safe_envs.text_tables.Column`.
+        titles: one for each column; soft hyphens in them show where a title is broken.
+        rows: cells, str or Text, one for each column; markup is not interpreted.
+        names: how many of the columns stand in front of every table.
+    """
+    columns = columns_of(kinds, titles, rows)
+    print_columns(console, columns[:names], columns[names:])
+
+
+def print_columns(
+    console: Console,
+    names: Sequence[Column],
+    columns: Sequence[Column],
+    facts: Sequence[str] = (),
+) -> None:
+    """Print columns as tables that fit the console, parted by blank lines.
+
+    Args:
+        console: to print on.
+        names: first columns of each table.
+        columns: all others.
+        facts: lines that belong to the first table.
+    """
+    for i, fitted in enumerate(arranged(names, columns, console.width)):
+        if i:
+            console.print(Table.grid())
+        table = _drawn(fitted)
+        if not i and facts:
+            lines = [line for fact in facts for line in wrapped(fact, console.width, indent=4)]
+            table.caption, table.caption_justify = Text("\n".join(lines)), "left"
+            table.caption_style = ""
+        print_full(console, table)
+
+
+def _drawn(fitted: FittedTable) -> Table:
+    table = make_table(
+        "".join(column.column.kind for column in fitted),
+        *("\n".join(column.title) for column in fitted),
+    )
+    for drawn, column in zip(table.columns, fitted, strict=True):
+        drawn.width, drawn.overflow, drawn.vertical = column.width, "fold", "top"
+        drawn.no_wrap = False
+    for cells in zip(*(column.cells for column in fitted), strict=True):
+        table.add_row(*(each if isinstance(each, Text) else Text(str(each)) for each in cells))
+    return table

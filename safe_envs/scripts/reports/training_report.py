@@ -9,7 +9,7 @@ from rich.console import Console
 
 from safe_envs.agents.evaluation.rate_text import rate_of
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.tables import print_rows
 
 
 def print_evaluations(
@@ -23,12 +23,17 @@ def print_evaluations(
         rows: content of `evaluations.json`.
     """
     titles = ("steps", "safe [95 % interval]", "return", "violations in training")
-    table = make_table("r", *titles, tight=False)
-    for row in rows:
-        steps, violations = f"{row['timesteps']:,}", f"{row['training']['violations']:.0f}"
-        table.add_row(steps, rate_of(row), f"{row['return_mean']:.4g}", violations)
+    cells = [
+        (
+            f"{row['timesteps']:,}",
+            rate_of(row),
+            f"{row['return_mean']:.4g}",
+            f"{row['training']['violations']:.0f}",
+        )
+        for row in rows
+    ]
     say(console, f"Evaluations with the filter {filter_name}:")
-    console.print(table)
+    print_rows(console, "r", titles, cells)
     if rows and "constraint" in rows[-1]:
         _print_constraint(console, rows[-1])
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.text import Text
 
 from safe_envs.scripts.options.console import say
@@ -64,7 +63,7 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
 
 
 def _section(console: Console, title: str, lines: Sequence[str]) -> None:
-    console.print(f"\n[bold]{escape(title)}[/]", soft_wrap=True, highlight=False)
+    say(console, Text(f"\n{title}", style="bold"))
     for line in lines:
         say(console, f"  {line}")
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from safe_envs.errors import ConfigurationError, nearest
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.options.job_progress import run_jobs
@@ -29,6 +29,7 @@ def reproduce(
             metavar="[all | NAME]...",
             help="Such as table-4.1 or figure-3.3; all by default.",
             autocompletion=completion.artefacts,
+            callback=early_checks.known_artefacts,
         ),
     ] = None,
     episodes: Annotated[
@@ -91,11 +92,7 @@ def reproduce(
 def _chosen(names: Sequence[str]) -> list[Artefact]:
     from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 
-    known = {artefact.name: artefact for artefact in ARTEFACTS}
-    for name in names:
-        if name != _ALL and name not in known:
-            raise ConfigurationError(f"unknown artefact {name!r}; {nearest(name, [_ALL, *known])}")
-    return [artefact for name, artefact in known.items() if _ALL in names or name in names]
+    return [artefact for artefact in ARTEFACTS if _ALL in names or artefact.name in names]
 
 
 @dataclass(frozen=True)

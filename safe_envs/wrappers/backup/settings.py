@@ -8,7 +8,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings, settings_in
-from safe_envs.wrappers.conditions.registry import BACKUP
+from safe_envs.wrappers.conditions.names import BACKUP
 
 _KEYS = ("horizon", "margin")
 _EXAMPLE = f"{BACKUP}:horizon=2"

@@ -6,13 +6,14 @@ import inspect
 from typing import Any
 
 from safe_envs import plugins
-from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.object_import import load_object, place_of
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
 from safe_envs.wrappers.conditions.certified import Certified
 from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
+from safe_envs.wrappers.conditions.names import BY_THEMSELVES, condition_names, unknown_filter
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
 
@@ -31,33 +32,6 @@ _BUILT_IN: dict[str, type[Condition]] = {
     **LEARNED,
     Certified.name: Certified,
 }
-
-
-PROMISE = "promise"
-"""Name of the filter of `safe_envs.wrappers.value`, which is no condition."""
-
-BACKUP = "backup"
-"""Name of the filter of `safe_envs.wrappers.backup`, which is no condition either."""
-
-BY_THEMSELVES = {PROMISE: f"{PROMISE}:p=0.99", BACKUP: BACKUP}
-"""Filters that act by themselves, by name, each with an example of its text."""
-
-RESERVED = ("none", *BY_THEMSELVES)
-"""Names that no condition can have: "none" stands for the unfiltered env."""
-
-
-def is_built_in(name: str) -> bool:
-    """Return whether a name is that of a condition of this project."""
-    return name in _BUILT_IN
-
-
-def condition_names() -> tuple[str, ...]:
-    """Return the names of all conditions: the built-in ones, then those of installed packages.
-
-    A package can take neither a built-in name nor one of `RESERVED`.
-    """
-    declared = plugins.plugin_names(plugins.CONDITIONS)
-    return (*_BUILT_IN, *(name for name in declared if name not in (*_BUILT_IN, *RESERVED)))
 
 
 def condition_class(name: str) -> type[Condition]:
@@ -90,17 +64,6 @@ def name_of(condition: type[Condition]) -> str:
     if _BUILT_IN.get(condition.name) is condition:
         return condition.name
     return plugins.name_of(plugins.CONDITIONS, condition) or place_of(condition)
-
-
-def unknown_filter(name: str, *more: str) -> ConfigurationError:
-    """Return the error of a filter that nobody knows.
-
-    Args:
-        name: what was given.
-        more: names that are allowed besides those of conditions.
-    """
-    allowed = (*more, *condition_names(), *BY_THEMSELVES, "FILE.py:NAME")
-    return ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, allowed)}")
 
 
 def _checked(name: str, found: Any) -> type[Condition]:

@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 from safe_envs.object_import import resolved
 from safe_envs.plugins import CONDITIONS, module_of
-from safe_envs.wrappers.conditions.registry import (
+from safe_envs.wrappers.conditions.names import (
     BACKUP,
     BY_THEMSELVES,
     PROMISE,
-    condition_class,
     condition_names,
     is_built_in,
     unknown_filter,
@@ -117,6 +116,9 @@ def _has_module(name: str) -> bool:
 
 def learned_parts(text: str) -> list[tuple[str, str | None]]:
     """Return the method and the file, None without one, of each condition that needs a model."""
+    # The classes need symbolic algebra, and the rest of this module does not.
+    from safe_envs.wrappers.conditions.registry import condition_class
+
     return [
         (method, next((s[len("file=") :] for s in part.settings if s.startswith("file=")), None))
         for part in parts_of(text)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.backup import BackupFilter, BackupSettings
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
-from safe_envs.wrappers.conditions.registry import BACKUP, PROMISE
+from safe_envs.wrappers.conditions.names import BACKUP, PROMISE
 from safe_envs.wrappers.conditions.text_parts import name_by_itself
 from safe_envs.wrappers.value.promise_filter import PromiseFilter
 from safe_envs.wrappers.value.promise_tables import promise_filter_for

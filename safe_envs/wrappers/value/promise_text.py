@@ -16,7 +16,7 @@ from safe_envs.number_text import finite_number, real
 from safe_envs.problem.named_sets import set_names
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings, settings_in
-from safe_envs.wrappers.conditions.registry import PROMISE
+from safe_envs.wrappers.conditions.names import PROMISE
 from safe_envs.wrappers.value.automaton_building import automaton_of
 from safe_envs.wrappers.value.settings import LEAVING
 from safe_envs.wrappers.value.specification import Specification

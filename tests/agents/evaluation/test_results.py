@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import episodes_file
+from safe_envs.agents.evaluation.frames import row_columns
 from safe_envs.agents.evaluation.spec import RunSettings
 
 
@@ -27,13 +29,14 @@ def measured(**how):
     return evaluate("Scalar-v0", "random", ["none", "cbf:alpha=2"], record=how == {}, **given)
 
 
-def test_text_is_a_table(found):
-    heading, titles, *rows = str(found).splitlines()
-    assert heading.startswith(found.title)
-    assert titles.startswith("filter")
-    assert "safe [95 % interval]" in titles
-    assert [line.split()[0] for line in rows] == ["none", "cbf:alpha=2"]
-    assert len({len(line) for line in (titles, *rows)}) == 1
+def test_text_is_a_short_table(found):
+    heading, _, *lines = str(found).splitlines()
+    assert heading == f"{found.title} | policy random | 40 episodes | seed 0"
+    assert "safe [95 %" in lines[0]
+    assert [line.split()[0] for line in lines[3:5]] == ["none", "cbf:alpha=2"]
+    assert len(lines) < 12
+    assert max(map(len, lines)) <= 80
+    assert repr(found) == str(found)
 
 
 def test_results_of_episodes_are_those_of_the_rows(found):
@@ -100,15 +103,33 @@ def test_without_pyarrow_or_pandas_errors_say_what_to_install(found, monkeypatch
     assert not (tmp_path / "out.parquet").exists()
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigurationError, match="pip install pandas"):
-        found.to_dataframe()
+        found.to_frame()
 
 
 def test_data_frames_have_a_row_for_each_filter_or_episode(found, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda data: data))
-    rows = found.to_dataframe()
-    assert [row["safety_rate"] for row in rows] == [row.safety_rate for row in found.rows]
-    assert not {"curve", "learning"} & set(rows[0])
-    assert len(found.to_dataframe(episodes=True)["return"]) == 80
+    columns = found.to_frame()
+    assert columns["filter"].tolist() == ["none", "cbf:alpha=2"]
+    assert columns["safety_rate"].tolist() == [row.safety_rate for row in found.rows]
+    assert not {"curve", "learning"} & set(columns)
+    assert {len(values) for values in columns.values()} == {2}
+    assert len(found.to_frame(episodes=True)["return"]) == 80
+
+
+def test_columns_of_data_frames_have_one_type_each(found):
+    columns = row_columns(found)
+    kinds = {name: values.dtype.kind for name, values in columns.items()}
+    assert {"violations", "episodes", "touching", "learned_from"} <= {
+        name for name, kind in kinds.items() if kind == "i"
+    }
+    texts = ("title", "filter", "policy", "held_word", "continuous_note", "withheld")
+    assert all(isinstance(cell, str) for name in texts for cell in columns[name])
+    numbers = {name for name, kind in kinds.items() if kind == "f"}
+    assert {"ci_low", "held_bound", "attainable_high", "steps_per_second"} <= numbers
+    assert np.isnan(columns["held_bound"]).all()
+    # Also where no filter has a number, the column is one of numbers.
+    bare = replace(found, rows=[replace(row, effort_mean=None) for row in found.rows])
+    assert row_columns(bare)["effort_mean"].dtype.kind == "f"
 
 
 def test_rows_are_found_by_name(found):

@@ -11,7 +11,7 @@ import pytest
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs import plugins as safe_envs_plugins
 from safe_envs.agents import ZeroController, evaluate, make_policy
-from safe_envs.agents.policies.registry import absolute_policy, policy_file
+from safe_envs.agents.policies.names import absolute_policy, policy_file
 from safe_envs.registry import make_problem
 
 SHORT = {"episodes": 6, "bounds": False, "options": {"horizon": 0.2}}

@@ -9,14 +9,14 @@ from contextlib import redirect_stdout
 import pytest
 
 import safe_envs
-from safe_envs.agents.policies.registry import POLICIES
+from safe_envs.agents.policies.names import POLICIES
 from safe_envs.agents.training.hyperparameters import ALGORITHMS
 from safe_envs.scripts import cli
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 from safe_envs.wrappers import CONDITIONS
 from safe_envs.wrappers.conditions import LEARNED, Certified
-from safe_envs.wrappers.conditions.registry import BY_THEMSELVES
+from safe_envs.wrappers.conditions.names import BY_THEMSELVES
 
 pytestmark = pytest.mark.slow
 

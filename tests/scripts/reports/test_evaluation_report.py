@@ -77,7 +77,7 @@ def test_starts_from_which_nothing_is_promised_are_told(evaluated):
 
 def printed(answer):
     console = Console(width=200, file=io.StringIO())
-    print_evaluation(console, answer)
+    print_evaluation(console, answer, timing=True)
     return " ".join(console.file.getvalue().split())
 
 

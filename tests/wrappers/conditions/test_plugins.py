@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -198,9 +199,11 @@ def test_an_installed_condition_cannot_take_the_name_of_the_unfiltered_env(monke
 
 def test_installed_packages_are_looked_through_once(installed, monkeypatch):
     groups = []
-    look = plugins.entry_points
+    look = importlib.metadata.entry_points
     monkeypatch.setattr(
-        plugins, "entry_points", lambda group: groups.append(group) or look(group=group)
+        importlib.metadata,
+        "entry_points",
+        lambda group: groups.append(group) or look(group=group),
     )
     for text in ("eager:gain=2", "eager", "scbf"):
         parse_conditions(text, SCALAR)

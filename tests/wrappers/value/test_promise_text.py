@@ -10,7 +10,7 @@ from safe_envs import ConfigurationError
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.render import split_filters
 from safe_envs.wrappers import SafetyFilter, parse_conditions
-from safe_envs.wrappers.conditions.registry import PROMISE, condition_names
+from safe_envs.wrappers.conditions.names import PROMISE, condition_names
 from safe_envs.wrappers.conditions.text_parts import (
     files_of,
     learned_parts,

@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorSummary
 from safe_envs.registry import make_problem
 from safe_envs.scripts.options.evaluation_options import LEARNED_PARAMETERS
 from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
-from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
+from safe_envs.scripts.reports.learned_notes import learned_notes
 from safe_envs.wrappers import LEARNED
 
 NO_BOUND = "no bound for learned filters"
@@ -50,20 +50,11 @@ def test_a_bound_over_the_posterior_is_proposed_where_there_may_be_one(env_id, r
 
 def test_nothing_is_said_where_nothing_was_learned():
     assert not learned_notes([row()], make_problem("CubicSDEDisk-v0"))
-    assert not learned_columns([row()])
 
 
 def test_repeats_are_means_and_their_intervals_have_a_condition():
     problem = make_problem("CubicSDEDisk-v0")
     rows = [row(), row(LEARNING), row(OFTEN)]
-    speeds = [SimpleNamespace(learning_seconds=seconds) for seconds in (None, 1.5, 1.5)]
-    columns = learned_columns(rows)
-    assert [list(map(cell, rows, speeds)) for cell in columns.values()] == [
-        ["-", "1.50 s", "1.50 s"],
-        ["-", "-", "50.0 %"],
-    ]
-    assert list(columns) == ["learned in,\nmean", "worst\nident."]
-    assert list(learned_columns([row(LEARNING)])) == ["learned\nin"]
     assert (
         sum(
             "for nearly normal: bad ones that are rarer than about 1 in 3" in note

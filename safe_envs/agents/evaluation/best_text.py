@@ -90,6 +90,22 @@ def best_line(best: AttainableSafety | None) -> str:
     return f"best attainable safety: {best_text(best)}"
 
 
+def attainable_text(best: AttainableSafety | None) -> list[str]:
+    """Return the upper end of the attainable safety, rounded up; none where it is not known.
+
+    Args:
+        best: attainable safety, if it is known; only a certified end stands after a sign.
+    """
+    if best is None or best.lower is None or best.upper is None:
+        return []
+    return [f"{'<= ' * is_certified(best)}{outwards(best.lower, best.upper)[1]} %"]
+
+
+def is_certified(best: AttainableSafety) -> bool:
+    """Return whether the upper end of the attainable safety is of a table that was checked."""
+    return best.check is not None and best.check.upper is not None
+
+
 def best_notes(best: AttainableSafety | None) -> list[str]:
     """Return what has to be known to read the best attainable safety and the times."""
     if best is None:

@@ -7,9 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from safe_envs.agents.evaluation.best_text import attainable_text, ends_text, outwards, times_text
 from safe_envs.agents.evaluation.yardstick import TimesUnavoidable
-from safe_envs.scripts.reports.best_text import ends_text, outwards, times_text
-from safe_envs.scripts.reports.bound_notes import attainable_text
 from tests.agents.evaluation.made_up import attainable
 
 

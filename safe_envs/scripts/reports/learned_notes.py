@@ -1,33 +1,12 @@
-"""Columns and notes of an evaluation's table on learned models and posterior bounds."""
+"""Notes under the table of an evaluation on learned models and posterior bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from safe_envs.agents.evaluation.bound_text import bound_text
-from safe_envs.agents.evaluation.rate_text import percent
-from safe_envs.agents.evaluation.results import FilterTiming
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
 from safe_envs.problem.problem import SafetyProblem
-
-Cell = Callable[[EvaluationRow, FilterTiming], str]
-"""From a row, and what was timed of it, to a text."""
-
-_NONE = "-"
-
-
-def learned_columns(rows: Sequence[EvaluationRow]) -> dict[str, Cell]:
-    """Return the columns that the rows need, by title; none where nothing was learned."""
-    columns: dict[str, Cell] = {}
-    repeats = _repeats(rows)
-    if repeats:
-        columns["learned\nin" if repeats == 1 else "learned in,\nmean"] = _seconds
-    if repeats > 1:
-        columns["worst\nident."] = _worst
-    if any(row.posterior_bound for row in rows):
-        columns["bound,\nposterior"] = _posterior_bound
-    return columns
 
 
 def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list[str]:
@@ -93,18 +72,3 @@ def _may_have_a_bound(problem: SafetyProblem) -> bool:
         vanishes(problem.plant, entry)
         for entry in lie_derivative_g(problem.plant, barrier.expression)
     )
-
-
-def _seconds(_: EvaluationRow, timing: FilterTiming) -> str:
-    seconds = timing.learning_seconds
-    return _NONE if seconds is None else f"{seconds:.2f} s"
-
-
-def _worst(row: EvaluationRow, _: FilterTiming) -> str:
-    learning = row.learning
-    return percent(min(learning.rates)) if learning and learning.repeats > 1 else _NONE
-
-
-def _posterior_bound(row: EvaluationRow, _: FilterTiming) -> str:
-    bound = row.posterior_bound
-    return _NONE if bound is None else bound_text(bound.probability, bound.word)

@@ -1,0 +1,94 @@
+"""Names, places and files of policies, known before what is behind them is imported."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.object_import import resolved
+from safe_envs.plugins import POLICIES as POLICY_PLUGINS
+from safe_envs.plugins import module_of, plugin_names
+
+POLICIES = ("nominal", "clf", "zero", "random", "best")
+"""Names that `make_policy` knows without any other package."""
+
+POLICY_FILE = "policy.npz"
+"""Name of the file of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
+
+_PLACE = re.compile(r".+\.py:\w+|[^\W\d]\w*(\.\w+)*:\w+")
+
+_ALLOWED = (
+    "a policy of your own as FILE.py:NAME, a folder of `safe-envs train`, or the path of a"
+    " Stable-Baselines3 .zip"
+)
+
+
+def require_policy(name: str) -> None:
+    """Raise ConfigurationError if there is no policy of a name and no file; nothing is opened.
+
+    Args:
+        name: as for `safe_envs.agents.policies.registry.make_policy`.
+    """
+    if name in POLICIES or name in plugin_names(POLICY_PLUGINS) or os.path.exists(name):
+        return
+    if is_place(name):
+        file = policy_file(name)
+        if file is not None and not os.path.isfile(file):
+            raise ConfigurationError(
+                f"policy {shown(name)}: there is no such file; give FILE.py:NAME of what a file"
+                " defines"
+            )
+        return
+    if "." in os.path.basename(name) or os.sep in name:
+        raise ConfigurationError(
+            f"policy {shown(name)}: there is no such file or folder; give {_ALLOWED}, or one of"
+            f" {', '.join(POLICIES)}"
+        )
+    known = (*POLICIES, *plugin_names(POLICY_PLUGINS))
+    raise ConfigurationError(f"unknown policy {shown(name)}; {nearest(name, known)}, or {_ALLOWED}")
+
+
+def is_place(name: str) -> bool:
+    """Return whether the name of a policy is FILE.py:NAME or MODULE:NAME, and no file."""
+    return _PLACE.fullmatch(name) is not None and not os.path.exists(name)
+
+
+def saved_policy_file(path: Path) -> Path | None:
+    """Return the file of a policy that was saved as data; None where the path names no such one.
+
+    Args:
+        path: of its folder, or of the file itself.
+    """
+    # Unlike a path, os.path takes any text for the name of a file.
+    if os.path.isdir(path):
+        return path / POLICY_FILE
+    return path if path.suffix == ".npz" else None
+
+
+def policy_file(name: str) -> Path | None:
+    """Return the file that `make_policy` reads; None for the name of a policy and MODULE:NAME."""
+    if name in POLICIES or name in plugin_names(POLICY_PLUGINS):
+        return None
+    if is_place(name):
+        source = name.rpartition(":")[0]
+        return Path(source) if source.endswith(".py") else None
+    return saved_policy_file(Path(name)) or Path(name)
+
+
+def policy_module(name: str) -> str | None:
+    """Return the module of a policy that is MODULE:NAME or of a package; None for others."""
+    if name in POLICIES:
+        return None
+    if name in plugin_names(POLICY_PLUGINS):
+        return module_of(POLICY_PLUGINS, name)
+    source = name.rpartition(":")[0]
+    return source if is_place(name) and not source.endswith(".py") else None
+
+
+def absolute_policy(name: str) -> str:
+    """Return the name of a policy with the whole path of its file, valid in any folder."""
+    if is_place(name):
+        return resolved(name)
+    return os.path.realpath(name) if policy_file(name) and os.path.exists(name) else name

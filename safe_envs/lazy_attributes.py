@@ -1,0 +1,34 @@
+"""Attributes of a package that are imported when they are first used.
+
+Ids, errors and the help of a command are needed at once, and symbolic algebra, which most of what a
+package exports imports, takes longer than all of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+
+def lazy_attributes(
+    package: str, modules: Mapping[str, str], namespace: dict[str, Any]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return the functions `__getattr__` and `__dir__` of a package.
+
+    Args:
+        package: its name.
+        modules: the full name of the module of each attribute.
+        namespace: of the package, its `globals()`; an attribute is put there once it is imported.
+    """
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        found = namespace[name] = getattr(import_module(modules[name]), name)
+        return found
+
+    def names() -> list[str]:
+        return sorted({*namespace, *modules})
+
+    return get, names

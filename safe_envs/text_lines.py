@@ -1,0 +1,88 @@
+"""Lines of text that fit a width: names folded where they have joints, sentences at blanks."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+_PIECES = re.compile(r"[^\s:+,;/=]*[:+,;/=\s]+|[^\s:+,;/=]+")
+"""Where a name may be folded: after the signs that part the settings of a filter or a path."""
+
+_TOGETHER = re.compile(
+    r"(?<=\d) (?=(?:%|points\b|s\b))"  # a number and its unit
+    r"|(?<=[<>=]) (?=\S)|(?<=\S) (?=[<>=]=? )"  # a relation and its sides
+    r"|(?<=\[)[^\[\]]{1,40}(?=\])"  # an interval
+)
+
+
+def folded(name: str, width: int) -> str:
+    """Return a name in lines of a width, broken after signs that part its settings.
+
+    Args:
+        name: of any length.
+        width: of a line.
+    """
+    lines = [""]
+    for piece in _PIECES.findall(name):
+        if lines[-1] and text_width(lines[-1] + piece.rstrip()) > width:
+            lines.append("")
+        while text_width(lines[-1] + piece.rstrip()) > width:
+            cut = _cut(piece, width - text_width(lines[-1]))
+            lines[-1] += piece[:cut]
+            piece = piece[cut:]
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(lines)
+
+
+def wrapped(text: str, width: int, indent: int = 0) -> list[str]:
+    """Return a line of text in lines of a width, all but the first indented.
+
+    Numbers stay with their units and intervals in one line; a word that is too long is folded.
+
+    Args:
+        text: a line.
+        width: of a line.
+        indent: blanks before all lines but the first.
+    """
+    starts = [0, *break_points(text, width, indent)]
+    ends = [*starts[1:], len(text)]
+    parts = [text[start:end].rstrip() for start, end in zip(starts, ends, strict=True)]
+    return [parts[0], *(" " * indent + part for part in parts[1:])]
+
+
+def break_points(text: str, width: int, indent: int = 0) -> list[int]:
+    """Return where the lines of `wrapped` begin in the text, but for the first one."""
+    text = _TOGETHER.sub(lambda found: found[0].replace(" ", "\u00a0"), text)
+    points: list[int] = []
+    begin, room = 0, width
+    for word in re.finditer(r"[^ ]+", text):
+        if text_width(text[begin : word.end()]) <= room:
+            continue
+        if text[begin : word.start()].strip():
+            points.append(word.start())
+            begin, room = word.start(), max(width - indent, 1)
+        for piece in _PIECES.finditer(text, word.start(), word.end()):
+            while text_width(text[begin : piece.end()]) > room:
+                at = piece.start()
+                if at <= begin:
+                    at = begin + _cut(text[begin:], room)
+                points.append(at)
+                begin, room = at, max(width - indent, 1)
+    return points
+
+
+def text_width(text: str) -> int:
+    """Return how many characters of a terminal a text takes."""
+    return sum(
+        0 if unicodedata.combining(c) else 2 if unicodedata.east_asian_width(c) in "WF" else 1
+        for c in text
+    )
+
+
+def _cut(text: str, width: int) -> int:
+    """Return how many characters of a text fit, at least one."""
+    count = 1
+    while count < len(text) and text_width(text[: count + 1]) <= width:
+        count += 1
+    return count
