@@ -375,8 +375,8 @@ def test_bounds_are_shown_where_there_are_any():
     assert " 49.2 % est. " in line_of(bounded, "scbf")
     assert not re.search("≥|>=|guaranteed", bounded.replace("{b_j >= 0}", ""))
     assert "\nbound, held input: none of these has one\n" in bounded
-    assert "] - " in " ".join(line_of(bounded, "hocbf").split())
-    assert "] - " in " ".join(line_of(bounded, "none").split())
+    assert "] 0 - " in " ".join(line_of(bounded, "hocbf").split())
+    assert "] 0 - " in " ".join(line_of(bounded, "none").split())
     assert "Note: no bound, continuous control, for hocbf: it ignores the noise\n" in bounded
     assert bounded.count("no bound, continuous control, for") == 1
     assert "Note: no bound, held input, for hocbf, scbf: neither a table" in bounded
@@ -397,7 +397,7 @@ def test_bounds_are_shown_where_there_are_any():
         "Note: no bound, continuous control, for scbf: withheld: the interval of the measured rate"
         " ends at 98.0 %, below 99.9 %" in below
     )
-    assert "] withheld " in " ".join(line_of(below, "scbf").split())
+    assert "] 0 withheld " in " ".join(line_of(below, "scbf").split())
     assert "est.: " not in below
 
 

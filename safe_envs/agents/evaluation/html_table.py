@@ -45,9 +45,10 @@ def html_table(evaluation: Evaluation) -> str:
         lines += map(describe, differences)
     told = "<br>".join(map(escape, lines))
     head = "".join(map(_title, columns))
+    heading = f"<b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}"
     under = f'<p style="{_SMALL}">{told}</p>' if lines else ""
     return (
-        f'<div><p style="{_SMALL}"><b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}</p>'
+        f'<div><p style="{_SMALL}">{heading}</p>'
         '<div style="overflow-x:auto"><table style="border-collapse:collapse;font-size:90%">'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{under}</div>"
     )
