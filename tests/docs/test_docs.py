@@ -151,9 +151,7 @@ def run_cell(source: str, names: dict[str, Any]) -> Any:
 
 
 @pytest.mark.slow
-def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(
-    hook: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
+def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(hook: Any, tmp_path: Path):
     notebooks, pixel = hook("notebooks"), base64.b64encode(b"\x89PNG of a pixel").decode()
     cells = [
         nbformat.v4.new_markdown_cell("# A title"),
@@ -163,8 +161,7 @@ def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(
         ),
     ]
     nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "small.ipynb")
-    monkeypatch.setattr(notebooks, "FOLDER", tmp_path)
-    pages = notebooks.notebook_pages()
+    pages = notebooks.notebook_pages(tmp_path / "small.ipynb")
     assert "```text\n6\n7\n```\n\n```text\n42\n```" in pages["notebooks/small.md"]
     assert pages["notebooks/small-2-0.png"] == b"\x89PNG of a pixel"
 
