@@ -145,10 +145,10 @@ def test_the_page_of_a_reproduction(browser: Browser, serve: Serve, tmp_path: Pa
 def test_what_is_wrong_is_found(browser: Browser, serve: Serve, tmp_path: Path):
     (tmp_path / "index.html").write_text(
         '<!doctype html><meta name="viewport" content="width=device-width"><link rel="icon"'
-        ' href="data:,"><body style="margin:0"><p style="color:#ccc;background:#fff">faint</p>'
+        ' href="data:,"><body style="margin:0">'
         '<img src="none.png"><div style="width:500px">wide</div>'
         '<article style="width:90px;overflow:hidden"><b style="margin-left:200px">cut</b>'
-        "</article>"
+        '<p style="color:#ccc;background:#fff">faint</p></article>'
         "<script>console.error('bad'); missing()</script>"
     )
     found = looked_at(browser, serve(tmp_path), tmp_path, dark=False)
