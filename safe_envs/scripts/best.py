@@ -105,9 +105,9 @@ def best(
     print_best(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:
-        from safe_envs.scripts.figures.best_figure import draw
+        from safe_envs.scripts.figures.best_figure import plot_attainable
 
-        draw(answer, policy.table, plot, size)
+        plot_attainable(found, policy, plot, title=answer.title, size=size)
 
 
 if __name__ == "__main__":

@@ -107,9 +107,9 @@ def evaluate(
     found = _evaluate(problem, policy, refine, (json, timing), common)
     write_text_result(latex, found.to_latex)
     if plot is not None:
-        from safe_envs.scripts.figures.evaluation_figure import draw
+        from safe_envs.scripts.figures.evaluation_figure import plot_evaluation
 
-        draw(found, plot, size)
+        plot_evaluation(found, plot, size=size)
 
 
 def _evaluate(

@@ -143,9 +143,9 @@ def frontier(
     config = {"env_id": known, "options": arguments, "seed": seed, "knowledge": knowledge}
     write_result(json, lambda: document(found, config))
     if plot is not None:
-        from safe_envs.scripts.figures.frontier_figure import draw
+        from safe_envs.scripts.figures.frontier_figure import plot_frontier
 
-        draw(found, title, plot, size)
+        plot_frontier(found, plot, title=title, size=size)
 
 
 def _trained(env: EnvOptions, problem: SafetyProblem, steps: int, seed: int) -> Any:

@@ -112,9 +112,9 @@ def verify(
     print_report(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:
-        from safe_envs.scripts.figures.verify_figure import draw
+        from safe_envs.scripts.figures.verify_figure import plot_verification
 
-        draw(answer, plot, size)
+        plot_verification(found, plot, starts=starts, title=title, size=size)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.best_text import best_text
+from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.scripts.figures.labels import expression, labelled, mathematics, plain
-from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.saving import Picture, finished
 from safe_envs.scripts.figures.style import (
     COLORS,
     QUIET,
@@ -28,9 +30,7 @@ from safe_envs.scripts.figures.style import (
     wrapped,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
-from safe_envs.scripts.reports.best_report import BestAnswer
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.wrappers.value.table import ValueTable
 
 LEVEL = 0.99
 """Of the set that is marked."""
@@ -39,35 +39,52 @@ _LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 1.0)
 _SHADES = ("#F1F5F9", "#DCE8F2", "#BDD6E8", "#93BEDB", "#5E9FCB", "#2F7FB8", "#0072B2")
 
 
-def draw(answer: BestAnswer, table: ValueTable, path: Path, size: str = DEFAULT_SIZE) -> None:
-    """Draw the value at the start of an episode, and write the picture whole or not at all.
+def plot_attainable(
+    found: AttainableSafety,
+    policy: BestPolicy,
+    out: Path | str | None = None,
+    *,
+    title: str | None = None,
+    size: str = DEFAULT_SIZE,
+) -> Picture:
+    """Draw the best attainable safety over the starts.
 
     One coordinate gives a curve and two a plane. With more the plane of the first two is drawn,
     with each other coordinate in the middle of its range.
 
     Args:
-        answer: to draw.
-        table: that was computed for it.
-        path: of the picture; its suffix is the format.
+        found: to draw, of `attainable_safety`.
+        policy: of the same, with the table.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        title: name of the env; by default that of the problem.
         size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: The file cannot be written, or there is no such size.
     """
-    with mpl.rc_context(STYLE):
-        save(figure_of(answer, table, size), path)
+    named = title or policy.problem.name
+    return finished(figure_of(found, policy, named, size), out)
 
 
-def figure_of(answer: BestAnswer, table: ValueTable, size: str = DEFAULT_SIZE) -> Figure:
+def figure_of(
+    found: AttainableSafety, policy: BestPolicy, named: str, size: str = DEFAULT_SIZE
+) -> Picture:
     """Return the figure of the value at the start of an episode.
 
     Args:
-        answer: to draw.
-        table: that was computed for it.
-        size: as for `draw`.
+        found: to draw.
+        policy: with the table.
+        named: how the env is called.
+        size: as for `plot_attainable`.
 
     Raises:
         ConfigurationError: there is no such size.
     """
     width = width_of(size)
-    found, problem = answer.found, answer.problem
+    problem, table = policy.problem, policy.table
     shape, axes = table.grid.shape, table.grid.axes
     middle = tuple(count // 2 for count in shape[2:])
     lower, upper = (
@@ -79,7 +96,7 @@ def figure_of(answer: BestAnswer, table: ValueTable, size: str = DEFAULT_SIZE) -
     units = {state.symbol.name: state.unit for state in problem.states}
     names = [expression(coordinate, units) for coordinate in found.coordinates]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width, 3.9 if size == "double" else 3.7))
+        figure = Picture(figsize=(width, 3.9 if size == "double" else 3.7))
         panel = figure.subplots()
         if len(shape) == 1:
             handles = _draw_curve(panel, axes[0].edges, lower, upper)
@@ -98,7 +115,7 @@ def figure_of(answer: BestAnswer, table: ValueTable, size: str = DEFAULT_SIZE) -
         panel.set_title(wrapped(figure, title, mpl.rcParams["axes.titlesize"], 0.75 * width))
         add_legend(figure, handles)
         said = f"from the starts {best_text(found)}" if found.lower is not None else "withheld"
-        title = plain(f"{answer.title}: {said}", 200)
+        title = plain(f"{named}: {said}", 200)
         add_title(figure, f"{title}\n{mathematics(describe_system(problem))}")
     return figure
 

@@ -8,17 +8,17 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.policies.names import POLICY_FILE
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.figures.evaluation_plane import draw_plane
 from safe_envs.scripts.figures.labels import labelled, mathematics, plain
 from safe_envs.scripts.figures.log_panels import LogColors, LogPanels
-from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.saving import Picture, finished
 from safe_envs.scripts.figures.style import (
     QUIET,
     STYLE,
@@ -46,24 +46,36 @@ _Looks = dict[str, dict[str, Any]]
 """Colour and dashes of each filter."""
 
 
-def draw(evaluation: Evaluation, path: Path, size: str = DEFAULT_SIZE) -> None:
-    """Draw an evaluation that recorded trajectories, and write the picture whole or not at all.
+def plot_evaluation(
+    evaluation: Evaluation, out: Path | str | None = None, *, size: str = DEFAULT_SIZE
+) -> Picture:
+    """Draw h and the safety rate over time, trajectories, and the first episodes.
 
     Args:
-        evaluation: to draw.
-        path: of the picture; its suffix is the format.
+        evaluation: that recorded trajectories: of `evaluate(..., record=True)`.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
         size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: It recorded no trajectories, the file cannot be written, or there is no
+            such size.
     """
-    with mpl.rc_context(STYLE):
-        save(figure_of(evaluation, size), path)
+    if not evaluation.trajectories:
+        raise ConfigurationError(
+            "the evaluation recorded no trajectories to draw; evaluate with record=True"
+        )
+    return finished(figure_of(evaluation, size), out)
 
 
-def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Figure:
+def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Picture:
     """Return the figure of an evaluation that recorded trajectories.
 
     Args:
         evaluation: to draw.
-        size: as for `draw`.
+        size: as for `plot_evaluation`.
 
     Raises:
         ConfigurationError: there is no such size.
@@ -78,7 +90,7 @@ def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Figure:
         heights = [_BARRIER_HEIGHT, _CURVE_HEIGHT]
         heights += [_PLANE_HEIGHT] if problem.plane and not aside else []
         above = _SIDE_HEIGHT if aside else sum(heights)
-        figure = Figure(figsize=(width, above + block))
+        figure = Picture(figsize=(width, above + block))
         upper, lower = figure.add_gridspec(2, 1, height_ratios=(above, block))
         grid = upper.subgridspec(len(heights), 1 + aside, height_ratios=heights)
         barrier = figure.add_subplot(grid[0, 0])

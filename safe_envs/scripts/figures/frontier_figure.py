@@ -6,13 +6,12 @@ from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.scripts.figures.labels import mathematics, plain
-from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.saving import Picture, finished
 from safe_envs.scripts.figures.style import (
     COLORS,
     QUIET,
@@ -28,32 +27,43 @@ _POLICIES, _FILTERS, _BEST = ("o", "v", "<", ">"), ("s", "D", "^", "P", "p", "h"
 """Marks by the kind of a point: none depends on its colour alone."""
 
 
-def draw(found: Frontier, title: str, path: Path, size: str = DEFAULT_SIZE) -> None:
-    """Draw the curve and the points, and write the picture whole or not at all.
+def plot_frontier(
+    found: Frontier,
+    out: Path | str | None = None,
+    *,
+    title: str | None = None,
+    size: str = DEFAULT_SIZE,
+) -> Picture:
+    """Draw what safety costs: the largest return over the chance of a violation, and the points.
 
     Args:
         found: the curve and the points.
-        title: of the env.
-        path: of the picture; its suffix is the format.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        title: name of the env; by default that of the problem.
         size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: The file cannot be written, or there is no such size.
     """
-    with mpl.rc_context(STYLE):
-        save(figure_of(found, title, size), path)
+    return finished(figure_of(found, title or found.problem.name, size), out)
 
 
-def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> Figure:
+def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> Picture:
     """Return the figure of the curve and the points.
 
     Args:
         found: the curve and the points.
         title: of the env.
-        size: as for `draw`.
+        size: as for `plot_frontier`.
 
     Raises:
         ConfigurationError: there is no such size.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width_of(size), 4.0 if size == "double" else 3.4))
+        figure = Picture(figsize=(width_of(size), 4.0 if size == "double" else 3.4))
         axes = figure.add_subplot()
         _draw_curve(axes, found)
         others, drawn = 0, dict[str, int]()

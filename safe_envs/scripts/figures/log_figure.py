@@ -6,12 +6,11 @@ import math
 from pathlib import Path
 
 import matplotlib as mpl
-from matplotlib.figure import Figure
 
-from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.figures.labels import plain
 from safe_envs.scripts.figures.log_panels import LogPanels, note
-from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.saving import Picture, finished
 from safe_envs.scripts.figures.style import (
     STYLE,
     add_legend,
@@ -19,7 +18,6 @@ from safe_envs.scripts.figures.style import (
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.wrappers.decision_log import DecisionLog
-from safe_envs.wrappers.decision_log.files import path_of
 
 _HEIGHT = 1.0
 _LINE = 0.16
@@ -36,7 +34,7 @@ def plot_log(
     end: float | None = None,
     title: str | None = None,
     size: str = DEFAULT_SIZE,
-) -> Figure:
+) -> Picture:
     """Draw the nominal and the executed inputs, h and slacks of a log over time.
 
     Periods in which a constraint changed the input are shaded, infeasible ones hatched. The
@@ -66,7 +64,7 @@ def plot_log(
         )
     drawn, width = LogPanels(log), width_of(size)
     with mpl.rc_context(STYLE):
-        figure = Figure()
+        figure = Picture()
         panels = list(figure.subplots(drawn.count, 1, sharex=True, squeeze=False)[:, 0])
         drawn.draw(panels)
         drawn.note_cuts(panels)
@@ -80,14 +78,4 @@ def plot_log(
         add_legend(figure, [*left, *right], 2)
         said = str(log).partition("; ")[::2] if title is None else str(title).splitlines()
         add_title(figure, "\n".join([plain(each, 200) for each in said if each]))
-        if out is not None:
-            _write(figure, path_of(out, "FILE.png, FILE.pdf or FILE.svg"))
-    return figure
-
-
-def _write(figure: Figure, path: Path) -> None:
-    if path.suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
-        raise ConfigurationError(
-            f"{shortened(path)} names no format of a picture; give FILE.png, FILE.pdf or FILE.svg"
-        )
-    save(figure, path)
+    return finished(figure, out)

@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.contour import ContourSet
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.scripts.figures.contour_labels import write_levels
 from safe_envs.scripts.figures.labels import mathematics, plain
-from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.saving import Picture, finished
 from safe_envs.scripts.figures.style import (
     COLORS,
     DASHES,
@@ -23,34 +24,52 @@ from safe_envs.scripts.figures.style import (
     add_legend,
     add_title,
 )
-from safe_envs.scripts.figures.verify_panel import INFEASIBLE, draw_line
+from safe_envs.scripts.figures.verify_panel import INFEASIBLE, DrawnVerification, draw_line
 from safe_envs.scripts.figures.verify_plane import draw_shares, draw_slice
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.verify_answer import VerifyAnswer
+from safe_envs.wrappers import spec_of
+from safe_envs.wrappers.verification.feasibility import Verification
 
 
-def draw(answer: VerifyAnswer, path: Path, size: str = DEFAULT_SIZE) -> None:
-    """Draw a verification, and write the picture whole or not at all.
-
-    Args:
-        answer: to draw.
-        path: of the picture; its suffix is the format.
-        size: "single" or "double", in columns of a paper.
-    """
-    with mpl.rc_context(STYLE):
-        save(figure_of(answer, size), path)
-
-
-def figure_of(answer: VerifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
-    """Return the figure of a verification.
+def plot_verification(
+    found: Verification,
+    out: Path | str | None = None,
+    *,
+    starts: np.ndarray | None = None,
+    title: str | None = None,
+    size: str = DEFAULT_SIZE,
+) -> Picture:
+    """Draw where no action meets the conditions, h, and the boundaries of the chain.
 
     A plane is drawn with the other states as at the worst state, and next to it with all values of
     the others at once.
 
     Args:
+        found: to draw, of `verify`.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        starts: to mark, shape (B, n); by default some of the problem's.
+        title: name of the env; by default that of the problem.
+        size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: The file cannot be written, or there is no such size.
+    """
+    problem = found.formulas.problem
+    marked = starts_of(problem) if starts is None else starts
+    drawn = DrawnVerification(found, marked, title or problem.name)
+    return finished(figure_of(drawn, size), out)
+
+
+def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> Picture:
+    """Return the figure of a verification.
+
+    Args:
         answer: to draw.
-        size: as for `draw`.
+        size: as for `plot_verification`.
 
     Raises:
         ConfigurationError: there is no such size.
@@ -61,7 +80,7 @@ def figure_of(answer: VerifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
         aside = several and size == "double"
         # A single panel of two columns would be taller than wide panels need.
         height = 3.9 if aside else 6.8 if several else 4.2 if size == "double" else 3.6
-        figure = Figure(figsize=(width, height))
+        figure = Picture(figsize=(width, height))
         shape = (1, 2) if aside else (2, 1) if several else (1, 1)
         panels = list(figure.subplots(*shape, squeeze=False).flat)
         lines = None
@@ -72,14 +91,15 @@ def figure_of(answer: VerifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
         if several:
             draw_shares(figure, panels[1], answer)
         add_legend(figure, _legend(answer, lines))
-        title = plain(f"{answer.title}, {answer.filter_text}", 200)
+        filter_text = spec_of(answer.verification.formulas.conditions)
+        title = plain(f"{answer.title}, {filter_text}", 200)
         add_title(figure, f"{title}\n{mathematics(describe_system(problem))}")
         if lines is not None:
             write_levels(figure, panels[0], lines)
     return figure
 
 
-def _legend(answer: VerifyAnswer, lines: ContourSet | None) -> list[Patch | Line2D]:
+def _legend(answer: DrawnVerification, lines: ContourSet | None) -> list[Patch | Line2D]:
     found = answer.verification
     handles: list[Patch | Line2D] = []
     if found.safe_set.shortfall > 0.0 or answer.part.shortfall > 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from matplotlib.axes import Axes
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.figures.labels import quantity
 from safe_envs.scripts.figures.style import COLORS, DASHES, UNSAFE
-from safe_envs.scripts.reports.verify_answer import VerifyAnswer
+from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
 from safe_envs.wrappers.verification.formulas import Formulas
 
 INFEASIBLE = "#D55E00"
@@ -18,7 +19,32 @@ _SHOWN_STARTS = 200
 _NEAREST = 500
 
 
-def window(answer: VerifyAnswer, indices: Sequence[int]) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class DrawnVerification:
+    """A verification with what is drawn with it.
+
+    Attributes:
+        verification: where the conditions can be met.
+        starts: to mark, shape (B, n).
+        title: name of the env.
+    """
+
+    verification: Verification
+    starts: np.ndarray
+    title: str
+
+    @property
+    def problem(self) -> SafetyProblem:
+        """The problem that was looked at."""
+        return self.verification.formulas.problem
+
+    @property
+    def part(self) -> SetFeasibility:
+        """The feasibility in the set whose worst state is shown."""
+        return self.verification.part
+
+
+def window(answer: DrawnVerification, indices: Sequence[int]) -> np.ndarray:
     """Return limits that show C within the workspace, or what happens in it if it has no end.
 
     Args:
@@ -92,7 +118,7 @@ def axis_label(problem: SafetyProblem, i: int) -> str:
     return quantity(problem.states[i].symbol.name, problem.states[i].unit)
 
 
-def draw_line(axes: Axes, answer: VerifyAnswer) -> None:
+def draw_line(axes: Axes, answer: DrawnVerification) -> None:
     """Draw h and the chain over the only state of a problem.
 
     Args:

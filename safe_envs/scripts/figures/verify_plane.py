@@ -13,12 +13,12 @@ from safe_envs.scripts.figures.labels import labelled, symbol
 from safe_envs.scripts.figures.style import COLORS, DASHES, QUIET, UNSAFE
 from safe_envs.scripts.figures.verify_panel import (
     INFEASIBLE,
+    DrawnVerification,
     axis_label,
     infeasible,
     mark_states,
     window,
 )
-from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.feasibility import Verification
 from safe_envs.wrappers.verification.safe_set import sample
 
@@ -29,7 +29,7 @@ _LISTED = 3
 _LEVELS = (0.2, 0.4, 0.6, 0.8)
 
 
-def draw_slice(axes: Axes, answer: VerifyAnswer) -> ContourSet | None:
+def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
     """Draw h, the chain and where no action meets the conditions, in the plane of the worst state.
 
     Args:
@@ -76,7 +76,7 @@ def draw_slice(axes: Axes, answer: VerifyAnswer) -> ContourSet | None:
     return lines
 
 
-def draw_shares(figure: Figure, axes: Axes, answer: VerifyAnswer) -> None:
+def draw_shares(figure: Figure, axes: Axes, answer: DrawnVerification) -> None:
     """Draw for which share of the other states no action meets the conditions.
 
     Args:
@@ -118,7 +118,7 @@ def _plane(problem: SafetyProblem) -> tuple[int, int]:
 
 
 def _states_over(
-    answer: VerifyAnswer, plane: tuple[int, int], state: np.ndarray, count: int
+    answer: DrawnVerification, plane: tuple[int, int], state: np.ndarray, count: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Return a grid over a plane, and its states, with the other coordinates of a state."""
     ticks = [np.linspace(low, high, count) for low, high in window(answer, plane)]
