@@ -92,7 +92,9 @@ def test_many_names_become_numbers_in_further_tables():
 
 
 def test_titles_are_broken_where_they_may_be():
-    columns = columns_of("lrr", ["a", f"viola{SOFT_HYPHEN}tions", "min\u00a0h 5\u00a0%"], [["b", "1", "2"]])
+    columns = columns_of(
+        "lrr", ["a", f"viola{SOFT_HYPHEN}tions", "min\u00a0h 5\u00a0%"], [["b", "1", "2"]]
+    )
     assert [c.title for c in arranged(columns[:1], columns[1:], 80)[0]] == [
         ("a",),
         ("viola-", "tions"),
