@@ -52,14 +52,21 @@ def wrapped(text: str, width: int, indent: int = 0) -> list[str]:
 
 
 def break_points(text: str, width: int, indent: int = 0) -> list[int]:
-    """Return where the lines of `wrapped` begin in the text, but for the first one."""
+    """Return where the lines of `wrapped` begin in the text, but for the first one.
+
+    Args:
+        text: a line.
+        width: of a line.
+        indent: blanks before all lines but the first.
+    """
     text = _TOGETHER.sub(lambda found: found[0].replace(" ", "\u00a0"), text)
     points: list[int] = []
     begin, room = 0, width
     for word in re.finditer(r"[^ ]+", text):
         if text_width(text[begin : word.end()]) <= room:
             continue
-        if text[begin : word.start()].strip():
+        # A name that is to be folded anyway begins in the line in which it is.
+        if text[begin : word.start()].strip() and text_width(word[0]) <= width - indent:
             points.append(word.start())
             begin, room = word.start(), max(width - indent, 1)
         for piece in _PIECES.finditer(text, word.start(), word.end()):

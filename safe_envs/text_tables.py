@@ -106,19 +106,18 @@ def arranged(names: Sequence[Column], columns: Sequence[Column], width: int) -> 
     Returns:
         Tables with the names in front. A column that is wider than the rest of a line is not cut.
     """
-    if len(names) > 1 and _total(map(_fitted, names)) > width // 2:
+    others = [_fitted(column) for column in columns]
+    whole = [_fitted(name) for name in names]
+    limit = max(2 * width // 5, 12)
+    short = [_folded(name.column, limit) if name.width > limit else name for name in whole]
+    if len(names) > 1 and _total(short) > width // 2:
         count = len(names[0].cells)
         numbers = Column("#", tuple(str(i) for i in range(1, count + 1)))
-        first = [replace(name, part=-1) for name in names]
-        return _packed([_fitted(numbers)], [*first, *columns], width)
-    fitted = [_fitted(name) for name in names]
-    tables = _packed(fitted, columns, width)
-    if len(names) == 1:
-        limit = max(2 * width // 5, 12)
-        if fitted[0].width > limit:
-            folded = _packed([_folded(names[0], limit)], columns, width)
-            if len(folded) < len(tables) or _widest(tables) > width:
-                return folded
+        first = [replace(name, column=replace(name.column, part=-1)) for name in short]
+        return _packed([_fitted(numbers)], [*first, *others], width)
+    tables, folded_tables = _packed(whole, others, width), _packed(short, others, width)
+    if len(folded_tables) < len(tables) or _widest(tables) > width:
+        return folded_tables
     return tables
 
 
@@ -163,14 +162,15 @@ def _folded(column: Column, limit: int) -> FittedColumn:
 
 
 def _packed(
-    names: Sequence[FittedColumn], columns: Sequence[Column], width: int
+    names: Sequence[FittedColumn], columns: Sequence[FittedColumn], width: int
 ) -> list[FittedTable]:
+    """Return columns in tables, with the names in front of each."""
     tables: list[FittedTable] = []
 
     def fits(more: Sequence[FittedColumn]) -> bool:
         return _least([*tables[-1], *more]) <= width if tables else False
 
-    for _, part in groupby(map(_fitted, columns), key=lambda c: c.column.part):
+    for _, part in groupby(columns, key=lambda c: c.column.part):
         group = list(part)
         if fits(group):
             tables[-1] += group

@@ -10,7 +10,7 @@ from unittest import mock
 import numpy as np
 
 UNIFORM = 1.6
-"""Largest contrast of two pixels below a text: a grid or a tint has less, a line or an edge more."""
+"""Largest contrast of two pixels below a text: a grid has less, a line or an edge more."""
 
 LEGIBLE = 4.5
 """Least contrast of letters to what is below them. Source: WCAG 2.2, 1.4.3."""
@@ -99,7 +99,7 @@ def figure_texts(figure: Any, dpi: int = 150) -> tuple[list[Written], np.ndarray
     with mock.patch.object(Text, "draw", kept):
         canvas.draw()
     texts = [_written(text, canvas) for text in drawn]
-    with mock.patch.object(Text, "draw", lambda self, renderer: None):
+    with mock.patch.object(Text, "draw", return_value=None):
         canvas.draw()
     return texts, np.asarray(canvas.buffer_rgba())[..., :3].copy()
 

@@ -82,7 +82,7 @@ def _page(env_id: str, problem: SafetyProblem, summary: str, text: str, caption:
     # Docstrings state the equations for a terminal; here they come from the symbols.
     before, _, after = text.partition(_EQUATIONS)
     after = re.sub(r"\A(?:    .*\n)+", "", after)
-    text = "".join([_set(before), _EQUATIONS, _equations(problem), _set(after)])
+    text = "".join([_set(before), _EQUATIONS, _equations(problem), "\n", _set(after)])
     return f"""# {_title(name)}
 
 {summary}
@@ -208,8 +208,9 @@ def _picture(env: Any) -> tuple[np.ndarray, str]:
     seen = f" The minimum of $h$ so far is {info['h_min']:.3g}{why}." if info["h_min"] < 0 else ""
     return filtered.render(), (
         f"The nominal controller under {_link(problem)} after {count * problem.dt:g} s, seed 0."
-        " Green: the safe set; hatched: $h < 0$. The panel shows the executed action (bar), the"
-        f" nominal action (diamond), and $h$ over time.{seen}"
+        " Green: the safe set; hatched: $h < 0$. Axes have the units of the [states](#states), or s."
+        " The panel shows the executed action (bar), the nominal action (diamond), both in physical"
+        f" units, and $h$ over time.{seen}"
     )
 
 

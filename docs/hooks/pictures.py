@@ -26,7 +26,7 @@ from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
 
 WIDE, NARROW = (1, 2), (2, 1)
-"""Rows and columns of a picture with two parts, on a desktop and on a phone."""
+"""Parts of a picture from top to bottom and from left to right, on a desktop and on a phone."""
 
 _GRID = 241
 _EPISODES = 1000
@@ -83,7 +83,7 @@ def _chain(layout: tuple[int, int]) -> Figure:
         axes.contour(x, y, h, levels=[0.0], colors="black", linewidths=1.3)
         axes.contour(x, y, b_1, levels=[0.0], colors=COLORS[0], linewidths=1.3)
         axes.annotate("", (0.6, -2.4), (-0.6, -2.4), arrowprops={"arrowstyle": "->"})
-        axes.text(0.0, -2.3, "heading", ha="center", color=QUIET)
+        axes.text(0.0, -2.3, "heading", ha="center", va="bottom", color=QUIET)
         axes.set(
             aspect="equal",
             xlabel="x [m]",

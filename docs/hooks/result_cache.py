@@ -67,10 +67,9 @@ def forget_unused() -> None:
 def code_checksum() -> str:
     """Return a checksum of the files that examples are run with, as they are now."""
     package = find_spec("safe_envs")
-    assert package is not None and package.submodule_search_locations is not None
     digest = hashlib.sha256()
     for folder in (
-        *map(Path, package.submodule_search_locations),
+        *map(Path, (package and package.submodule_search_locations) or ()),
         ROOT / "examples",
         ROOT / "docs" / "hooks",
     ):

@@ -20,6 +20,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 
+_COLUMNS = 96
+"""Of code that fits the text of a page on a desktop."""
+
 _FENCE = re.compile(r"^```(python|console) run([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _ANY_FENCE = re.compile(r"^```(python|console)[^\n]*\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _FILE = re.compile(r"^<!-- file (\S+) -->$", re.MULTILINE)
@@ -44,6 +47,7 @@ def with_output(
         RuntimeError: A command did not end as its fence says.
     """
     markdown = _FILE.sub(lambda found: f"```python\n{(ROOT / found[1]).read_text()}```", markdown)
+    markdown = _COMMAND.sub(lambda found: f"$ {_folded(found[1])}", markdown)
     fences = _FENCE.findall(markdown)
     if not fences:
         return markdown
@@ -111,12 +115,32 @@ def _printed(kind: str, options: str, code: str, names: dict[str, Any]) -> list[
 def _shown(kind: str, options: str, code: str, printed: Sequence[str]) -> str:
     texts = [_first(text, _settings(options)) for text in printed]
     if kind == "python":
-        return f"```python\n{code}```\n\n```text\n{texts[0]}\n```"
+        return f"```python\n{code}```\n\n{_text(texts[0])}"
     # The output is a fence of its own: in a console, Pygments takes a % for a prompt.
     return "\n\n".join(
-        f"```console\n$ {command}\n```\n\n```text\n{text}\n```"
+        f"```console\n$ {command}\n```\n\n{_text(text)}"
         for command, text in zip(_COMMAND.findall(code), texts, strict=True)
     )
+
+
+def _text(printed: str) -> str:
+    """Return a fence with output; lines that fit no page wrap, as they do in a terminal."""
+    is_wide = any(len(line) > _COLUMNS for line in printed.splitlines())
+    return f"```{{.text .wrapped}}\n{printed}\n```" if is_wide else f"```text\n{printed}\n```"
+
+
+def _folded(command: str) -> str:
+    """Return a command on lines that fit a page, broken before its options."""
+    if len(command) <= _COLUMNS or "\n" in command:
+        return command
+    first, *options = re.split(r" (?=--\w)", command)
+    lines = [first]
+    for option in options:
+        if len(lines[-1]) + len(option) > _COLUMNS - len(" \\"):
+            lines.append(f"    {option}")
+        else:
+            lines[-1] += f" {option}"
+    return " \\\n".join(lines)
 
 
 def _settings(options: str) -> dict[str, str]:

@@ -217,7 +217,7 @@ class Quadrotor(SystemEnv):
     ## Inputs
     | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], an assumption |
+    | `rotor_1` to `rotor_4` | squared rotor speeds | rad^2/s^2 | [0, 1e5], an assumption |
 
     ## Observation
     The states, in order, without psi; then $cos(psi)$, $sin(psi)$, $z_ref = 5 + 2.5 sin(t)$, and

@@ -105,7 +105,7 @@ class QuadrotorLimits(SystemEnv):
     the tilt; both come from the same four rotors, within their speed limits.
 
     ## Equations
-    Those of `Quadrotor`.
+    The equations and the parameters are those of `Quadrotor`.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -120,7 +120,7 @@ class QuadrotorLimits(SystemEnv):
     ## Inputs
     | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the hover |
+    | `rotor_1` to `rotor_4` | squared rotor speeds | rad^2/s^2 | [0, 1e5], twice the hover |
 
     ## Observation
     The states, in order, without psi; then $cos(psi)$, $sin(psi)$, $z_ref = 5 + 2.5 sin(t)$ and its

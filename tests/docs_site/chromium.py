@@ -16,11 +16,14 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+MISSING = (
+    f"none of {', '.join(NAMES)} is on the PATH; install one from your system's packages, as with"
+    " 'apt-get install chromium', 'dnf install chromium' or 'brew install chromium'"
+)
 PATIENCE = 60.0
 """Seconds after which a browser that does not answer is an error."""
 
@@ -255,16 +258,3 @@ def _pipe() -> tuple[int, int]:
     os.close(read)
     os.close(write)
     return high[0], high[1]
-
-
-def skip_reason() -> str:
-    """Return why tests are skipped where there is no browser, and what to do."""
-    return (
-        f"none of {', '.join(NAMES)} is on the PATH; install one from your system's packages, as"
-        " with 'apt-get install chromium', 'dnf install chromium' or 'brew install chromium'"
-    )
-
-
-def pages_of(folder: Path) -> list[str]:
-    """Return the paths of all HTML files of a folder, in order."""
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.html"))

@@ -240,7 +240,7 @@ def test_times_of_decisions_grow_from_the_middle_to_the_end(monkeypatch, capsys)
     monkeypatch.setattr(benchmark_figures, "parts", part_of(figures))
     benchmark.benchmark()
     out = capsys.readouterr().out
-    assert all(name in out for name in (*cases, "p99.9", "gc off: max"))
+    assert all(name in out for name in (*cases, "p99.9", "gc off:", "collections"))
     assert "latency, " not in out
 
 

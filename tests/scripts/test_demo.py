@@ -23,4 +23,5 @@ def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, c
     assert "\n".join(out.split()).count("safe\n[95\n%") == 2
     assert "policy nominal" in out
     for name in demo.FILTERS:
-        assert sum(line.startswith(name) for line in out.splitlines()) == 2
+        # In each of two tables of two parts.
+        assert sum(line.startswith(name) for line in out.splitlines()) == 4

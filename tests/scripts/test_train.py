@@ -50,7 +50,7 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
     )
     status, out, err = safe_envs_command(*arguments, "--tensorboard", "logs")
     assert (status, err) == (0, "")
-    assert re.search("violations in\n.* training\n", out)
+    assert re.search(r"violations\n.* in training\n", out)
     assert f"safe-envs evaluate {DUBINS} --policy run --filter scbf --horizon=0.5" in out
     assert list((tmp_path / "logs").iterdir())
     config = json.loads((tmp_path / "run" / "config.json").read_text())["training"]

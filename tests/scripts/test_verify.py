@@ -62,7 +62,7 @@ def test_each_hypothesis_has_the_word_of_the_judge(verify):
     assert bounded.split()[-2:] == ["proved", "0"]
     (feasible,) = [line for line in lines if line.startswith("the condition can be met")]
     assert " undecided " in feasible
-    (amount,) = [line for line in lines if "violates it by at" in line]
+    (amount,) = [line for line in lines if line.startswith("the best input violates it")]
     assert " proved " in amount
     # What is estimated stands after no sign, and what is proved does.
     estimated, proved = (
@@ -106,7 +106,7 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
         ),
         (
             ("StochasticDubins-v0",),
-            ("c_0 = 8.9996, c_1 = 11.92", "product of b_j/c_j", "conditions on the future"),
+            ("c_0 = 8.9996, c_1 = 11.92", "product of", "conditions on the future"),
         ),
         (("StochasticDubins-v0", "--filter", "hocbf"), ("hocbf ignores the noise",)),
         (

@@ -15,6 +15,7 @@ from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
+from safe_envs.agents.evaluation.evaluation_data import FilterTiming, Timing
 from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.guarantees import together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
@@ -22,7 +23,7 @@ from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
 from safe_envs.agents.evaluation.players import Player, player_of
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts, conditions_of
-from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
+from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.trajectories import Trajectories

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from safe_envs.agents.evaluation.best_text import attainable_text, times_column
 from safe_envs.agents.evaluation.bound_text import bound_text, continuous_text, held_text
+from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData, FilterTiming
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.text_tables import Column, FittedTable, arranged, without_empty
-
-if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.comparison import Comparison
-    from safe_envs.agents.evaluation.results import Evaluation, FilterTiming
 
 _NONE = "-"
 _SAFETY, _BEHAVIOR, _TIMING = range(3)
@@ -48,7 +45,7 @@ class EvaluationTable:
         return replace(self, columns=[replace(c, part=i) for i, c in enumerate(kept)])
 
 
-def evaluation_table(evaluation: Evaluation, timing: bool = False) -> EvaluationTable:
+def evaluation_table(evaluation: EvaluationData, timing: bool = False) -> EvaluationTable:
     """Return the table of an evaluation.
 
     Args:
@@ -75,12 +72,12 @@ def evaluation_table(evaluation: Evaluation, timing: bool = False) -> Evaluation
     return EvaluationTable(Column("filter", tuple(row.filter for row in rows), "l"), columns, facts)
 
 
-def interval_name(evaluation: Evaluation) -> str:
+def interval_name(evaluation: EvaluationData) -> str:
     """Return the name of the intervals of an evaluation, such as "95 % interval"."""
     return f"{100 * evaluation.config['confidence']:.10g} % interval"
 
 
-def compared(evaluation: Evaluation) -> list[Comparison]:
+def compared(evaluation: EvaluationData) -> list[Comparison]:
     """Return the comparisons of filters with each other; none where nothing is random."""
     if evaluation.is_deterministic:
         return []
@@ -88,7 +85,13 @@ def compared(evaluation: Evaluation) -> list[Comparison]:
 
 
 def points(difference: float, low: float, high: float) -> str:
-    """Return a difference of rates with its interval, in points."""
+    """Return a difference of rates with its interval, in points.
+
+    Args:
+        difference: of two rates from 0 to 1.
+        low: lower end of its interval.
+        high: upper end.
+    """
     return f"{100 * difference:+.1f} points [{100 * low:.1f}, {100 * high:.1f}]"
 
 

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.yardstick import times_unavoidable
 from safe_envs.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.results import Evaluation
 
 _NESTED = ("curve", "posterior_bound", "learning")
 
@@ -37,7 +35,7 @@ def frame_of(columns: Mapping[str, np.ndarray]) -> Any:
     return pd.DataFrame(dict(columns))
 
 
-def row_columns(evaluation: Evaluation) -> dict[str, np.ndarray]:
+def row_columns(evaluation: EvaluationData) -> dict[str, np.ndarray]:
     """Return a result as columns with a row for each filter.
 
     Args:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from html import escape
-from typing import TYPE_CHECKING
 
 from safe_envs.agents.evaluation.bound_marks import marks_in
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.evaluation_table import (
     compared,
     describe,
@@ -14,15 +14,12 @@ from safe_envs.agents.evaluation.evaluation_table import (
 )
 from safe_envs.text_tables import Column
 
-if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.results import Evaluation
-
 _CELL = "padding:.2em .7em;white-space:nowrap;vertical-align:bottom;"
 _RULE = "border-bottom:1px solid currentColor;"
 _SMALL = "margin:.4em 0;font-size:90%"
 
 
-def html_table(evaluation: Evaluation) -> str:
+def html_table(evaluation: EvaluationData) -> str:
     """Return a heading, a table with a row for each filter, and comparisons, as HTML.
 
     Colors are those of the page, so that it can be read on a dark one too.
@@ -45,9 +42,10 @@ def html_table(evaluation: Evaluation) -> str:
         lines += map(describe, differences)
     told = "<br>".join(map(escape, lines))
     head = "".join(map(_title, columns))
+    heading = f"<b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}"
     under = f'<p style="{_SMALL}">{told}</p>' if lines else ""
     return (
-        f'<div><p style="{_SMALL}"><b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}</p>'
+        f'<div><p style="{_SMALL}">{heading}</p>'
         '<div style="overflow-x:auto"><table style="border-collapse:collapse;font-size:90%">'
         f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{under}</div>"
     )

@@ -6,21 +6,22 @@ import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 from safe_envs.agents.evaluation.bound_marks import marks_in
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.evaluation_table import (
     compared,
     evaluation_table,
     interval_name,
     p_text,
 )
-from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged
-
-if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.text_lines import folded
+from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of
 
 _WIDTH = 80
+_NAMES = 0.38
+"""Width of names that take several lines, of that of a line."""
+
 _ESCAPED = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -56,7 +57,7 @@ _GREEK = re.compile(
 )
 
 
-def latex_table(evaluation: Evaluation) -> str:
+def latex_table(evaluation: EvaluationData) -> str:
     """Return a floating table with a row for each filter, and the comparisons of filters.
 
     Args:
@@ -119,14 +120,14 @@ def _tabular(table: FittedTable) -> str:
     """Return a table with titles of one or two lines, broken as in a terminal."""
     height = max(len(column.title) for column in table)
     titles = zip(*(_bottom(column.title, height) for column in table), strict=True)
-    rows = zip(*(column.column.cells for column in table), strict=True)
+    rows = zip(*(column.cells for column in table), strict=True)
     return _framed([column.column for column in table], [*titles], [*rows])
 
 
-def _compared(evaluation: Evaluation) -> str:
+def _compared(evaluation: EvaluationData) -> str:
     rows = [
         (
-            f"{c.first} - {c.second}",
+            folded(f"{c.first} - {c.second}", _WIDTH // 2),
             f"{100 * c.difference:+.1f} [{100 * c.ci_low:.1f}, {100 * c.ci_high:.1f}]",
             "-" if c.mcnemar_p is None else p_text(c.mcnemar_p).removeprefix("= "),
             f"{c.only_first} / {c.only_second}",
@@ -134,19 +135,19 @@ def _compared(evaluation: Evaluation) -> str:
         for c in compared(evaluation)
     ]
     titles = (
-        "difference of safety rates",
-        f"points [{interval_name(evaluation)}]",
-        "McNemar p",
-        "safe with one only",
+        ("difference of", "points", "McNemar", "safe with"),
+        ("safety rates", f"[{interval_name(evaluation)}]", "p", "one only"),
     )
-    columns = [Column(title, (), "r" if i else "l") for i, title in enumerate(titles)]
-    return _framed(columns, [titles], rows)
+    return _framed(columns_of("lr", titles[1], rows), titles, rows)
 
 
 def _framed(
-    columns: Sequence[Column], titles: Sequence[Sequence[str]], rows: Sequence[Sequence[Any]]
+    columns: Sequence[Column], titles: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]
 ) -> str:
     kinds = "".join("r" if column.kind == "r" else "l" for column in columns)
+    if any("\n" in cells[0] for cells in rows):
+        # Long names take several lines.
+        kinds = f"p{{{_NAMES}\\linewidth}}{kinds[1:]}"
     lines = [
         f"\\begin{{tabular}}{{@{{}}{kinds}@{{}}}}",
         "\\toprule",
@@ -159,16 +160,21 @@ def _framed(
     return "\n".join(lines)
 
 
-def _row(cells: Sequence[Any]) -> str:
+def _row(cells: Sequence[str]) -> str:
     # Braces, since after the end of a row LaTeX takes a bracket or a star for an option.
-    return " & ".join(f"{{{escape(str(cell))}}}" for cell in cells) + " \\\\"
+    return " & ".join(f"{{{_cell(str(cell))}}}" for cell in cells) + " \\\\"
+
+
+def _cell(text: str) -> str:
+    lines = [escape(line) for line in text.split("\n")]
+    return lines[0] if len(lines) == 1 else "\\raggedright " + "\\newline ".join(lines)
 
 
 def _bottom(lines: Sequence[str], height: int) -> list[str]:
     return [""] * (height - len(lines)) + list(lines)
 
 
-def _caption(evaluation: Evaluation) -> str:
+def _caption(evaluation: EvaluationData) -> str:
     config, problem = evaluation.config, evaluation.problem
     text = (
         f"Safety of the policy {config['policy']['name']} on {evaluation.title}:"
@@ -180,7 +186,7 @@ def _caption(evaluation: Evaluation) -> str:
     return escape(text + (f" Bounds: {marks}." if marks else ""))
 
 
-def _label(evaluation: Evaluation) -> str:
+def _label(evaluation: EvaluationData) -> str:
     name = unicodedata.normalize("NFKD", evaluation.title).encode("ascii", "ignore").decode()
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
     return f"tab:{slug or 'evaluation'}"

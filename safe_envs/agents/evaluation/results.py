@@ -1,165 +1,24 @@
-"""The result of an evaluation."""
+"""The result of an evaluation, as texts, tables and data frames."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.evaluation_table import evaluation_table
 from safe_envs.agents.evaluation.frames import frame_of, row_columns
 from safe_envs.agents.evaluation.html_table import html_table
 from safe_envs.agents.evaluation.latex_table import latex_table
-from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
-from safe_envs.agents.evaluation.safe_flags import SafeFlags
-from safe_envs.agents.evaluation.spec import EvaluationSpec
-from safe_envs.agents.evaluation.trajectories import Trajectories
-from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.agents.evaluation.yardstick import best_document
-from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.errors import ConfigurationError
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.text_tables import markdown_of, text_of
-from safe_envs.wrappers.learning import LearnedModel
 
 _WIDTH = 80
 """Of texts, in characters."""
 
 
-@dataclass(frozen=True)
-class FilterTiming:
-    """How long the episodes under a filter took.
-
-    Attributes:
-        filter: its name.
-        seconds: wall-clock time.
-        steps: control periods of all episodes.
-        steps_per_second: steps/seconds.
-        learning_seconds: mean time of an identification; None where nothing was learned.
-        engine: "numpy" or "compiled".
-        jobs: processes of NumPy, or threads of the compiled engine.
-    """
-
-    filter: str
-    seconds: float
-    steps: int
-    steps_per_second: float
-    learning_seconds: float | None
-    engine: str
-    jobs: int
-
-
-@dataclass(frozen=True)
-class Timing:
-    """The part of a result that depends on the machine.
-
-    Attributes:
-        num_envs: episodes that NumPy simulates side by side.
-        rows: one for each filter.
-    """
-
-    num_envs: int
-    rows: list[FilterTiming]
-
-
 @dataclass(frozen=True, repr=False)
-class Evaluation:
-    """The result of `evaluate`. `print` and notebooks show it as a table.
-
-    Attributes:
-        problem: what was simulated.
-        spec: what was asked for.
-        config: all that determines the result, as JSON-able data.
-        rows: statistics, one row for each filter.
-        comparisons: of every two rows, by which of the same episodes were safe.
-        timing: the only part that depends on the machine and on `num_envs`.
-        trajectories: of each filter, if they were asked for.
-        safe: which episodes are safe, for each filter and identification.
-        visited: states of the episodes that contradict a bound, if any do, for each filter and
-            identification.
-        learned: models of the first identifications.
-        is_deterministic: whether nothing is random, so that all episodes are one and the same.
-        episodes_if_kept: see `episodes`; None where they were not kept.
-        best: how safe any policy can be, counted as the rows are; None where it is not known.
-    """
-
-    problem: SafetyProblem
-    spec: EvaluationSpec
-    config: dict[str, Any]
-    rows: list[EvaluationRow]
-    comparisons: list[Comparison]
-    timing: Timing
-    trajectories: dict[str, Trajectories]
-    safe: dict[str, list[SafeFlags]]
-    visited: dict[str, list[VisitedStates]]
-    learned: list[LearnedModel]
-    is_deterministic: bool
-    episodes_if_kept: dict[str, list[EpisodeResults]] | None
-    best: AttainableSafety | None = None
-
-    @property
-    def title(self) -> str:
-        """How results call what was evaluated."""
-        return self.config["title"]
-
-    @property
-    def episodes(self) -> dict[str, list[EpisodeResults]]:
-        """Results of each episode, for each filter and identification.
-
-        They are there where the evaluation was to keep them: see `RunSettings.keep_episodes`.
-
-        Raises:
-            ConfigurationError: they were not kept.
-        """
-        if self.episodes_if_kept is None:
-            count = sum(len(flags) for each in self.safe.values() for flags in each)
-            raise ConfigurationError(
-                f"the results of the {count:,} episodes were not kept one by one; evaluate with"
-                " keep_episodes=True for that, or with episodes_out='FILE.parquet' to write them"
-                " to a file, which takes no memory"
-            )
-        return self.episodes_if_kept
-
-    def row(self, name: str) -> EvaluationRow:
-        """Return the row of a filter.
-
-        Raises:
-            KeyError: No row has the name.
-        """
-        return {row.filter: row for row in self.rows}[name]
-
-    def document(self) -> dict[str, Any]:
-        """Return the whole as JSON-able data."""
-        return {
-            "config": self.config,
-            "versions": package_versions(),
-            "rows": [row.as_dict() for row in self.rows],
-            "comparisons": [asdict(comparison) for comparison in self.comparisons],
-            "timing": asdict(self.timing),
-            "best": best_document(self.best, self.rows),
-        }
-
-    def episode_columns(self) -> dict[str, np.ndarray]:
-        """Return the results of all episodes as columns, in the order of filters and episodes.
-
-        Returns:
-            Arrays of equal length: filter, identification, episode, safe, return, min_h,
-            first_violation (s, NaN where there is none), length (steps), interventions,
-            infeasible, effort.
-
-        Raises:
-            ConfigurationError: they were not kept: see `episodes`.
-        """
-        found: dict[str, list[Any]] = {}
-        for name, identifications in self.episodes.items():
-            for repeat, results in enumerate(identifications):
-                columns = results.columns(name, repeat, 0, self.problem.dt)
-                for key, values in columns.items():
-                    found.setdefault(key, []).append(values)
-        return {key: np.concatenate(parts) for key, parts in found.items()}
+class Evaluation(EvaluationData):
+    """The result of `evaluate`. `print` and notebooks show it as a table."""
 
     def to_frame(self, episodes: bool = False) -> Any:
         """Return a pandas DataFrame with a row for each filter, or for each episode.
@@ -182,12 +41,6 @@ class Evaluation:
         table = evaluation_table(self)
         tables = [markdown_of(each) for each in table.arranged(_WIDTH)]
         return "\n\n".join([tables[0], *table.facts, *tables[1:]])
-
-    @property
-    def about(self) -> str:
-        """Policy, number of episodes, and seed."""
-        seed, policy = self.config["seed"], self.config["policy"]["name"]
-        return f"policy {policy} | {self.spec.episodes} episodes | seed {seed}"
 
     def __str__(self) -> str:
         table = evaluation_table(self).short()

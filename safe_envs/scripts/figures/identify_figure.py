@@ -45,7 +45,7 @@ _TITLE = 0.2
 
 _TINY, _HUGE = 0.02, 2e4
 
-_OF = re.compile(r"(\w+)\[([\w, ]+)\]")
+_OF = re.compile(r"(\w+)([\[(])([\w, ]+)[\])]")
 
 _ESTIMATE_HANDLE = Line2D(
     [], [], color=COLORS[0], marker="o", linestyle="", markersize=3, label="estimate at a state"
@@ -238,7 +238,7 @@ def function_symbol(name: str) -> str:
     """Return the name of a learned function as mathematics.
 
     Args:
-        name: such as "f[x_1]" or "covariance[x_1, x_2]", or a text.
+        name: such as "f[x_1]" "covariance[x_1, x_2]" or "C(x, y)", or a text.
 
     Returns:
         Such as "$f$ of $x_{1}$".
@@ -246,8 +246,9 @@ def function_symbol(name: str) -> str:
     match = _OF.fullmatch(name)
     if match is None:
         return " ".join(symbol(word) for word in name.split())
-    states = ", ".join(symbol(each) for each in match[2].split(", "))
-    return f"{symbol(match[1])} of {states}"
+    name, bracket, inside = match.groups()
+    of = ", ".join(symbol(each) for each in inside.split(", "))
+    return f"{symbol(name)} of {of}" if bracket == "[" else f"{symbol(name)}({of})"
 
 
 def _range(name: str, values: np.ndarray) -> str:

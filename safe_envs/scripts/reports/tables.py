@@ -60,8 +60,10 @@ def print_full(console: Console, table: Table) -> None:
         table: with columns of any width.
     """
     widest = console.options.update(max_width=_WIDEST)
-    width = max(console.width, console.measure(table, options=widest).maximum)
-    console.print(table, width=width)
+    before = console.width
+    console.width = max(before, console.measure(table, options=widest).maximum)
+    console.print(table)
+    console.width = before
 
 
 def print_rows(
@@ -101,12 +103,13 @@ def print_columns(
     for i, fitted in enumerate(arranged(names, columns, console.width)):
         if i:
             console.print(Table.grid())
-        table = _drawn(fitted)
-        if not i and facts:
-            lines = [line for fact in facts for line in wrapped(fact, console.width, indent=4)]
-            table.caption, table.caption_justify = Text("\n".join(lines)), "left"
-            table.caption_style = ""
-        print_full(console, table)
+        print_full(console, _drawn(fitted))
+        if not i:
+            # Each is a table too, so that --quiet leaves it.
+            for fact in facts:
+                line = Table.grid()
+                line.add_row(Text("\n".join(wrapped(fact, console.width, indent=4))))
+                console.print(line)
 
 
 def _drawn(fitted: FittedTable) -> Table:

@@ -67,7 +67,7 @@ def ciede2000(one: np.ndarray, other: np.ndarray) -> float:
     turn = (h2 - h1 + 180.0) % 360.0 - 180.0 if c1 * c2 else 0.0
     lightness, chroma = l2 - l1, c2 - c1
     hue = 2 * math.sqrt(c1 * c2) * math.sin(math.radians(turn / 2))
-    l, c = 0.5 * (l1 + l2), 0.5 * (c1 + c2)
+    light, c = 0.5 * (l1 + l2), 0.5 * (c1 + c2)
     if not c1 * c2:
         h = h1 + h2
     elif abs(h1 - h2) <= 180.0:
@@ -76,7 +76,7 @@ def ciede2000(one: np.ndarray, other: np.ndarray) -> float:
         h = 0.5 * (h1 + h2 + (360.0 if h1 + h2 < 360.0 else -360.0))
     t = 1 - 0.17 * math.cos(math.radians(h - 30)) + 0.24 * math.cos(math.radians(2 * h))
     t += 0.32 * math.cos(math.radians(3 * h + 6)) - 0.2 * math.cos(math.radians(4 * h - 63))
-    s_l = 1 + 0.015 * (l - 50) ** 2 / math.sqrt(20 + (l - 50) ** 2)
+    s_l = 1 + 0.015 * (light - 50) ** 2 / math.sqrt(20 + (light - 50) ** 2)
     s_c, s_h = 1 + 0.045 * c, 1 + 0.015 * c * t
     turned = 60 * math.exp(-(((h - 275) / 25) ** 2))
     r = -2 * math.sqrt(c**7 / (c**7 + 25.0**7)) * math.sin(math.radians(turned))

@@ -32,7 +32,12 @@ def test_the_legend_is_not_cut(labels, columns):
     add_legend(figure, [Line2D([], [], label=label) for label in labels])
     figure.canvas.draw()
     (legend,) = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == labels
+    texts = [text.get_text() for text in legend.get_texts()]
+    # A label that is too long has several lines, and its letters keep their size.
+    assert [text.replace("\n", "") for text in texts] == [
+        text.replace(" ", "") for text in labels
+    ] or texts == labels
+    assert all(text.get_fontsize() >= 7.0 for text in legend.get_texts())
     assert legend._ncols == columns
     extent = legend.get_window_extent()
     assert extent.x0 >= -1

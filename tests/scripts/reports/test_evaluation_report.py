@@ -13,7 +13,7 @@ from rich.console import Console
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.results import Timing
+from safe_envs.agents.evaluation.evaluation_data import Timing
 from safe_envs.agents.evaluation.rounding import touches
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
 from tests.scripts.conftest import strictly

@@ -185,7 +185,9 @@ def test_vector_wrappers_above_the_filter_leave_its_decisions_alone(name: str):
 @pytest.mark.parametrize("above", [True, False])
 def test_videos_show_the_filtered_episode_from_both_sides(above: bool, tmp_path: Path):
     def recorded(env: Any) -> Any:
-        return wrappers.RecordVideo(env, str(tmp_path / "videos"), video_length=3, disable_logger=True)
+        return wrappers.RecordVideo(
+            env, str(tmp_path / "videos"), video_length=3, disable_logger=True
+        )
 
     env = (
         recorded(own(render_mode="rgb_array")) if above else own(recorded, render_mode="rgb_array")

@@ -1,0 +1,85 @@
+"""The table of an evaluation in a notebook: escaped, without scripts and colors of its own."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+
+from tests.agents.evaluation.made_up import LONG_NAME, nasty_evaluation
+
+ATTACK = '<script>alert("x")</script> & <b onclick="f()">'
+
+
+class Reader(HTMLParser):
+    """Reads tags, their attributes, and the texts of cells."""
+
+    def __init__(self):
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.attributes: list[tuple[str, str | None]] = []
+        self.rows: list[list[str]] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.attributes += attrs
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag != "br":
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def read():
+    answer = nasty_evaluation()
+    rows = [*answer.rows[:2], replace(answer.rows[2], filter=ATTACK)]
+    reader = Reader()
+    reader.feed(replace(answer, rows=rows)._repr_html_())
+    assert not reader.open
+    return reader, rows
+
+
+def test_it_has_a_row_for_each_filter_with_its_intervals_and_words(read):
+    reader, rows = read
+    titles, *cells = reader.rows
+    assert [row[0] for row in cells] == ["none", LONG_NAME, ATTACK]
+    assert {len(row) for row in cells} == {len(titles)}
+    rate = titles.index("safe [95 % interval]")
+    for shown, row in zip(cells, rows, strict=True):
+        assert f"[{100 * row.ci_low:.1f}, {100 * row.ci_high:.1f}]" in shown[rate]
+    assert cells[1][titles.index("bound, continuous")] == ">= 12.3 %"
+    assert cells[2][titles.index("bound, continuous")] == "50.0 % est."
+    for text in (
+        "violations",
+        "infeasible",
+        "attainable by any policy: 99.99 %",
+        "est. is estimated, and not proved",
+        "McNemar p",
+    ):
+        assert text in reader.text
+
+
+def test_it_is_escaped_and_has_neither_scripts_nor_colors(read):
+    reader, _ = read
+    assert reader.tags == {
+        *("div", "p", "b", "br"),
+        *("table", "thead", "tbody", "tr", "th", "td"),
+    }
+    assert {name for name, _ in reader.attributes} <= {"style", "scope"}
+    styles = " ".join(value or "" for name, value in reader.attributes if name == "style")
+    assert not re.search(r"#|rgb|background|(?<!-)color:", styles)
+    assert set(re.findall(r"\d+px solid (\w+)", styles)) == {"currentColor"}

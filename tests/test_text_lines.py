@@ -1,0 +1,50 @@
+"""Lines that fit a width, with every word of the text in them."""
+
+from __future__ import annotations
+
+import pytest
+
+from safe_envs.text_lines import folded, text_width, wrapped
+
+COMPARED = (
+    "  promise:p=0.9 - scbf: +21.0 points [15.6, 27.2], McNemar p < 1e-10 (safe with one only:"
+    " promise:p=0.9 42, scbf 0)"
+)
+LONG = "learned-hocbf:p=2:level=.95:file=/some/very/long/path/to/a/model.npz+cbf:alpha=1"
+
+
+@pytest.mark.parametrize("width", range(24, 131, 7))
+@pytest.mark.parametrize("text", [COMPARED, f"Note: with {LONG} it ends", LONG, "x" * 200, ""])
+def test_no_line_is_longer_and_no_character_is_lost(text, width):
+    lines = wrapped(text, width, indent=4)
+    assert max(map(len, lines)) <= width
+    assert "".join("".join(lines).split()) == "".join(text.split())
+    assert all(line.startswith("    ") for line in lines[1:])
+
+
+def test_numbers_stay_with_their_units_intervals_and_signs():
+    for width in range(40, 100):
+        lines = [line.strip() for line in wrapped(COMPARED, width, indent=4)]
+        for together in ("+21.0 points", "[15.6, 27.2]", "p < 1e-10"):
+            assert sum(together in line for line in lines) == 1
+    assert wrapped("a rate of 12.3 % is", 13) == ["a rate of", "12.3 % is"]
+
+
+def test_a_text_that_fits_is_left_alone():
+    assert wrapped(COMPARED, 200) == [COMPARED]
+    assert wrapped("one  two", 8) == ["one  two"]
+
+
+@pytest.mark.parametrize("width", [8, 12, 20, 33, 200])
+def test_names_are_folded_after_the_signs_that_part_them(width):
+    lines = folded(LONG, width).split("\n")
+    assert max(map(len, lines)) <= width
+    assert "".join(lines) == LONG
+    if width > 16:
+        assert all(line[-1] in ":+,;/=" for line in lines[:-1])
+
+
+def test_wide_characters_take_two_places():
+    assert text_width("安全") == 4
+    assert text_width("e\u0301") == 1
+    assert [text_width(line) for line in folded("安全安全安", 4).split("\n")] == [4, 4, 2]
