@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import base64
 import json
 import re
-import tempfile
 import tomllib
 from collections.abc import Iterator
 from importlib import import_module
@@ -19,8 +17,6 @@ import nbformat
 import PIL.Image
 import pytest
 import yaml
-from IPython.display import Image
-from matplotlib import pyplot as plt
 
 import safe_envs
 from safe_envs import ENV_IDS, agents, wrappers
@@ -115,40 +111,6 @@ def test_python_runs(page: Path, hook: Any, monkeypatch: pytest.MonkeyPatch):
     for size, few in (("particles", 50), ("repetitions", 10)):
         monkeypatch.setitem(estimate_rare.__kwdefaults__, size, few)
     hook("runs").run_python(page.read_text())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((DOCS / "notebooks").glob("*.ipynb")), ids=name_of)
-def test_notebook_is_kept_without_outputs_and_its_cells_run(
-    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    text = path.read_text()
-    assert '"outputs": []' in text
-    assert not re.search(r'"outputs": \[\s*\{', text)
-    # In this process: a kernel of its own imports everything once more. `make docs` executes
-    # notebooks in kernels.
-    pictures: list[Any] = []
-    monkeypatch.setattr(plt, "show", lambda: pictures.append(plt.get_fignums()))
-    monkeypatch.setattr(tempfile, "mkdtemp", lambda: str(tmp_path))
-    names: dict[str, Any] = {}
-    for cell in json.loads(text)["cells"]:
-        if cell["cell_type"] == "code":
-            pictures += [
-                value
-                for value in [run_cell("".join(cell["source"]), names)]
-                if isinstance(value, Image)
-            ]
-    plt.close("all")
-    assert len(pictures) == 1
-    assert pictures[0]
-
-
-def run_cell(source: str, names: dict[str, Any]) -> Any:
-    """Execute a cell, and return the value of its last line, if it is an expression."""
-    tree = ast.parse(source)
-    last = ast.Expression(tree.body.pop().value) if isinstance(tree.body[-1], ast.Expr) else None
-    exec(compile(tree, "<cell>", "exec"), names)
-    return eval(compile(last, "<cell>", "eval"), names) if last else None
 
 
 @pytest.mark.slow
