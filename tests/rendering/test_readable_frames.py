@@ -44,7 +44,7 @@ def test_the_check_finds_a_text_on_a_line_and_one_that_is_cut_off(monkeypatch, m
     def crossed(self, canvas, snapshot):
         draw(self, canvas, snapshot)
         canvas.line((80, 100), (400, 100), (0, 0, 0), 3)
-        getattr(canvas, method)("crossed", (200, 104), (0, 0, 0))
+        getattr(canvas, method)("crossed", (200, 94), (0, 0, 0))
         getattr(canvas, method)("cut off", (-10, 300), (0, 0, 0))
 
     monkeypatch.setattr(TopView, "draw", crossed)
