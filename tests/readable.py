@@ -56,11 +56,11 @@ def unreadable(texts: list[Written], background: np.ndarray) -> list[str]:
         texts: of the picture.
         background: the picture without texts, uint8 of shape (height, width, 3).
     """
-    found = []
+    found, lights = [], luminance(background)
     for each in texts:
         if not each.inside:
             found.append(f"{each.text!r} is cut off")
-        below = luminance(background)[each.mask]
+        below = lights[each.mask]
         if not below.size:
             continue
         if each.halo is None:
@@ -72,8 +72,9 @@ def unreadable(texts: list[Written], background: np.ndarray) -> list[str]:
             least = contrast(luminance(each.color), luminance(each.halo))
         if least < LEGIBLE:
             found.append(f"{each.text!r} is hard to tell from what is below (contrast {least:.2f})")
-    for one, other in itertools.combinations(texts, 2):
-        if (one.mask & other.mask).any():
+    pixels = [np.flatnonzero(each.mask) for each in texts]
+    for (one, a), (other, b) in itertools.combinations(zip(texts, pixels, strict=True), 2):
+        if a.size and b.size and a[0] <= b[-1] and b[0] <= a[-1] and np.intersect1d(a, b).size:
             found.append(f"{one.text!r} overlaps {other.text!r}")
     return found
 

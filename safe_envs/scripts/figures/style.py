@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 # The palette of Okabe and Ito: no two of the seven are closer than 10 in CIEDE2000, also under
 # protanopia, deuteranopia and tritanopia.
@@ -57,6 +58,9 @@ STYLE: Any = {
     "svg.hashsalt": "safe-envs",
     "savefig.dpi": 300,
 }
+HALO = [withStroke(linewidth=2.0, foreground="white")]
+"""Of a text in a panel, which lines may cross."""
+
 SMALL = 7.0
 """Size of the smallest letters, in points."""
 
