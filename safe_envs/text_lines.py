@@ -38,7 +38,8 @@ def folded(name: str, width: int) -> str:
 def wrapped(text: str, width: int, indent: int = 0) -> list[str]:
     """Return a line of text in lines of a width, all but the first indented.
 
-    Numbers stay with their units and intervals in one line; a word that is too long is folded.
+    Numbers stay with their units and intervals in one line, and so does what is in brackets, where
+    it fits; a word that is too long is folded.
 
     Args:
         text: a line.
@@ -63,6 +64,9 @@ def break_points(text: str, width: int, indent: int = 0) -> list[int]:
     points: list[int] = []
     begin, room = 0, width
     for word in re.finditer(r"[^ ]+", text):
+        if word[0].startswith("(") and _goes_down(text, begin, word.start(), room, width - indent):
+            points.append(word.start())
+            begin, room = word.start(), max(width - indent, 1)
         if text_width(text[begin : word.end()]) <= room:
             continue
         # A name that is to be folded anyway begins in the line in which it is.
@@ -84,6 +88,25 @@ def text_width(text: str) -> int:
     return sum(
         0 if unicodedata.combining(c) else 2 if unicodedata.east_asian_width(c) in "WF" else 1
         for c in text
+    )
+
+
+def _goes_down(text: str, begin: int, opened: int, room: int, below: int) -> bool:
+    """Return whether a bracket is to begin a line: it fits there as a whole, and here it does not.
+
+    Args:
+        text: a line.
+        begin: of its part in the present line.
+        opened: place of the bracket.
+        room: width of the present line.
+        below: width of the next line.
+    """
+    closed = text.find(")", opened) + 1
+    return (
+        closed > 0
+        and text_width(text[begin:closed]) > room
+        and text_width(text[opened:closed]) <= below
+        and text_width(text[begin:opened]) > room // 2
     )
 
 

@@ -30,6 +30,13 @@ def test_numbers_stay_with_their_units_intervals_and_signs():
     assert wrapped("a rate of 12.3 % is", 13) == ["a rate of", "12.3 % is"]
 
 
+def test_what_is_in_brackets_begins_a_line_where_it_does_not_fit():
+    lines = wrapped(COMPARED, 80, indent=6)
+    assert lines[1].strip() == "(safe with one only: promise:p=0.9 42, scbf 0)"
+    # Nearly all of the line would be empty.
+    assert wrapped("in (a b c d e f)", 14) == ["in (a b c d e", "f)"]
+
+
 def test_a_text_that_fits_is_left_alone():
     assert wrapped(COMPARED, 200) == [COMPARED]
     assert wrapped("one  two", 8) == ["one  two"]

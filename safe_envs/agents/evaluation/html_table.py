@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 from safe_envs.agents.evaluation.bound_marks import marks_in
@@ -14,9 +15,11 @@ from safe_envs.agents.evaluation.evaluation_table import (
 )
 from safe_envs.text_tables import Column
 
-_CELL = "padding:.2em .7em;white-space:nowrap;vertical-align:bottom;"
+_WIDTH = 80
+"""Of a table, in characters: about what the column of a page holds."""
+
+_CELL = "padding:.2em .7em;vertical-align:bottom;border:0;"
 _RULE = "border-bottom:1px solid currentColor;"
-_SMALL = "margin:.4em 0;font-size:90%"
 
 
 def html_table(evaluation: EvaluationData) -> str:
@@ -28,26 +31,36 @@ def html_table(evaluation: EvaluationData) -> str:
         evaluation: to show.
     """
     table = evaluation_table(evaluation)
-    columns = [table.names, *table.columns]
-    rows = zip(*(column.cells for column in columns), strict=True)
-    body = "".join(
-        f"<tr>{''.join(_cell(*each) for each in zip(columns, cells, strict=True))}</tr>"
-        for cells in rows
-    )
-    lines = [*table.facts, *marks_in(table.columns)]
+    first, *others = [_table([c.column for c in each]) for each in table.arranged(_WIDTH)]
+    lines = marks_in(table.columns)
     differences = compared(evaluation)
     if differences:
         heading = "Difference of the safety rates on the same episodes"
         lines.append(f"{heading} [{interval_name(evaluation)}]:")
         lines += map(describe, differences)
-    told = "<br>".join(map(escape, lines))
-    head = "".join(map(_title, columns))
     heading = f"<b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}"
-    under = f'<p style="{_SMALL}">{told}</p>' if lines else ""
+    parts = [_paragraph(heading), first, *map(_paragraph, map(escape, table.facts)), *others]
+    if lines:
+        parts.append(_paragraph("<br>".join(map(escape, lines))))
+    return f"<div>{''.join(parts)}</div>"
+
+
+def _paragraph(html: str) -> str:
+    return f'<p style="margin:.4em 0;font-size:90%;overflow-wrap:anywhere">{html}</p>'
+
+
+def _table(columns: Sequence[Column]) -> str:
+    """Return a table that scrolls by itself; its class keeps a page's own look away from it."""
+    head = "".join(map(_title, columns))
+    rows = zip(*(column.cells for column in columns), strict=True)
+    body = "".join(
+        f"<tr>{''.join(_cell(*each) for each in zip(columns, cells, strict=True))}</tr>"
+        for cells in rows
+    )
     return (
-        f'<div><p style="{_SMALL}">{heading}</p>'
-        '<div style="overflow-x:auto"><table style="border-collapse:collapse;font-size:90%">'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{under}</div>"
+        '<div style="overflow-x:auto;margin:.6em 0"><table class="safe-envs-evaluation"'
+        ' style="border-collapse:collapse;font-size:90%;margin:0;border:0">'
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
     )
 
 
@@ -57,8 +70,10 @@ def _title(column: Column) -> str:
 
 
 def _cell(column: Column, text: str) -> str:
-    return f'<td style="{_align(column)}{_CELL}">{escape(text)}</td>'
+    # A number stays on one line with its interval; titles and long names take several.
+    breaks = "white-space:nowrap;" if column.kind == "r" else "overflow-wrap:anywhere;"
+    return f'<td style="{_align(column)}{_CELL}{breaks}">{escape(text)}</td>'
 
 
 def _align(column: Column) -> str:
-    return f"text-align:{'right' if column.kind == 'r' else 'left'};"
+    return "text-align:right;" if column.kind == "r" else "text-align:left;min-width:9em;"
