@@ -8,6 +8,7 @@
 # make lint        check style, formatting, types and the layers of imports
 # make wheel-test  build the wheel, install it without extras, and use it outside the checkout
 # make docs        build the documentation in site/
+# make docs-test   build it, and open every page in a browser
 # Every target first creates the virtual environment .venv.
 
 PYTHON ?= python3
@@ -15,7 +16,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test check oracle clusters mutants golden lint wheel-test docs clean
+.PHONY: demo test check oracle clusters mutants golden lint wheel-test docs docs-test clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -50,6 +51,9 @@ wheel-test: $(READY)
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
+docs-test: docs
+	$(BIN)/python -m pytest -m docs tests/docs_site --site site
+
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,render]'
@@ -60,4 +64,4 @@ $(DOCS_READY): $(READY)
 	touch $@
 
 clean:
-	rm -rf .venv site
+	rm -rf .venv site .docs_cache

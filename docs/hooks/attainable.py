@@ -18,9 +18,11 @@ from typing import Any
 KEPT = Path(__file__).resolve().parents[1] / "assets" / "attainable.json"
 
 _HEADER = (
-    "| env | lower | upper | simulated [95 % interval] | by | coordinates | grid | steps | time |"
-    " table |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| env | lower | upper | simulated [95 % interval] | by |\n|---|---|---|---|---|",
+    "| env | coordinates | grid | steps | time | table |\n|---|---|---|---|---|---|",
 )
+"""Of the values, and of the grids they were computed on."""
+
 _NEAR = 0.01
 """Of a gap that is called one: below, lower and upper are close."""
 
@@ -28,9 +30,11 @@ _OF_BEST = ("lower", "upper", "contradiction", "coordinates", "cells", "steps", 
 
 
 def attainable_table(kept: Path = KEPT) -> str:
-    """Return Markdown with a line for each env of the file."""
-    entries = json.loads(kept.read_text())
-    return "\n".join([_HEADER, *(_line(name, entries[name]) for name in sorted(entries))])
+    """Return Markdown with a line for each env of the file, and one for each grid."""
+    entries = sorted(json.loads(kept.read_text()).items())
+    values = [_line(*entry) for entry in entries]
+    grids = [_grid_line(name, entry) for name, entry in entries if "cells" in entry]
+    return "\n".join([_HEADER[0], *values, "", _HEADER[1], *grids])
 
 
 def taken_over(folder: Path, kept: Path = KEPT) -> None:
@@ -55,21 +59,27 @@ def entry_of(document: dict[str, Any]) -> dict[str, Any]:
 def _line(name: str, entry: dict[str, Any]) -> str:
     rate, low, high = (100.0 * share for share in entry["simulated"])
     by = entry["by"] if entry["by"] == "best" else f"`{entry['by']}`"
-    start = f"| [{name}](../envs/{name}.md) |"
-    measured = f"{rate:.1f} % [{low:.1f}, {high:.1f}] | {by} |"
     if "cells" not in entry:
-        return f"{start} no grid | no grid | {measured} | | | | |"
-    if entry["contradiction"]:
+        bounds = "no grid | no grid"
+    elif entry["contradiction"]:
         bounds = "withheld | withheld"
     elif entry["upper"] - entry["lower"] >= 1.0 - _NEAR:
         bounds = "0 (grid too coarse) | 1 (grid too coarse)"
     else:
         bounds = " | ".join(f"{100.0 * entry[end]:.2f} %" for end in ("lower", "upper"))
+    return f"| {_link(name)} | {bounds} | {rate:.1f} % [{low:.1f}, {high:.1f}] | {by} |"
+
+
+def _grid_line(name: str, entry: dict[str, Any]) -> str:
     coordinates = ", ".join(f"`{c}`" for c in entry["coordinates"])
     return (
-        f"{start} {bounds} | {measured} {coordinates} | {' x '.join(map(str, entry['cells']))} |"
+        f"| {_link(name)} | {coordinates} | {' x '.join(map(str, entry['cells']))} |"
         f" {entry['steps']} | {entry['seconds']:.0f} s | {entry['memory'] / 1e6:.0f} MB |"
     )
+
+
+def _link(name: str) -> str:
+    return f"[{name}](../envs/{name}.md)"
 
 
 if __name__ == "__main__":

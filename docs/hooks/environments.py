@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import sympy as sp
 from formulas import with_latex, with_set_units
+from navigation import short_name
 from PIL import Image
 
 from safe_envs import ENV_IDS, SafetyProblem
@@ -50,11 +51,6 @@ _HEADER = (
 _WORD = re.compile(r"^[A-Za-z]{2,}")
 _FUNCTION = re.compile(r"(?<=[A-Za-z0-9}]) (?=\\(?:sin|cos|tan|exp|log)\b)")
 _LOW = re.compile(r"\\left\(((?:(?!\\left|\\right|\\frac).)*)\\right\)")
-
-
-def short_name(env_id: str) -> str:
-    """Return the name of an env without its namespace and version."""
-    return env_id.removeprefix("safe_envs/").removesuffix("-v0")
 
 
 def env_pages() -> dict[str, str | bytes]:
@@ -212,8 +208,9 @@ def _picture(env: Any) -> tuple[np.ndarray, str]:
     seen = f" The minimum of $h$ so far is {info['h_min']:.3g}{why}." if info["h_min"] < 0 else ""
     return filtered.render(), (
         f"The nominal controller under {_link(problem)} after {count * problem.dt:g} s, seed 0."
-        " Green: the safe set; hatched: $h < 0$. The panel shows the executed action (bar), the"
-        f" nominal action (diamond), and $h$ over time.{seen}"
+        " Green: the safe set; hatched: $h < 0$. The axes have the units of the [states](#states);"
+        " time is in s. The panel shows the executed action (bar) and the nominal action"
+        f" (diamond) in physical units, and $h$ over time.{seen}"
     )
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from environments import short_name
-
 from safe_envs import ENV_IDS
 from safe_envs.wrappers import CONDITIONS, LEARNED
+
+
+def short_name(env_id: str) -> str:
+    """Return the name of an env without its namespace and version."""
+    return env_id.removeprefix("safe_envs/").removesuffix("-v0")
 
 
 def complete(nav: Sequence[dict[str, Any]]) -> None:

@@ -39,27 +39,28 @@ def executed(path: Path) -> Any:
         return client.execute()
 
 
-def notebook_pages() -> dict[str, str | bytes]:
-    """Return the content by path of a page for each notebook, and of its pictures."""
+def notebook_pages(path: Path) -> dict[str, str | bytes]:
+    """Run a notebook, and return the content by path of its page and of its pictures.
+
+    Args:
+        path: of the notebook.
+    """
     pages: dict[str, str | bytes] = {}
-    for path in sorted(FOLDER.glob("*.ipynb")):
-        parts: list[str] = []
-        for i, cell in enumerate(executed(path).cells):
-            if cell.cell_type == "markdown":
-                parts.append(cell.source)
-                continue
-            parts.append(f"```python\n{cell.source}\n```")
-            for j, output in enumerate(_joined(cell.outputs)):
-                text, picture = _output(output)
-                if picture:
-                    name = f"{path.stem}-{i}-{j}.png"
-                    pages[f"notebooks/{name}"] = picture
-                    text = f"![Output of the cell](./{name})"
-                parts.append(text)
-        parts.insert(
-            1, f"[Download the notebook](./{path.name}); it was run when this site was built."
-        )
-        pages[f"notebooks/{path.stem}.md"] = "\n\n".join(parts) + "\n"
+    parts: list[str] = []
+    for i, cell in enumerate(executed(path).cells):
+        if cell.cell_type == "markdown":
+            parts.append(cell.source)
+            continue
+        parts.append(f"```python\n{cell.source}\n```")
+        for j, output in enumerate(_joined(cell.outputs)):
+            text, picture = _output(output)
+            if picture:
+                name = f"{path.stem}-{i}-{j}.png"
+                pages[f"notebooks/{name}"] = picture
+                text = f"![Output of the cell](./{name})"
+            parts.append(text)
+    parts.insert(1, f"[Download the notebook](./{path.name}); it was run when this site was built.")
+    pages[f"notebooks/{path.stem}.md"] = "\n\n".join(parts) + "\n"
     return pages
 
 

@@ -14,11 +14,14 @@ import io
 import re
 import shlex
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+
+_COLUMNS = 96
+"""Of code that fits the text of a page on a desktop."""
 
 _FENCE = re.compile(r"^```(python|console) run([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _ANY_FENCE = re.compile(r"^```(python|console)[^\n]*\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -26,18 +29,45 @@ _FILE = re.compile(r"^<!-- file (\S+) -->$", re.MULTILINE)
 _COMMAND = re.compile(r"^\$ (safe-envs(?:[^\n]*\\\n)*[^\n]*)$", re.MULTILINE)
 
 
-def with_output(markdown: str) -> str:
+Fences = Sequence[tuple[str, str, str]]
+"""Of a page: kind, options and code of each."""
+
+
+def with_output(
+    markdown: str, cached: Callable[[Any, Callable[[], Any]], Any] | None = None
+) -> str:
     """Run the examples of a page, and insert their output and the files that it shows.
+
+    Args:
+        markdown: of the page.
+        cached: takes the examples and a function that runs them, and returns what it returns, or
+            returned before; by default they are run.
 
     Raises:
         RuntimeError: A command did not end as its fence says.
     """
     markdown = _FILE.sub(lambda found: f"```python\n{(ROOT / found[1]).read_text()}```", markdown)
-    if not _FENCE.search(markdown):
+    markdown = _COMMAND.sub(lambda found: f"$ {_folded(found[1])}", markdown)
+    fences = _FENCE.findall(markdown)
+    if not fences:
         return markdown
+    printed = outputs(fences) if cached is None else cached(fences, lambda: outputs(fences))
+    each = iter(printed)
+    return _FENCE.sub(lambda found: _shown(found[1], found[2], found[3], next(each)), markdown)
+
+
+def outputs(fences: Fences) -> list[list[str]]:
+    """Run the examples of a page in order, and return what each prints, a text for each command.
+
+    Args:
+        fences: of the page.
+
+    Raises:
+        RuntimeError: A command did not end as its fence says.
+    """
     names: dict[str, Any] = {}
     with _folder():
-        return _FENCE.sub(lambda found: _shown(found[1], found[2], found[3], names), markdown)
+        return [_printed(kind, options, code, names) for kind, options, code in fences]
 
 
 def run_python(markdown: str) -> None:
@@ -72,23 +102,49 @@ def _folder() -> Iterator[None]:
             yield
 
 
-def _shown(kind: str, options: str, code: str, names: dict[str, Any]) -> str:
-    settings = {
-        name: value for name, _, value in (option.partition("=") for option in options.split())
-    }
+def _printed(kind: str, options: str, code: str, names: dict[str, Any]) -> list[str]:
+    if kind == "console":
+        fails = "fails" in _settings(options)
+        return [_output(_words(command), fails) for command in _COMMAND.findall(code)]
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(code, names)
+    return [printed.getvalue()]
+
+
+def _shown(kind: str, options: str, code: str, printed: Sequence[str]) -> str:
+    texts = [_first(text, _settings(options)) for text in printed]
     if kind == "python":
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            exec(code, names)
-        return f"```python\n{code}```\n\n```text\n{_first(printed.getvalue(), settings)}\n```"
+        return f"```python\n{code}```\n\n{_text(texts[0])}"
     # The output is a fence of its own: in a console, Pygments takes a % for a prompt.
-    printed = {
-        command: _first(_output(_words(command), "fails" in settings), settings)
-        for command in _COMMAND.findall(code)
-    }
     return "\n\n".join(
-        f"```console\n$ {command}\n```\n\n```text\n{text}\n```" for command, text in printed.items()
+        f"```console\n$ {command}\n```\n\n{_text(text)}"
+        for command, text in zip(_COMMAND.findall(code), texts, strict=True)
     )
+
+
+def _text(printed: str) -> str:
+    """Return a fence with output; lines that fit no page wrap, as they do in a terminal."""
+    is_wide = any(len(line) > _COLUMNS for line in printed.splitlines())
+    return f"```{{.text .wrapped}}\n{printed}\n```" if is_wide else f"```text\n{printed}\n```"
+
+
+def _folded(command: str) -> str:
+    """Return a command on lines that fit a page, broken before its options."""
+    if len(command) <= _COLUMNS or "\n" in command:
+        return command
+    first, *options = re.split(r" (?=--\w)", command)
+    lines = [first]
+    for option in options:
+        if len(lines[-1]) + len(option) > _COLUMNS - len(" \\"):
+            lines.append(f"    {option}")
+        else:
+            lines[-1] += f" {option}"
+    return " \\\n".join(lines)
+
+
+def _settings(options: str) -> dict[str, str]:
+    return {name: value for name, _, value in (each.partition("=") for each in options.split())}
 
 
 def _first(text: str, settings: dict[str, str]) -> str:

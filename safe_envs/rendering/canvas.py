@@ -11,22 +11,15 @@ from typing import Any
 import numpy as np
 import pygame
 
-from safe_envs.rendering.curves import apart, dash_ends
-from safe_envs.rendering.fonts import cut, text_surface
-from safe_envs.rendering.style import INK, NORMAL, PAPER, Color
+from safe_envs.rendering.curves import BRUSHES, apart, dash_ends
+from safe_envs.rendering.fonts import HALO, cut, haloed_surface, text_surface
+from safe_envs.rendering.style import INK, NORMAL, PAPER, SMALL, Color
 
 Point = Sequence[float]
 Box = tuple[int, int, int, int]
 
 _FAR = 20_000.0
 """Points further away are drawn at this distance: a surface has 16-bit coordinates."""
-
-_BRUSHES = {
-    1: ((0.0, 0.0),),
-    2: ((0.0, -0.5), (0.43, 0.25), (-0.43, 0.25)),
-    3: ((0.0, -0.9), (0.9, 0.0), (0.0, 0.9), (-0.9, 0.0), (0.0, 0.0)),
-}
-"""Offsets of the thin lines that make a line of 1, 2 or 3 pixels."""
 
 
 class Canvas:
@@ -47,22 +40,6 @@ class Canvas:
     def lay(self, other: Canvas) -> None:
         """Lay another canvas over this one."""
         self.surface.blit(other.surface, (0, 0))
-
-    def photograph(self, pixels: np.ndarray, box: Box) -> None:
-        """Show a picture as large as it fits into a box.
-
-        Args:
-            pixels: uint8 of shape (height, width, 3).
-            box: left, top, width and height.
-        """
-        left, top, width, height = box
-        shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
-        scale = min(width / shown.get_width(), height / shown.get_height())
-        size = max(1, round(scale * shown.get_width())), max(1, round(scale * shown.get_height()))
-        self.surface.blit(
-            pygame.transform.smoothscale(shown, size),
-            (left + (width - size[0]) // 2, top + (height - size[1]) // 2),
-        )
 
     @contextmanager
     def within(self, box: Box) -> Iterator[None]:
@@ -136,7 +113,7 @@ class Canvas:
         if len(points) > 200:
             points = points[apart(points)]
         # Wide lines of the library have gaps at their corners: a brush of thin ones has none.
-        for offset in _BRUSHES[min(width, 3)]:
+        for offset in BRUSHES[min(width, 3)]:
             through = (points + offset).tolist()
             # Given two points, the library's `aalines` reads a third one out of bounds.
             if len(through) == 2:
@@ -287,6 +264,28 @@ class Canvas:
             surface, (round(at[0] - align[0] * width), round(at[1] - align[1] * height))
         )
         return width
+
+    def label(
+        self,
+        text: str,
+        at: Point,
+        color: Color = INK,
+        size: int = SMALL,
+        align: tuple[float, float] = (0.5, 1.0),
+    ) -> None:
+        """Write a line with a halo of paper, which sets it off from what moves below it.
+
+        Args:
+            text: to write.
+            at: as for `text`.
+            color: of the letters.
+            size: of the letters.
+            align: as for `text`.
+        """
+        surface = haloed_surface(text, size, color, PAPER)
+        width, height = (side - 2 * HALO for side in surface.get_size())
+        left, top = round(at[0] - align[0] * width), round(at[1] - align[1] * height)
+        self.surface.blit(surface, (left - HALO, top - HALO))
 
     def pixels(self) -> np.ndarray:
         """Return a copy of what was drawn, uint8 of shape (height, width, 3)."""

@@ -8,6 +8,13 @@ _APART = 1.5
 _MOST_POINTS = 1000
 _MOST_IN_CHART = 400
 
+BRUSHES = {
+    1: ((0.0, 0.0),),
+    2: ((0.0, -0.5), (0.43, 0.25), (-0.43, 0.25)),
+    3: ((0.0, -0.9), (0.9, 0.0), (0.0, 0.9), (-0.9, 0.0), (0.0, 0.0)),
+}
+"""Offsets of the thin lines that make a line of 1, 2 or 3 pixels."""
+
 
 def apart(points: np.ndarray) -> np.ndarray:
     """Return indices of points about 1.5 pixels apart along a path, with the first and the last."""

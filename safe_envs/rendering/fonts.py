@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
+import math
 from functools import lru_cache
 from pathlib import Path
 
 import pygame
 
 from safe_envs.rendering.style import Color
+
+HALO = 2
+"""Pixels of a halo around the letters."""
 
 
 def _font(size: int, bold: bool) -> pygame.font.Font:
@@ -48,6 +53,34 @@ def text_surface(text: str, size: int, bold: bool, color: Color, turned: bool) -
     """
     surface = _font(size, bold).render(text, True, color)
     return pygame.transform.rotate(surface, 90) if turned else surface
+
+
+@lru_cache(maxsize=256)
+def haloed_surface(text: str, size: int, color: Color, halo: Color) -> pygame.Surface:
+    """Return a text with a halo around its letters.
+
+    Args:
+        text: a line.
+        size: of the letters.
+        color: of the letters.
+        halo: colour around them.
+
+    Returns:
+        A surface of the size of the text, with room for the halo on all sides.
+    """
+    letters, around = (text_surface(text, size, False, each, False) for each in (color, halo))
+    width, height = letters.get_size()
+    surface = pygame.Surface((width + 2 * HALO, height + 2 * HALO), pygame.SRCALPHA, 32)
+    for x, y in itertools.product(range(2 * HALO + 1), repeat=2):
+        if math.hypot(x - HALO, y - HALO) <= HALO + 0.5:
+            surface.blit(around, (x, y))
+    surface.blit(letters, (HALO, HALO))
+    return surface
+
+
+def text_size(text: str, size: int) -> tuple[int, int]:
+    """Return the width and height in pixels of a line of text."""
+    return _font(size, False).size(text)
 
 
 def cut(text: str, size: int, bold: bool, widest: int) -> str:

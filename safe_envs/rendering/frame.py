@@ -8,7 +8,7 @@ import numpy as np
 import pygame
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.panel import Panel
 from safe_envs.rendering.scenes import make_scene
 from safe_envs.rendering.scenes.base import Scene
@@ -50,7 +50,7 @@ class Picture:
         if shot is None:
             self._scene.draw(self._canvas, snapshot)
         else:
-            self._canvas.photograph(shot, SCENE)
+            _photograph(self._canvas, shot, SCENE)
         return self._canvas.surface
 
     def frame(
@@ -68,3 +68,21 @@ class Picture:
         """
         self.draw(snapshot, caption, shot)
         return self._canvas.pixels()
+
+
+def _photograph(canvas: Canvas, pixels: np.ndarray, box: Box) -> None:
+    """Show a picture as large as it fits into a box.
+
+    Args:
+        canvas: to draw on.
+        pixels: uint8 of shape (height, width, 3).
+        box: left, top, width and height.
+    """
+    left, top, width, height = box
+    shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
+    scale = min(width / shown.get_width(), height / shown.get_height())
+    size = max(1, round(scale * shown.get_width())), max(1, round(scale * shown.get_height()))
+    canvas.surface.blit(
+        pygame.transform.smoothscale(shown, size),
+        (left + (width - size[0]) // 2, top + (height - size[1]) // 2),
+    )

@@ -13,11 +13,13 @@ BLUE: Color = (0, 114, 178)
 SKY: Color = (86, 180, 233)
 GREEN: Color = (0, 158, 115)
 ORANGE: Color = (230, 159, 0)
-VERMILLION: Color = (213, 94, 0)
+DARK_VERMILLION: Color = (196, 80, 0)
+"""Darker than theirs, so that white letters on it can be read."""
+
 PURPLE: Color = (204, 121, 167)
 
 INK: Color = (32, 36, 44)
-GREY: Color = (112, 118, 128)
+GREY: Color = (104, 110, 120)
 LINE: Color = (214, 218, 224)
 PANEL: Color = (246, 247, 249)
 PAPER: Color = (255, 255, 255)
@@ -32,8 +34,8 @@ HATCH: Color = (236, 200, 174)
 
 EXECUTED = BLUE
 INTERVENING = ORANGE
-INFEASIBLE = VERMILLION
-VIOLATION = VERMILLION
+INFEASIBLE = DARK_VERMILLION
+VIOLATION = DARK_VERMILLION
 GOAL = PURPLE
 
 SMALL, NORMAL, LARGE = 13, 15, 20

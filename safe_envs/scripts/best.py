@@ -9,7 +9,7 @@ import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import text_options, value_options
+from safe_envs.scripts.options import figure_options, text_options, value_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -59,6 +59,7 @@ def best(
             help=f"Draw the value over the coordinates of the grid: {text_options.FORMATS}",
         ),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print how safe any policy can be from the env's starts, and how safe a greedy policy is.
 
@@ -80,6 +81,7 @@ def best(
     require_whole("seed", seed, 0)
     reads = [*text_options.inputs_of(env.system), *([("--table", table)] if table else [])]
     text_options.require_outputs(json, plot, inputs=reads)
+    figure_options.width_of(size)
     if table is not None:
         require_writable(table)
     settings = ValueSettings(
@@ -103,9 +105,9 @@ def best(
     print_best(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:
-        from safe_envs.scripts.figures.best_figure import draw
+        from safe_envs.scripts.figures.best_figure import plot_attainable
 
-        draw(answer, policy.table, plot)
+        plot_attainable(found, policy, plot, title=answer.title, size=size)
 
 
 if __name__ == "__main__":

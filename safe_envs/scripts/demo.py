@@ -37,7 +37,7 @@ def demo(
     The safety of both is shown unfiltered and filtered.
     """
     from safe_envs.agents.evaluation.evaluate import evaluate
-    from safe_envs.scripts.figures.evaluation_figure import draw
+    from safe_envs.scripts.figures.evaluation_figure import plot_evaluation
     from safe_envs.scripts.reports.evaluation_report import print_evaluation
 
     require_result(json)
@@ -57,7 +57,7 @@ def demo(
         print_evaluation(console, answer)
         documents.append(answer.document())
         picture = folder / f"{Path(actor).stem}.png"
-        draw(answer, picture)
+        plot_evaluation(answer, picture)
         say(console, f"Picture: {picture}\n")
     write_result(json, lambda: {"folder": str(folder), "evaluations": documents})
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import evaluation_options as of
-from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options import figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -47,6 +47,7 @@ def evaluate(
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
     timing: of.Timing = False,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print the safety rate of a policy under each filter, and compare the filters in pairs.
 
@@ -61,6 +62,7 @@ def evaluate(
     """
     reads = text_options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec)
     text_options.require_outputs(json, plot, episodes_out=episodes_out, latex=latex, inputs=reads)
+    figure_options.width_of(size)
     common: dict[str, Any] = {
         "filters": list(dict.fromkeys(filters)) if filters else None,
         "trust": trust,
@@ -105,9 +107,9 @@ def evaluate(
     found = _evaluate(problem, policy, refine, (json, timing), common)
     write_text_result(latex, found.to_latex)
     if plot is not None:
-        from safe_envs.scripts.figures.evaluation_figure import draw
+        from safe_envs.scripts.figures.evaluation_figure import plot_evaluation
 
-        draw(found, plot)
+        plot_evaluation(found, plot, size=size)
 
 
 def _evaluate(

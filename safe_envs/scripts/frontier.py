@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import completion, early_checks, text_options, value_options
+from safe_envs.scripts.options import (
+    completion,
+    early_checks,
+    figure_options,
+    text_options,
+    value_options,
+)
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -84,6 +90,7 @@ def frontier(
         Path | None,
         typer.Option(metavar="FILE", help=f"Draw the curve and the points: {text_options.FORMATS}"),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print the largest returns that can be had at each risk, next to those of filters.
 
@@ -105,6 +112,7 @@ def frontier(
     files = [file for policy in named for file in text_options.inputs_of(None, policy)]
     files += text_options.inputs_of(env.system, filters=given)
     text_options.require_outputs(json, plot, inputs=files)
+    figure_options.width_of(size)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     settings = FrontierSettings(
@@ -135,9 +143,9 @@ def frontier(
     config = {"env_id": known, "options": arguments, "seed": seed, "knowledge": knowledge}
     write_result(json, lambda: document(found, config))
     if plot is not None:
-        from safe_envs.scripts.figures.frontier_figure import draw
+        from safe_envs.scripts.figures.frontier_figure import plot_frontier
 
-        draw(found, title, plot)
+        plot_frontier(found, plot, title=title, size=size)
 
 
 def _trained(env: EnvOptions, problem: SafetyProblem, steps: int, seed: int) -> Any:

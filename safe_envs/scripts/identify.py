@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.scripts.options import completion, early_checks, text_options
+from safe_envs.scripts.options import completion, early_checks, figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -73,6 +73,7 @@ def identify(
             metavar="FILE", help=f"Draw the truth against the estimate: {text_options.FORMATS}"
         ),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
@@ -89,6 +90,7 @@ def identify(
     require_whole("seed", seed, 0)
     inputs = [*text_options.inputs_of(env.system), *([] if data is None else [("--data", data)])]
     text_options.require_outputs(json, plot, out=out, inputs=inputs)
+    figure_options.width_of(size)
     arguments = env.arguments
     learner = learner_of(method)
     chosen = read_settings(method, learner, settings or ())
@@ -120,7 +122,7 @@ def identify(
     if plot is not None:
         from safe_envs.scripts.figures.identify_figure import draw
 
-        draw(found, plot)
+        draw(found, plot, size)
 
 
 def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Transitions:

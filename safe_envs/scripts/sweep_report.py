@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest
-from safe_envs.scripts.options import early_checks, text_options
+from safe_envs.scripts.options import early_checks, figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, say, stdout, write_result
 
@@ -55,6 +55,7 @@ def sweep_report(
             show_default=False,
         ),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
     json: Json = None,
 ) -> None:
     """Draw the safety rates of a sweep with 95 % bands, and list its worst and its failed cells.
@@ -70,6 +71,7 @@ def sweep_report(
     path = plot or folder / _PICTURE
     index, rows = read_index(folder), read(folder).to_pylist()
     text_options.require_outputs(json, path)
+    figure_options.width_of(size)
     swept = index["swept"]
     for option, name in (("--x", x), ("--lines", lines)):
         if name is not None and name not in swept:
@@ -85,7 +87,7 @@ def sweep_report(
     print_cells(stdout(), index, rows, worst)
     if done:
         layout = Layout.of(done, swept, x, lines)
-        hidden = draw(done, layout, path)
+        hidden = draw(done, layout, path, size)
         picture = f"The picture: {path}" + (
             f" (without {hidden} of its panels, which are too many; sweep less, or choose --x and"
             " --lines)" * bool(hidden)

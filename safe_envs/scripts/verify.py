@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import completion, early_checks, text_options
+from safe_envs.scripts.options import completion, early_checks, figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -65,6 +65,7 @@ def verify(
             ),
         ),
     ] = None,
+    size: figure_options.Size = figure_options.DEFAULT_SIZE,
 ) -> None:
     """Print where a filter's conditions cannot be met, and its bounds next to a simulation.
 
@@ -89,6 +90,7 @@ def verify(
     require_engine(engine)
     inputs = text_options.inputs_of(env.system, policy, [filter_name or ""])
     text_options.require_outputs(json, plot, inputs=inputs)
+    figure_options.width_of(size)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     # An unknown policy is an error before the search, and without a simulation too.
@@ -110,9 +112,9 @@ def verify(
     print_report(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:
-        from safe_envs.scripts.figures.verify_figure import draw
+        from safe_envs.scripts.figures.verify_figure import plot_verification
 
-        draw(answer, plot)
+        plot_verification(found, plot, starts=starts, title=title, size=size)
 
 
 if __name__ == "__main__":

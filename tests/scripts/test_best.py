@@ -15,6 +15,7 @@ from safe_envs.wrappers.value import table_cache
 from safe_envs.wrappers.value.table_files import load_table, save_table
 from tests.agents.policies.coarse import COARSE
 from tests.scripts.conftest import strictly
+from tests.scripts.figures.svg_texts import svg_texts
 
 SCALAR = ("Scalar-v0", "--horizon", 0.3, "--noise", 1.5, "--start", 0.8)
 COARSELY = ("--cells", 400, "--inputs", 9, "--episodes", 200)
@@ -131,7 +132,7 @@ def test_errors_come_at_once(safe_envs_command, arguments, text):
 def test_the_value_is_drawn_over_any_number_of_coordinates(safe_envs_command, tmp_path, arguments):
     how = ("--inputs", 3, "--episodes", 0, "--plot", "value.svg")
     assert safe_envs_command("best", *arguments, *how)[0] == 0
-    drawn = (tmp_path / "value.svg").read_text()
+    drawn = svg_texts(tmp_path / "value.svg")
     assert "best attainable safety" in drawn.lower()
     assert "99 % can be had" in drawn
 

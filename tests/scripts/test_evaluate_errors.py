@@ -197,8 +197,8 @@ def test_every_format_is_refused_before_the_run_or_written(safe_envs_command, su
 def test_a_failed_picture_leaves_no_part_of_it(safe_envs_command, monkeypatch):
     from matplotlib.figure import Figure
 
-    def fail(self, path, **_):
-        Path(path).write_bytes(b"half a picture")
+    def fail(self, file, **_):
+        file.write(b"half a picture")
         raise OSError("no space left")
 
     monkeypatch.setattr(Figure, "savefig", fail)

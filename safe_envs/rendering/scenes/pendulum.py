@@ -54,16 +54,11 @@ class PendulumScene(Scene):
             canvas.line(at(angle, 0.15 * length), at(angle, length), HATCH)
         for start, end in self._barriers.intervals(snapshot.state, self._angle, low, high):
             canvas.shape(sector(start, end), tint(1), EDGE, 2)
-            for angle in (start, end):
+            # Each number is on the unsafe side of its line, so that close ones are apart.
+            for angle, side in ((start, 1.0), (end, 0.0)):
                 if low < angle < high:
                     outer = at(angle, length + 22)
-                    canvas.text(
-                        number(angle),
-                        outer,
-                        EDGE,
-                        SMALL,
-                        align=(0.5 - 0.5 * math.copysign(1.0, angle), 0.5),
-                    )
+                    canvas.text(number(angle), outer, EDGE, SMALL, align=(side, 0.5))
         canvas.dashes(np.array([pivot, at(0.0, length + 10)]), GREY)
         base = pivot[1] + 12
         canvas.line((pivot[0] - 150, base), (pivot[0] + 150, base), INK, 2)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pygame
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.fonts import text_size
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import BOX, StatePlane
@@ -125,32 +127,35 @@ class SideView(Scene):
         """Draw the quadrotor and its reference."""
         axes = self._plane.background(canvas, snapshot)
         with canvas.within(axes.box):
-            self._draw_reference(canvas, axes, snapshot)
+            named = self._draw_reference(canvas, axes, snapshot)
             at = self._plane.trail(canvas, axes, snapshot)
             attitude = rotation(*(float(snapshot.state[i]) for i in self._angles))
             draw_quadrotor(canvas, at, attitude, warning_color(snapshot))
             self._draw_dial(canvas, attitude)
+            if named is not None:
+                _name_reference(canvas, axes, named, at)
 
-    def _draw_reference(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
+    def _draw_reference(
+        self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot
+    ) -> tuple[float, float] | None:
+        """Draw the reference; return the pixel next to which its name belongs."""
         now = snapshot.times[-1:]
         x, z = (
             None if reference is None else float(reference(now)[0])
             for reference in self._references
         )
         if z is None:
-            return
+            return None
         at = axes.place(0.0 if x is None else x, z)
-        ink = mix(GOAL, INK, 0.6)
         if x is None:
             canvas.dashes(
                 np.array([(axes.box[0], at[1]), (axes.box[0] + axes.box[2], at[1])]), GOAL, 2
             )
-            canvas.text("reference", (axes.box[0] + 6, at[1] + 2), ink, SMALL)
-            return
+            return axes.box[0] + 46.0, at[1]
         canvas.disk(at, 11, None, PAPER, 5)
         canvas.disk(at, 10, None, GOAL, 3)
         canvas.disk(at, 2, INK)
-        canvas.text("reference", (at[0], at[1] - 14), ink, SMALL, align=(0.5, 1.0))
+        return at
 
     def _draw_dial(self, canvas: Canvas, attitude: np.ndarray) -> None:
         """Draw the angle between thrust and vertical, to the side of the thrust that is seen."""
@@ -171,6 +176,42 @@ class SideView(Scene):
         tip = x + radius * math.sin(tilt), y - radius * math.cos(tilt)
         canvas.arrow((x, y), tip, INK if safe else VIOLATION, 3, 9.0)
         canvas.text(f"tilt {number(abs(tilt))} rad", (x, y + 6), INK, SMALL, align=(0.5, 0.0))
+
+
+def _name_reference(
+    canvas: Canvas, axes: Axes, at: tuple[float, float], quadrotor: tuple[float, float]
+) -> None:
+    """Write the name of the reference where nothing covers it and it covers nothing.
+
+    Args:
+        canvas: to draw on.
+        axes: that the name is to be inside of.
+        at: pixel of the reference.
+        quadrotor: pixel of the quadrotor.
+    """
+    width, height = text_size("reference", SMALL)
+    left, top, across, down = axes.box
+    x, y, radius = _DIAL
+    dial = pygame.Rect(x - radius - 8, y - radius - 6, 2 * radius + 16, radius + 36)
+    body = pygame.Rect(0, 0, 2 * _ARM + 14, 2 * _ARM + 14)
+    body.center = round(quadrotor[0]), round(quadrotor[1])
+    inside = pygame.Rect(left, top, across, down)
+    side, away = width / 2 + 16, _ARM + 24
+    steps = [(0, -22), (0, 22), (-side, 0), (side, 0)]
+    steps += [(0, -away), (0, away), (-side - away, 0), (side + away, 0)]
+    places = []
+    for right, below in steps:
+        box = pygame.Rect(0, 0, width + 4, height + 4)
+        box.center = round(at[0] + right), round(at[1] + below)
+        places.append(box)
+    free = (
+        box
+        for box in places
+        if inside.contains(box) and not box.colliderect(dial) and not box.colliderect(body)
+    )
+    place = next(free, places[0].clamp(inside)).center
+    ink = mix(GOAL, INK, 0.45)
+    canvas.label("reference", place, ink, SMALL, (0.5, 0.5))
 
 
 def _sector(

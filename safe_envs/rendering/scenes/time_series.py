@@ -98,9 +98,7 @@ class TimeSeriesScene(Scene):
             places = axes.places(times, self._reference(times))
             canvas.dashes(places, GOAL, 2)
             top = places[np.argmin(places[:, 1])]
-            canvas.text(
-                "reference", (top[0], top[1] - 4), mix(GOAL, INK, 0.6), SMALL, align=(0.5, 1.0)
-            )
+            canvas.label("reference", (top[0], top[1] - 4), mix(GOAL, INK, 0.45))
 
     def _line(self, axes: Axes, snapshot: EpisodeSnapshot) -> Canvas:
         """Return the line with the safe set, drawn once if no barrier depends on other states."""

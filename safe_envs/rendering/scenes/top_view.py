@@ -131,7 +131,8 @@ class TopView(Scene):
             canvas.disk(at, 2, INK)
         else:
             canvas.disk(at, radius, None, GREY, 1)
-        canvas.text(name, (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
+        above = at[0], at[1] - radius - 3
+        canvas.label(name, above)
 
     def _draw_obstacles(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         paths = [
@@ -150,13 +151,9 @@ class TopView(Scene):
             canvas.disk(middle, 2, INK)
             if size >= 14.0:
                 canvas.line(middle, (middle[0] + size, middle[1]), INK)
-                canvas.text(
-                    f"{obstacle.radius:g} m",
-                    (middle[0] + size / 2, middle[1] - 1),
-                    INK,
-                    SMALL - 2,
-                    align=(0.5, 1.0),
-                )
+                beside = middle[0] + size + 5, middle[1]
+                radius = f"r = {obstacle.radius:g} m"
+                canvas.label(radius, beside, INK, SMALL - 2, (0.0, 0.5))
 
     def _draw_hit(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         """Outline the obstacles that the vehicle hit at the first violation, as they were then."""
@@ -179,12 +176,12 @@ class TopView(Scene):
             # On the far side of the vehicle, whose trail and mark are on the near one.
             up = vehicle[1] < then[1]
             edge = at[1] - size - 2 if up else at[1] + size + 2
-            canvas.text(
+            canvas.label(
                 f"at {snapshot.violated_at:.2f} s",
                 (at[0], edge),
-                mix(color, INK, 0.6),
+                mix(VIOLATION, INK, 0.6),
                 SMALL,
-                align=(0.5, float(up)),
+                (0.5, float(up)),
             )
 
 

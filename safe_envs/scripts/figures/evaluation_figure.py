@@ -2,68 +2,118 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.policies.names import POLICY_FILE
-from safe_envs.atomic_io import write_atomically
-from safe_envs.dynamics.codegen import compile_function
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.log_panels import LogColors, LogPanels, plain
-from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE, WARM, add_legend
+from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.figures.evaluation_plane import draw_plane
+from safe_envs.scripts.figures.labels import labelled, mathematics, plain
+from safe_envs.scripts.figures.log_panels import LogColors, LogPanels
+from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.style import (
+    QUIET,
+    STYLE,
+    UNFILTERED_DASHES,
+    UNSAFE,
+    WARM,
+    add_legend,
+    add_title,
+    look,
+    wrapped,
+)
+from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
-_SHOWN = 8
-_MOST_EPISODES = 4
-_EPISODE_HEIGHT = 1.2
-"""In inches, of a panel of the first episodes."""
+_MOST_EPISODES = {"single": 2, "double": 4}
+"""Filters whose first episode is drawn, by the size of the figure."""
 
-_GRID = 300
+_EPISODE_HEIGHT = 0.85
+"""In inches, of a panel of the first episodes; below are further panels."""
+
+_BARRIER_HEIGHT, _CURVE_HEIGHT, _PLANE_HEIGHT = 2.1, 1.5, 3.3
+_SIDE_HEIGHT = 3.6
+
+_Looks = dict[str, dict[str, Any]]
+"""Colour and dashes of each filter."""
 
 
-def draw(evaluation: Evaluation, path: Path) -> None:
-    """Draw an evaluation that recorded trajectories, and write the picture whole or not at all.
+def plot_evaluation(
+    evaluation: Evaluation, out: Path | str | None = None, *, size: str = DEFAULT_SIZE
+) -> Picture:
+    """Draw h and the safety rate over time, trajectories, and the first episodes.
+
+    Args:
+        evaluation: that recorded trajectories: of `evaluate(..., record=True)`.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: It recorded no trajectories, the file cannot be written, or there is no
+            such size.
+    """
+    if not evaluation.trajectories:
+        raise ConfigurationError(
+            "the evaluation recorded no trajectories to draw; evaluate with record=True"
+        )
+    return finished(figure_of(evaluation, size), out)
+
+
+def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Picture:
+    """Return the figure of an evaluation that recorded trajectories.
 
     Args:
         evaluation: to draw.
-        path: of the picture; its suffix is the format.
+        size: as for `plot_evaluation`.
+
+    Raises:
+        ConfigurationError: there is no such size.
     """
     problem, config = evaluation.problem, evaluation.config
-    colors = _colors(evaluation)
+    width, looks = width_of(size), _looks(evaluation)
     with mpl.rc_context(STYLE):
-        episodes = _first_episodes(evaluation, colors)
+        episodes = _first_episodes(evaluation, looks, _MOST_EPISODES[size])
         count = max(each.count for each in episodes.values())
-        block = _EPISODE_HEIGHT * count + 0.6
-        figure = Figure(figsize=(11.5 if problem.plane else 7.5, 6.6 + block))
-        upper, lower = figure.add_gridspec(2, 1, height_ratios=(6.6, block))
-        grid = upper.subgridspec(2, 2 if problem.plane else 1, height_ratios=(3, 2))
+        block = _EPISODE_HEIGHT * count + 0.5
+        aside = bool(problem.plane) and size == "double"
+        heights = [_BARRIER_HEIGHT, _CURVE_HEIGHT]
+        heights += [_PLANE_HEIGHT] if problem.plane and not aside else []
+        above = _SIDE_HEIGHT if aside else sum(heights)
+        figure = Picture(figsize=(width, above + block))
+        upper, lower = figure.add_gridspec(2, 1, height_ratios=(above, block))
+        grid = upper.subgridspec(len(heights), 1 + aside, height_ratios=heights)
         barrier = figure.add_subplot(grid[0, 0])
-        _draw_barrier(barrier, evaluation, colors)
-        _draw_curve(figure.add_subplot(grid[1, 0], sharex=barrier), evaluation, colors)
+        _draw_barrier(barrier, evaluation, looks)
+        _draw_curve(figure.add_subplot(grid[1, 0], sharex=barrier), evaluation, looks)
         if problem.plane:
-            _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
+            place = grid[:, 1] if aside else grid[2, 0]
+            draw_plane(figure.add_subplot(place), evaluation, looks)
         panels = _draw_episodes(lower.subgridspec(count, len(episodes)), episodes)
         handles = barrier.get_legend_handles_labels()[0]
-        add_legend(figure, [*handles, *_handles_of(evaluation, episodes, panels)])
+        unsafe = Patch(color=UNSAFE, alpha=0.35, label="unsafe")
+        add_legend(figure, [*handles, unsafe, *_handles_of(evaluation, episodes, panels)])
         title = f"{evaluation.title}, {_policy_name(Path(config['policy']['name']))} policy"
-        figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+        add_title(figure, f"{plain(title, 200)}\n{mathematics(describe_system(problem))}")
+    return figure
 
 
-def _first_episodes(evaluation: Evaluation, colors: dict[str, str]) -> dict[str, LogPanels]:
+def _first_episodes(evaluation: Evaluation, looks: _Looks, most: int) -> dict[str, LogPanels]:
     """Return the panels of the first episode under each filter, as many as fit."""
+    colors = {name: look["color"] for name, look in looks.items()}
     return {
         name: LogPanels(each.log, LogColors(QUIET, colors[name], (colors[name],)))
-        for name, each in list(evaluation.trajectories.items())[:_MOST_EPISODES]
+        for name, each in list(evaluation.trajectories.items())[:most]
     }
 
 
@@ -81,7 +131,11 @@ def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> dict[str, list[
     panels = np.array([grid.figure.add_subplot(cell) for cell in grid]).reshape(shape)
     for (name, drawn), column in zip(episodes.items(), panels.T, strict=True):
         drawn.draw(list(column))
-        column[0].set_title(f"{name}, first episode")
+        room = grid.figure.get_figwidth() / len(episodes) - 0.4
+        title = wrapped(
+            grid.figure, f"{plain(name, 200)}, first episode", mpl.rcParams["axes.titlesize"], room
+        )
+        column[0].set_title(title)
     for i, row in enumerate(panels):
         low, high = np.transpose([panel.get_ylim() for panel in row])
         # As above, h far below 0 is cut off.
@@ -121,12 +175,13 @@ def _policy_name(path: Path) -> str:
     return path.parent.name if path.name == POLICY_FILE else path.stem
 
 
-def _colors(evaluation: Evaluation) -> dict[str, str]:
+def _looks(evaluation: Evaluation) -> _Looks:
     others = [row.filter for row in evaluation.rows if row.filter != UNFILTERED]
-    return {UNFILTERED: WARM} | {name: COLORS[i % len(COLORS)] for i, name in enumerate(others)}
+    unfiltered = {"color": WARM, "linestyle": UNFILTERED_DASHES}
+    return {UNFILTERED: unfiltered} | {name: look(i) for i, name in enumerate(others)}
 
 
-def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
+def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     """Draw median and 5 to 95 % band of h, as long as half of the episodes are under way.
 
     Later quantiles would be of the survivors, and jump when one ends.
@@ -138,15 +193,11 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
         h = h[np.isfinite(h).mean(axis=1) >= 0.5]
         time = np.arange(len(h)) * evaluation.problem.dt
         low, median, high = np.nanquantile(h, (0.05, 0.5, 0.95), axis=1)
-        axes.fill_between(time, low, high, color=colors[name], alpha=0.09, linewidth=0)
-        axes.plot(time, np.stack([low, high], axis=1), color=colors[name], linewidth=0.6, alpha=0.6)
-        axes.plot(
-            time,
-            median,
-            color=colors[name],
-            linewidth=2.2,
-            label=f"{name}: {percent(row.safety_rate)} safe",
-        )
+        color = looks[name]["color"]
+        axes.fill_between(time, low, high, color=color, alpha=0.09, linewidth=0)
+        axes.plot(time, np.stack([low, high], axis=1), color=color, linewidth=0.4, alpha=0.6)
+        label = f"{plain(name, 200)}: {percent(row.safety_rate)} safe"
+        axes.plot(time, median, **looks[name], linewidth=1.5, label=label)
         lowest, highest, last = (
             min(lowest, low.min()),
             max(highest, high.max()),
@@ -155,115 +206,27 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
     # Values far below 0 are cut off, so that they do not shrink the rest.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
     margin = 0.05 * max(highest - bottom, 1e-3)
-    # The unsafe side always has room for its name.
+    # Some of the unsafe side is always seen.
     bottom = min(bottom - margin, -2.0 * margin)
     axes.set(xlim=(0.0, max(last, evaluation.problem.dt)), ylim=(bottom, highest + margin))
     axes.axhspan(bottom, 0.0, color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
-    axes.axhline(0.0, color="black", linewidth=1.2)
-    axes.text(0.99, 0.02, "unsafe", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
-    axes.set(ylabel="barrier h", title="Barrier: median, and 5 to 95 % of the episodes")
+    axes.axhline(0.0, color="black", linewidth=0.9)
+    axes.set(ylabel="barrier $h$", title="Median and 5 to 95 % of the episodes")
 
 
-def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
+def _draw_curve(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     """Draw the rate of episodes that are safe so far, with its band, up to the last violation."""
     for row in evaluation.rows:
-        curve, color = row.curve, colors[row.filter]
+        curve = row.curve
+        look_of = looks[row.filter]
         low, rate, high = (100 * np.array(v) for v in (curve.ci_low, curve.rate, curve.ci_high))
-        axes.fill_between(curve.time, low, high, color=color, alpha=0.2, linewidth=0)
-        axes.plot(curve.time, rate, color=color, linewidth=1.8)
+        axes.fill_between(curve.time, low, high, color=look_of["color"], alpha=0.2, linewidth=0)
+        axes.plot(curve.time, rate, **look_of, linewidth=1.4)
         axes.set_xlim(right=max(axes.get_xlim()[1], curve.time[curve.safe.index(curve.safe[-1])]))
     lowest = min(row.curve.ci_low[-1] for row in evaluation.rows)
     bottom = 100 * lowest - 4 * (1 - lowest)
-    axes.set(ylim=(bottom, 100 + 4 * (1 - lowest)), xlabel="time (s)", ylabel="safe so far (%)")
+    axes.set(ylim=(bottom, 100 + 4 * (1 - lowest)), xlabel=labelled("time", "s"))
+    axes.set(ylabel=labelled("safe so far", "%"))
     axes.set_title(
-        f"Safety rate, with its pointwise {100 * evaluation.config['confidence']:.10g} % band"
+        f"Safe so far, with its pointwise {100 * evaluation.config['confidence']:.10g} % band"
     )
-
-
-def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
-    """Draw trajectories of the first episodes, the same ones for every filter."""
-    problem = evaluation.problem
-    names = [s.symbol.name for s in problem.states]
-    units = [s.unit for s in problem.states]
-    across, up = [names.index(name) for name in problem.plane or ()]
-    paths = {name: each.states[:, :_SHOWN] for name, each in evaluation.trajectories.items()}
-    for name, states in paths.items():
-        axes.plot(
-            states[:, :, across], states[:, :, up], color=colors[name], linewidth=0.9, alpha=0.8
-        )
-    starts = next(iter(paths.values()))[0]
-    axes.plot(starts[:, across], starts[:, up], "o", color="black", markersize=3.5, zorder=3)
-    everywhere = np.concatenate([states.reshape(-1, problem.plant.n) for states in paths.values()])
-    safe = _safe_function(problem, across, up, np.median(starts, axis=0))
-    limits = _limits(safe, everywhere[:, [across, up]], alike=units[across] == units[up])
-    if units[across] == units[up]:
-        axes.set_aspect("equal")
-    horizontal, vertical, h = _on_grid(safe, limits)
-    axes.contourf(
-        horizontal, vertical, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0
-    )
-    axes.contour(horizontal, vertical, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
-    labels = [f"{names[i]} ({units[i]})" if units[i] else names[i] for i in (across, up)]
-    axes.set(
-        xlabel=labels[0],
-        ylabel=labels[1],
-        title=f"Safe set{_when(problem)} and {len(starts)} episodes, dots at their starts",
-    )
-
-
-def _when(problem: SafetyProblem) -> str:
-    """Return a remark if the safe set in the plane changes with the other states."""
-    used = set().union(*(b.expression.free_symbols for b in problem.barriers))
-    return " (at the start)" if {str(s) for s in used} - set(problem.plane or ()) else ""
-
-
-def _safe_function(
-    problem: SafetyProblem, across: int, up: int, start: np.ndarray
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the smallest barrier over the plane, with the other states as at the start."""
-    barriers = compile_function(
-        problem.plant.states, tuple(b.expression for b in problem.barriers), "arrays"
-    )
-
-    def smallest(horizontal: np.ndarray, vertical: np.ndarray) -> np.ndarray:
-        state: list[Any] = list(start)
-        state[across], state[up] = horizontal, vertical
-        return np.minimum.reduce(
-            [np.broadcast_to(value, horizontal.shape) for value in barriers(*state)]
-        )
-
-    return smallest
-
-
-def _on_grid(
-    safe: Callable[[np.ndarray, np.ndarray], np.ndarray], limits: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    horizontal, vertical = np.meshgrid(*[np.linspace(low, high, _GRID) for low, high in limits])
-    return horizontal, vertical, safe(horizontal, vertical)
-
-
-def _limits(
-    safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.ndarray, alike: bool
-) -> np.ndarray:
-    """Return limits (low, high) of both axes.
-
-    They contain the trajectories, and the whole safe set if it is bounded and not far larger.
-    """
-    limits = np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)], axis=1)
-    width = np.maximum(limits[:, 1] - limits[:, 0], 1e-3)
-    horizontal, vertical, h = _on_grid(safe, limits + np.outer(width, (-1.0, 1.0)))
-    inside = h >= 0.0
-    edge = inside[0].any() or inside[-1].any() or inside[:, 0].any() or inside[:, -1].any()
-    if inside.any() and not edge:
-        region = np.stack([horizontal[inside], vertical[inside]])
-        limits = np.stack(
-            [
-                np.minimum(limits[:, 0], region.min(axis=1)),
-                np.maximum(limits[:, 1], region.max(axis=1)),
-            ],
-            axis=1,
-        )
-    width = limits[:, 1] - limits[:, 0]
-    # Equal scales fill the panel only if it shows a square.
-    half = np.full(2, width.max() / 2) if alike else np.maximum(width, 1e-3) / 2
-    return limits.mean(axis=1)[:, None] + 1.06 * np.outer(half, (-1.0, 1.0))

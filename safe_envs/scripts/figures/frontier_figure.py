@@ -6,37 +6,74 @@ from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent
-from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, add_legend
+from safe_envs.scripts.figures.labels import mathematics, plain
+from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.style import (
+    COLORS,
+    QUIET,
+    STYLE,
+    WARM,
+    add_legend,
+    add_title,
+)
+from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
-_NOMINAL_COLOR = "#D55E00"
-_MARKERS = {"policy": "o", "filter": "s", "best": "*"}
+_POLICIES, _FILTERS, _BEST = ("o", "v", "<", ">"), ("s", "D", "^", "P", "p", "h"), "*"
+"""Marks by the kind of a point: none depends on its colour alone."""
 
 
-def draw(found: Frontier, title: str, path: Path) -> None:
-    """Draw the curve and the points, and write the picture whole or not at all.
+def plot_frontier(
+    found: Frontier,
+    out: Path | str | None = None,
+    *,
+    title: str | None = None,
+    size: str = DEFAULT_SIZE,
+) -> Picture:
+    """Draw what safety costs: the largest return over the chance of a violation, and the points.
+
+    Args:
+        found: the curve and the points.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        title: name of the env; by default that of the problem.
+        size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: The file cannot be written, or there is no such size.
+    """
+    return finished(figure_of(found, title or found.problem.name, size), out)
+
+
+def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> Picture:
+    """Return the figure of the curve and the points.
 
     Args:
         found: the curve and the points.
         title: of the env.
-        path: of the picture; its suffix is the format.
+        size: as for `plot_frontier`.
+
+    Raises:
+        ConfigurationError: there is no such size.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(8.5, 5.8))
+        figure = Picture(figsize=(width_of(size), 4.0 if size == "double" else 3.4))
         axes = figure.add_subplot()
         _draw_curve(axes, found)
-        others = 0
+        others, drawn = 0, dict[str, int]()
         for point in found.points:
             nominal = point.name == "nominal"
-            color = _NOMINAL_COLOR if nominal else COLORS[others % len(COLORS)]
+            color = WARM if nominal else COLORS[others % len(COLORS)]
             others += not nominal
-            _draw_point(axes, point, color, _MARKERS.get(point.kind, "o"), point.name)
+            marks = {"filter": _FILTERS, "best": _BEST}.get(point.kind, _POLICIES)
+            turn = drawn[point.kind] = drawn.get(point.kind, -1) + 1
+            _draw_point(axes, point, color, marks[turn % len(marks)], point.name)
         for i, point in enumerate(found.attained):
             label = None if i else "policies of the curve, simulated"
             _draw_point(axes, point, QUIET, ".", label)
@@ -44,17 +81,16 @@ def draw(found: Frontier, title: str, path: Path) -> None:
         axes.set(xlabel="episodes with a violation", ylabel="mean return")
         axes.grid(alpha=0.25, linewidth=0.6)
         add_legend(figure, axes.get_legend_handles_labels()[0])
-        figure.suptitle(
-            f"{title}: what safety costs\n{describe_system(found.problem)}", fontsize=11
-        )
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+        described = mathematics(describe_system(found.problem))
+        add_title(figure, f"{plain(title, 200)}: what safety costs\n{described}")
+    return figure
 
 
 def _draw_curve(axes: Axes, found: Frontier) -> None:
     lows = [p.return_low for p in (*found.points, *found.attained)]
     bottom = min([*lows, found.curve()[1].min()])
     chances, returns = found.curve(bottom=bottom)
-    axes.plot(chances, returns, color="black", linewidth=1.8, label="largest return, computed")
+    axes.plot(chances, returns, color="black", linewidth=1.3, label="largest return, computed")
     axes.fill_between(chances, bottom, returns, color="#56B4E9", alpha=0.08, linewidth=0)
 
 
@@ -74,8 +110,8 @@ def _draw_point(
         ],
         color=color,
         marker=marker,
-        markersize=13 if marker == "*" else 7,
-        elinewidth=1.2,
+        markersize=8 if marker == _BEST else 4.5,
+        elinewidth=0.8,
         linestyle="none",
         label=label,
     )

@@ -14,54 +14,90 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, add_legend
+from safe_envs.scripts.figures.labels import labelled, mathematics, plain, symbol, unit_text
+from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.style import (
+    COLORS,
+    STYLE,
+    WARM,
+    add_legend,
+    add_title,
+    wrapped,
+)
+from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.scripts.reports.identify_answer import Function, IdentifyAnswer
 from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning.models.distributions import Diffusion, sigma_samples
 from safe_envs.wrappers.learning.models.posterior import Posterior
 
-_TRUTH = "#D55E00"
+_TRUTH = WARM
 _MOST = 12
 _MOST_LEVELS = 4
-_ACROSS = 4
+_ACROSS = {"single": 2, "double": 4}
 _SAMPLES = 20_000
 _CONSTANT = 1e-9
 _AROUND = 0.1
-_HEADROOM = 1.3
-_SIDE, _WIDEST_SIDE, _LEAST_WIDTH = 2.9, 3.4, 7.6
+_HIGHEST = 3.0
+"""In inches, of a panel."""
+
+_TITLE = 0.2
+"""In inches, of a line of a title."""
+
 _TINY, _HUGE = 0.02, 2e4
 
+_OF = re.compile(r"(\w+)([\[(])([\w, ]+)[\])]")
+
 _ESTIMATE_HANDLE = Line2D(
-    [], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label="estimate at a state"
+    [], [], color=COLORS[0], marker="o", linestyle="", markersize=3, label="estimate at a state"
 )
 _COUNTS_HANDLE = Patch(color=COLORS[0], alpha=0.6, label="estimates at all states")
 _SAMPLES_HANDLE = Patch(color=COLORS[1], alpha=0.6, label="samples of the posterior")
-_TRUTH_HANDLE = Line2D([], [], color=_TRUTH, linewidth=1.4, label="truth")
+_TRUTH_HANDLE = Line2D([], [], color=_TRUTH, linewidth=1.1, label="truth")
 
 
-def draw(found: IdentifyAnswer, path: Path) -> None:
+def draw(found: IdentifyAnswer, path: Path, size: str = DEFAULT_SIZE) -> None:
     """Draw an identification, and write the picture whole or not at all.
 
     Args:
         found: what to draw; of many functions those of the largest truth are shown.
         path: of the picture; its suffix is the format.
+        size: "single" or "double", in columns of a paper.
     """
+    with mpl.rc_context(STYLE):
+        save(figure_of(found, size), path)
+
+
+def figure_of(found: IdentifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
+    """Return the figure of an identification.
+
+    Args:
+        found: what to draw; of many functions those of the largest truth are shown.
+        size: as for `draw`.
+
+    Raises:
+        ConfigurationError: there is no such size.
+    """
+    width = width_of(size)
     levels = _levels(found)
     rest = [f for f in found.compared if not f.vanishes and f.name not in levels]
     shown = sorted(rest, key=lambda function: (-function.size, -function.error))[
         : _MOST - len(levels)
     ]
     count = len(shown) + len(levels)
-    down = max(math.ceil(count / _ACROSS), 1)
+    down = max(math.ceil(count / _ACROSS[size]), 1)
     across = max(math.ceil(count / down), 1)
     with mpl.rc_context(STYLE):
-        side = max(_SIDE, min(_WIDEST_SIDE, _LEAST_WIDTH / across))
-        figure = Figure(figsize=(max(side * across, _LEAST_WIDTH), 1.4 + side * down))
+        side = min(width / across, _HIGHEST)
+        figure = Figure(figsize=(width, 1.0 + side * down))
         axes = list(figure.subplots(down, across, squeeze=False).flat)
+        tallest = 0
         handles: dict[Line2D | Patch, None] = {}
         for panel, function in zip(axes, shown, strict=False):
             handles |= dict.fromkeys([_draw_function(panel, function), _TRUTH_HANDLE])
+            # In as many lines as it takes.
+            title = wrapped(figure, panel.get_title(), mpl.rcParams["axes.titlesize"], side - 0.1)
+            panel.set_title(title)
+            tallest = max(tallest, title.count("\n") - 1)
         for panel, (index, function) in zip(axes[len(shown) :], levels.values(), strict=False):
             _draw_level(panel, found, index, function)
             handles |= dict.fromkeys([_SAMPLES_HANDLE, _TRUTH_HANDLE])
@@ -69,13 +105,15 @@ def draw(found: IdentifyAnswer, path: Path) -> None:
             panel.axis("off")
         if not count:
             axes[0].text(0.5, 0.5, "There is nothing to compare.", ha="center", va="center")
+        figure.set_figheight(1.0 + (side + _TITLE * tallest) * down)
         if handles:
             add_legend(figure, list(handles))
         left = (
             f", the largest {len(shown)} of {len(rest)} functions" if len(shown) < len(rest) else ""
         )
-        figure.suptitle(f"{found.title}, {found.learned.method}{left}\n{found.setup}", fontsize=11)
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+        title = plain(f"{found.title}, {found.learned.method}{left}", 200)
+        add_title(figure, f"{title}\n{mathematics(found.setup)}")
+    return figure
 
 
 def _levels(found: IdentifyAnswer) -> dict[str, tuple[int, Function]]:
@@ -110,20 +148,19 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
         The handle for the legend.
     """
     off = "truth 0" if function.relative is None else f"error {relative_text(function.relative)}"
-    axes.set_title(f"{function.name}: {off}")
+    lines = [function_symbol(function.name), off]
     power = _power(np.concatenate([function.truth, function.estimate]))
     truth, estimate = function.truth / 10.0**power, function.estimate / 10.0**power
     alone = _constant(truth) and _constant(estimate)
     if _constant(truth):
-        numbers = f"{_range('truth', function.truth)}\n{_range('estimate', function.estimate)}"
-        axes.text(0.04, 0.97, numbers, transform=axes.transAxes, va="top", fontsize=9, color=QUIET)
+        lines += [_range("truth", function.truth), _range("estimate", function.estimate)]
+    axes.set_title("\n".join(lines))
     if _constant(truth) and not alone:
         axes.hist(estimate, bins=30, color=COLORS[0], alpha=0.6)
-        axes.axvline(truth[0], ymax=1.0 / _HEADROOM, color=_TRUTH, linewidth=1.4)
+        axes.axvline(truth[0], color=_TRUTH, linewidth=1.1)
         axes.set(
             xlabel=_label("estimate", function.unit, power),
             ylabel="states",
-            ylim=(0.0, _HEADROOM * axes.get_ylim()[1]),
         )
         _tidy(axes)
         return _COUNTS_HANDLE
@@ -132,13 +169,13 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
     room = max(np.ptp(both), _AROUND * abs(both).max()) if alone else 0.05 * np.ptp(both)
     limits = (both.min() - room, both.max() + room)
     axes.plot(limits, limits, color=_TRUTH, linewidth=1.0)
-    size, opacity = (6.0, 1.0) if alone else (2.5, 0.45)
+    mark, opacity = (4.0, 1.0) if alone else (1.8, 0.45)
     axes.plot(
         truth,
         estimate,
         "o",
         color=COLORS[0],
-        markersize=size,
+        markersize=mark,
         markeredgewidth=0,
         alpha=opacity,
         rasterized=True,
@@ -167,10 +204,10 @@ def _draw_level(axes: Axes, found: IdentifyAnswer, index: int, function: Functio
     )
     power = _power(samples)
     axes.hist(samples / 10.0**power, bins=40, density=True, color=COLORS[1], alpha=0.6)
-    axes.axvline(float(np.sqrt(function.truth[0])) / 10.0**power, color=_TRUTH, linewidth=1.4)
+    axes.axvline(float(np.sqrt(function.truth[0])) / 10.0**power, color=_TRUTH, linewidth=1.1)
     axes.set(
-        title=f"sigma of {state.symbol}",
-        xlabel=_label("sigma", f"{state.unit or 1}/√s", power),
+        title=f"$\\sigma$ of {symbol(state.symbol.name)}\nposterior",
+        xlabel=_label("$\\sigma$", f"{state.unit or 1}/√s", power),
         ylabel="density",
     )
     _tidy(axes)
@@ -179,7 +216,7 @@ def _draw_level(axes: Axes, found: IdentifyAnswer, index: int, function: Functio
 def _tidy(axes: Axes) -> None:
     """Make a panel square, with few ticks, so that long numbers do not overlap."""
     axes.set_box_aspect(1)
-    axes.xaxis.set_major_locator(MaxNLocator(3))
+    axes.xaxis.set_major_locator(MaxNLocator(2))
     axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.ticklabel_format(style="plain", useOffset=False)
 
@@ -191,9 +228,27 @@ def _power(values: np.ndarray) -> int:
 
 
 def _label(name: str, unit: str, power: int) -> str:
-    raised = re.sub(r"\^(\d+)", r"$^{\1}$", unit)
-    inside = (f"$10^{{{power}}}$ {raised}" if power else raised).strip()
-    return f"{name} ({inside})" if inside else name
+    if not power:
+        return labelled(name, unit)
+    raised = f" {unit_text(unit)}" if unit else ""
+    return f"{name} [$10^{{{power}}}${raised}]"
+
+
+def function_symbol(name: str) -> str:
+    """Return the name of a learned function as mathematics.
+
+    Args:
+        name: such as "f[x_1]" "covariance[x_1, x_2]" or "C(x, y)", or a text.
+
+    Returns:
+        Such as "$f$ of $x_{1}$".
+    """
+    match = _OF.fullmatch(name)
+    if match is None:
+        return " ".join(symbol(word) for word in name.split())
+    name, bracket, inside = match.groups()
+    of = ", ".join(symbol(each) for each in inside.split(", "))
+    return f"{symbol(name)} of {of}" if bracket == "[" else f"{symbol(name)}({of})"
 
 
 def _range(name: str, values: np.ndarray) -> str:

@@ -14,8 +14,14 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from safe_envs.agents.training.leaderboard import LeaderboardEntry
 from safe_envs.agents.training.study import StudyRow
-from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.style import COLORS, STYLE, WARM, add_legend
+from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.style import (
+    COLORS,
+    STYLE,
+    WARM,
+    add_legend,
+)
+from safe_envs.scripts.options.figure_options import WIDTHS
 
 _LOOKS = (
     ("#000000", "X"),
@@ -52,8 +58,8 @@ def draw(
         path: of the picture; its suffix is the format.
     """
     with mpl.rc_context(STYLE):
-        # Of the width of a column of a phone: letters keep their size there.
-        figure = Figure(figsize=(5.4, 4.4), dpi=150)
+        # One column, which is about as wide as a phone: letters keep their size there.
+        figure = Figure(figsize=(WIDTHS["single"], 3.3))
         axes = figure.add_subplot()
         low, high = _range_of_returns(entries, rows, frontier)
         if frontier is not None:
@@ -61,7 +67,7 @@ def draw(
                 frontier["violations"],
                 np.clip(frontier["returns"], low, None),
                 color="#000000",
-                linewidth=1.5,
+                linewidth=1.2,
                 label="largest return, computed",
                 zorder=1,
             )
@@ -73,7 +79,7 @@ def draw(
                 [row.return_mean for row in of_variant],
                 marker,
                 color=color,
-                markersize=4,
+                markersize=2.8,
                 alpha=0.45,
                 markeredgewidth=0,
                 zorder=2,
@@ -83,8 +89,8 @@ def draw(
         axes.set_ylim(low, high)
         axes.set(xlabel="episodes with a violation", ylabel="mean return", title=title)
         axes.grid(alpha=0.25, linewidth=0.6)
-        add_legend(figure, axes.get_legend_handles_labels()[0], most=3)
-        write_atomically(path, lambda part: figure.savefig(part))
+        add_legend(figure, axes.get_legend_handles_labels()[0], most=2)
+        save(figure, path)
 
 
 def _draw_entry(axes: Axes, entry: LeaderboardEntry, color: str, marker: str) -> None:
@@ -96,10 +102,10 @@ def _draw_entry(axes: Axes, entry: LeaderboardEntry, color: str, marker: str) ->
         yerr=[[returns.value - returns.low], [returns.high - returns.value]],
         color=color,
         marker=marker,
-        markersize=9,
+        markersize=6,
         markerfacecolor="none",  # what lies below is seen
-        markeredgewidth=1.6,
-        elinewidth=1.2,
+        markeredgewidth=1.1,
+        elinewidth=0.9,
         linestyle="none",
         label=entry.variant,
         zorder=3,

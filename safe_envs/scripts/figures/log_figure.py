@@ -6,20 +6,21 @@ import math
 from pathlib import Path
 
 import matplotlib as mpl
-from matplotlib.figure import Figure
 
-from safe_envs.atomic_io import write_atomically
-from safe_envs.errors import ConfigurationError, shortened
-from safe_envs.scripts.figures.log_panels import LogPanels, note, plain
-from safe_envs.scripts.figures.style import STYLE, add_legend
+from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.figures.labels import plain
+from safe_envs.scripts.figures.log_panels import LogPanels, note
+from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.style import (
+    STYLE,
+    add_legend,
+    add_title,
+)
+from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.wrappers.decision_log import DecisionLog
-from safe_envs.wrappers.decision_log.files import path_of
 
-_WIDTH = 5.6
-"""In inches: text of 10 points can be read on the screen of a phone."""
-
-_HEIGHT = 1.35
-_LINE = 0.21
+_HEIGHT = 1.0
+_LINE = 0.16
 """In inches, of a panel and of a line of the legend."""
 
 _COLUMN = 8
@@ -32,7 +33,8 @@ def plot_log(
     start: float | None = None,
     end: float | None = None,
     title: str | None = None,
-) -> Figure:
+    size: str = DEFAULT_SIZE,
+) -> Picture:
     """Draw the nominal and the executed inputs, h and slacks of a log over time.
 
     Periods in which a constraint changed the input are shaded, infeasible ones hatched. The
@@ -45,6 +47,7 @@ def plot_log(
         start: first time to show, in s; by default that of the log.
         end: last time to show, in s; by default that of the log.
         title: of the picture; counts by default.
+        size: "single" or "double", in columns of a paper.
 
     Returns:
         The figure, which a notebook shows.
@@ -59,9 +62,9 @@ def plot_log(
             f"nothing to draw between start = {start} and end = {end}: the log has {len(whole)}"
             f" periods{f' from {whole.t[0]:g} to {whole.t[-1]:g} s' if len(whole) else ''}"
         )
-    drawn = LogPanels(log)
+    drawn, width = LogPanels(log), width_of(size)
     with mpl.rc_context(STYLE):
-        figure = Figure()
+        figure = Picture()
         panels = list(figure.subplots(drawn.count, 1, sharex=True, squeeze=False)[:, 0])
         drawn.draw(panels)
         drawn.note_cuts(panels)
@@ -71,18 +74,8 @@ def plot_log(
         if len(right) <= _COLUMN:
             left += [note(" ")] * (len(right) - len(left))
         lines = max(len(left), math.ceil((len(left) + len(right)) / 2))
-        figure.set_size_inches(_WIDTH, 0.9 + _HEIGHT * drawn.count + _LINE * lines)
+        figure.set_size_inches(width, 0.7 + _HEIGHT * drawn.count + _LINE * lines)
         add_legend(figure, [*left, *right], 2)
         said = str(log).partition("; ")[::2] if title is None else str(title).splitlines()
-        figure.suptitle("\n".join([plain(each, 200) for each in said if each]), fontsize=10)
-        if out is not None:
-            _write(figure, path_of(out, "FILE.png, FILE.pdf or FILE.svg"))
-    return figure
-
-
-def _write(figure: Figure, path: Path) -> None:
-    if path.suffix.removeprefix(".") not in figure.canvas.get_supported_filetypes():
-        raise ConfigurationError(
-            f"{shortened(path)} names no format of a picture; give FILE.png, FILE.pdf or FILE.svg"
-        )
-    write_atomically(path, lambda part: figure.savefig(part, dpi=200))
+        add_title(figure, "\n".join([plain(each, 200) for each in said if each]))
+    return finished(figure, out)

@@ -12,14 +12,13 @@ from matplotlib.collections import PolyCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from safe_envs.errors import shortened
-from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, WARM
+from safe_envs.scripts.figures.labels import labelled, plain, quantity, symbol
+from safe_envs.scripts.figures.style import COLORS, DASHES, QUIET, SMALL, UNSAFE, WARM
 from safe_envs.wrappers.decision_log import DecisionLog
-from safe_envs.wrappers.decision_log.columns import printable
 
-_DASHES = ("solid", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
-_WIDTHS = (1.6, 0.8)
-_LONG = 15
+_DASHES = DASHES[:4]
+_WIDTHS = (1.3, 0.7)
+_LONG = 9
 """Characters that the label of a panel has no room for."""
 
 _MOST = 1e100
@@ -116,7 +115,7 @@ class LogPanels:
         self._draw_barriers(panels[self.barrier_panel])
         for panel in panels[self.barrier_panel + 1 :]:
             self._draw_slacks(panel)
-        panels[-1].set_xlabel("time (s)")
+        panels[-1].set_xlabel(labelled("time", "s"))
 
     def handles(self, panels: Sequence[Axes]) -> list[Any]:
         """Return entries of a legend: the inputs, and what is marked, as far as it can be seen.
@@ -126,7 +125,7 @@ class LogPanels:
         """
         log, colors = self._log, self._colors
         found: list[Any] = [
-            Line2D([], [], color=colors.executed, linewidth=1.6, label="executed input")
+            Line2D([], [], color=colors.executed, linewidth=1.3, label="executed input")
         ]
         if (log.section("nominal") != log.section("action")).any():
             found.insert(
@@ -161,10 +160,7 @@ class LogPanels:
         """
         names, seen = self._log.columns.barriers, self.seen(panels)
         lowest = self._log.section("h").min(axis=0)
-        labels = {
-            i: f"{name if name.startswith('h') else f'h {name}'}, min {lowest[i]:.3g}"
-            for i, name in ((i, plain(names[i])) for i in seen)
-        }
+        labels = {i: f"{_barrier_text(names[i])}, min {lowest[i]:.3g}" for i in seen}
         found = self._colors.legend(labels)
         if len(seen) < len(names):
             found.append(note(f"outside the panel: {len(names) - len(seen)} more"))
@@ -182,8 +178,8 @@ class LogPanels:
             f"{end:.2g}" for end, cut in ((low, self._h < low), (high, self._h > high)) if cut.any()
         ]
         if cuts:
-            text = f"h cut off at {' and '.join(cuts)}"
-            panel.set_title(text, loc="right", fontsize=8, color=QUIET, pad=2)
+            text = f"$h$ cut off at {' and '.join(cuts)}"
+            panel.set_title(text, loc="right", fontsize=SMALL, color=QUIET, pad=2)
 
     def _numbers(self, section: str) -> np.ndarray:
         """Return the columns of a section, without what cannot be drawn."""
@@ -196,7 +192,7 @@ class LogPanels:
         )
         steps: Any = {"drawstyle": "steps-post"}
         panel.plot(self._t, nominal, color=self._colors.nominal, **_PROPOSED, **steps)
-        panel.plot(self._t, action, color=self._colors.executed, linewidth=1.6, **steps)
+        panel.plot(self._t, action, color=self._colors.executed, linewidth=1.3, **steps)
         for bound in (low, high):
             panel.plot(self._t, bound, **_BOUNDS, **steps)
         smallest, largest = _range(nominal, action)
@@ -221,9 +217,9 @@ class LogPanels:
             bottom - 1e3 * (top - bottom), 0.0, color=UNSAFE, alpha=0.5, linewidth=0, zorder=0
         )
         panel.axhline(0.0, color="black", linewidth=1.0)
-        units = {self._unit(name) for name in self._log.columns.barriers}
+        units = {self._log.columns.units.get(name, "") for name in self._log.columns.barriers}
         unit = units.pop() if len(units) == 1 else ""
-        panel.set(ylim=(bottom, top + room), ylabel=f"h{unit}")
+        panel.set(ylim=(bottom, top + room), ylabel=quantity("h", unit))
 
     def _draw_slacks(self, panel: Axes) -> None:
         slack = self._numbers("slack")
@@ -245,22 +241,14 @@ class LogPanels:
 
     def _label(self, j: int) -> str:
         name = self._log.columns.inputs[j]
-        label = plain(name) + self._unit(name)
-        return label if len(label) < _LONG else label.replace(" (", "\n(", 1)
-
-    def _unit(self, name: str) -> str:
-        unit = self._log.columns.units.get(name, "").replace("^2", "²").replace("^3", "³")
-        return f" ({plain(unit)})" if unit else ""
+        unit = self._log.columns.units.get(name, "")
+        label = quantity(name, unit)
+        return label.replace(" [", "\n[", 1) if len(f"{name} {unit}") > _LONG else label
 
 
-def plain(text: str, most: int = 40) -> str:
-    """Return a text without what would be read as mathematics; it may come from a file.
-
-    Args:
-        text: a name, say.
-        most: characters, about.
-    """
-    return shortened(printable(text), most).replace("$", r"\$")
+def _barrier_text(name: str) -> str:
+    """Return h with the name of a barrier, unless that begins with h as h_1 does."""
+    return symbol(name) if name.startswith("h") else f"$h$ {plain(name)}"
 
 
 def note(text: str) -> Any:

@@ -17,12 +17,24 @@ from matplotlib.ticker import MaxNLocator
 
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
-from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.style import COLORS, STYLE, WARM, add_legend
+from safe_envs.scripts.figures.labels import labelled, plain, symbol
+from safe_envs.scripts.figures.saving import save
+from safe_envs.scripts.figures.style import (
+    COLORS,
+    DASHES,
+    MARKERS,
+    STYLE,
+    UNFILTERED_DASHES,
+    WARM,
+    add_legend,
+    add_title,
+    wrapped,
+)
+from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 
 _SEED = "seed"
 _MOST_PANELS = 12
-_COLUMNS = 3
+_COLUMNS = {"single": 1, "double": 3}
 
 Row = dict[str, Any]
 Rate = tuple[float, float, float]
@@ -80,26 +92,44 @@ class Layout:
         return cls(x, lines, tuple(rest))
 
 
-def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
+def draw(rows: Sequence[Row], layout: Layout, path: Path, size: str = DEFAULT_SIZE) -> int:
     """Draw cells that are done, and write the picture whole or not at all.
 
     Args:
         rows: of `safe_envs.agents.sweeps.store.read`.
         layout: places of the settings.
         path: of the picture.
+        size: "single" or "double", in columns of a paper.
 
     Returns:
         The number of panels without room.
 
     Raises:
-        ConfigurationError: the picture cannot be written.
+        ConfigurationError: the picture cannot be written, or there is no such size.
     """
+    figure, left = figure_of(rows, layout, size)
+    save(figure, path)
+    return left
+
+
+def figure_of(rows: Sequence[Row], layout: Layout, size: str = DEFAULT_SIZE) -> tuple[Figure, int]:
+    """Return the figure of cells that are done, and the number of panels without room.
+
+    Args:
+        rows: as for `draw`.
+        layout: places of the settings.
+        size: as for `draw`.
+
+    Raises:
+        ConfigurationError: there is no such size.
+    """
+    width = width_of(size)
     combinations = list(dict.fromkeys(tuple(row[name] for name in layout.panels) for row in rows))
     shown = combinations[:_MOST_PANELS]
-    columns = min(len(shown), _COLUMNS)
+    columns = min(len(shown), _COLUMNS[size])
     count = math.ceil(len(shown) / columns)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(max(6.0, 3.8 * columns), 1.2 + 3.0 * count))
+        figure = Figure(figsize=(width, 0.9 + (2.6 if count == 1 else 2.1) * count))
         grid = figure.subplots(count, columns, sharey=True, squeeze=False)
         for k, axes in enumerate(grid.flat):
             if k >= len(shown):
@@ -107,20 +137,21 @@ def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
                 continue
             chosen = [row for row in rows if tuple(row[name] for name in layout.panels) == shown[k]]
             _draw_panel(axes, chosen, layout, rows)
-            axes.set_title(_title(layout.panels, shown[k]))
-            axes.set_ylabel("safe (%)" if k % columns == 0 else "")
+            title = _title(layout.panels, shown[k])
+            room = 0.85 * width / columns
+            axes.set_title(wrapped(figure, title, mpl.rcParams["axes.titlesize"], room))
+            axes.set_ylabel(labelled("safe", "%") if k % columns == 0 else "")
         handles, labels = grid.flat[0].get_legend_handles_labels()
         if labels:
             add_legend(figure, handles)
-        figure.suptitle(f"{_common(rows)}safety rate, with its pointwise 95 % band", fontsize=11)
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
-    return len(combinations) - len(shown)
+        add_title(figure, f"{_common(rows)}safety rate, with its pointwise 95 % band")
+    return figure, len(combinations) - len(shown)
 
 
 def _common(rows: Sequence[Row]) -> str:
     """Return the env of the cells, if all have the same."""
     titles = {json.loads(row["config"])["title"] for row in rows}
-    return f"{titles.pop()}: " if len(titles) == 1 else ""
+    return f"{plain(titles.pop(), 200)}: " if len(titles) == 1 else ""
 
 
 def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Sequence[Row]) -> None:
@@ -136,14 +167,19 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
         of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
         rates = {position[place]: _rate(_at(of_kind, layout.x, place)) for place in places}
         found = {at: rate for at, rate in rates.items() if rate is not None}
-        color = WARM if kind == UNFILTERED else colors[k % len(colors)]
+        unfiltered = kind == UNFILTERED
+        style = {
+            "color": WARM if unfiltered else colors[k % len(colors)],
+            "linestyle": UNFILTERED_DASHES if unfiltered else DASHES[k % len(DASHES)],
+            "marker": MARKERS[k % len(MARKERS)],
+        }
         label = None if layout.lines is None else _text(kind)
         if layout.lines not in (None, "filter"):
-            label = f"{layout.lines} = {label}"
+            label = f"{symbol(layout.lines)} = {label}"
         # Bars are next to each other, since they would hide each other.
         shift = 0.0 if numeric else 0.12 * (k - (len(kinds) - 1) / 2)
-        _draw_rates(axes, [at + shift for at in found], list(found.values()), numeric, color, label)
-    axes.set_xlabel("" if layout.x is None else layout.x)
+        _draw_rates(axes, [at + shift for at in found], list(found.values()), numeric, style, label)
+    axes.set_xlabel("" if layout.x is None else symbol(layout.x))
     if numeric and all(isinstance(place, int) for place in places):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if not numeric:
@@ -163,17 +199,17 @@ def _draw_rates(
     at: Sequence[float],
     rates: Sequence[Rate],
     band: bool,
-    color: Any,
+    style: dict[str, Any],
     label: str | None,
 ) -> None:
     """Draw rates with their intervals, as a band or as bars."""
     rate, low, high = 100 * np.array(rates).reshape(-1, 3).T
     if band:
-        axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
-        axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
+        axes.fill_between(at, low, high, color=style["color"], alpha=0.2, linewidth=0)
+        axes.plot(at, rate, **style, markersize=3, label=label)
     else:
-        style: Any = {"fmt": "o", "markersize": 4, "capsize": 3}
-        axes.errorbar(at, rate, yerr=[rate - low, high - rate], color=color, label=label, **style)
+        style = {**style, "linestyle": "none", "markersize": 3, "capsize": 2, "elinewidth": 0.9}
+        axes.errorbar(at, rate, yerr=[rate - low, high - rate], label=label, **style)
 
 
 def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
@@ -217,10 +253,12 @@ def _is_numeric(rows: Sequence[Row], name: str) -> bool:
 
 
 def _title(names: Sequence[str], values: Sequence[Any]) -> str:
-    return ", ".join(f"{name} = {_text(value)}" for name, value in zip(names, values, strict=True))
+    return ", ".join(
+        f"{symbol(name)} = {_text(value)}" for name, value in zip(names, values, strict=True)
+    )
 
 
 def _text(value: Any) -> str:
     if value is None:
         return "env's own"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:g}" if isinstance(value, float) else plain(str(value))

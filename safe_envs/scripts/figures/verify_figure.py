@@ -6,62 +6,118 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.figure import Figure
+import numpy as np
+from matplotlib.contour import ContourSet
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from safe_envs.atomic_io import write_atomically
-from safe_envs.scripts.figures.style import COLORS, STYLE, UNSAFE
-from safe_envs.scripts.figures.verify_panel import INFEASIBLE, draw_line
+from safe_envs.agents.evaluation.bound_check import starts_of
+from safe_envs.scripts.figures.contour_labels import write_levels
+from safe_envs.scripts.figures.labels import mathematics, plain
+from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.style import (
+    COLORS,
+    DASHES,
+    QUIET,
+    STYLE,
+    UNSAFE,
+    add_legend,
+    add_title,
+)
+from safe_envs.scripts.figures.verify_panel import INFEASIBLE, DrawnVerification, draw_line
 from safe_envs.scripts.figures.verify_plane import draw_shares, draw_slice
+from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.verify_answer import VerifyAnswer
+from safe_envs.wrappers import spec_of
+from safe_envs.wrappers.verification.feasibility import Verification
 
 
-def draw(answer: VerifyAnswer, path: Path) -> None:
-    """Draw a verification, and write the picture whole or not at all.
+def plot_verification(
+    found: Verification,
+    out: Path | str | None = None,
+    *,
+    starts: np.ndarray | None = None,
+    title: str | None = None,
+    size: str = DEFAULT_SIZE,
+) -> Picture:
+    """Draw where no action meets the conditions, h, and the boundaries of the chain.
 
     A plane is drawn with the other states as at the worst state, and next to it with all values of
     the others at once.
 
     Args:
-        answer: to draw.
-        path: of the picture; its suffix is the format.
+        found: to draw, of `verify`.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
+        starts: to mark, shape (B, n); by default some of the problem's.
+        title: name of the env; by default that of the problem.
+        size: "single" or "double", in columns of a paper.
+
+    Returns:
+        The figure, which a notebook shows.
+
+    Raises:
+        ConfigurationError: The file cannot be written, or there is no such size.
     """
-    problem = answer.problem
+    problem = found.formulas.problem
+    marked = starts_of(problem) if starts is None else starts
+    drawn = DrawnVerification(found, marked, title or problem.name)
+    return finished(figure_of(drawn, size), out)
+
+
+def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> Picture:
+    """Return the figure of a verification.
+
+    Args:
+        answer: to draw.
+        size: as for `plot_verification`.
+
+    Raises:
+        ConfigurationError: there is no such size.
+    """
+    problem, width = answer.problem, width_of(size)
     several = problem.plant.n > 2
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(12.0, 5.6) if several else (7.4, 5.6))
-        panels = figure.subplots(1, 2 if several else 1, squeeze=False)[0]
+        aside = several and size == "double"
+        # A single panel of two columns would be taller than wide panels need.
+        height = 3.9 if aside else 6.8 if several else 4.2 if size == "double" else 3.6
+        figure = Picture(figsize=(width, height))
+        shape = (1, 2) if aside else (2, 1) if several else (1, 1)
+        panels = list(figure.subplots(*shape, squeeze=False).flat)
+        lines = None
         if problem.plant.n == 1:
             draw_line(panels[0], answer)
         else:
-            draw_slice(panels[0], answer)
+            lines = draw_slice(panels[0], answer)
         if several:
             draw_shares(figure, panels[1], answer)
-        columns = 6 if several else 3
-        figure.legend(handles=_legend(answer), loc="outside lower center", ncols=columns)
-        title = f"{answer.title}, {answer.filter_text}\n{describe_system(problem)}"
-        figure.suptitle(title, fontsize=11)
-        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+        add_legend(figure, _legend(answer, lines))
+        filter_text = spec_of(answer.verification.formulas.conditions)
+        title = plain(f"{answer.title}, {filter_text}", 200)
+        add_title(figure, f"{title}\n{mathematics(describe_system(problem))}")
+        if lines is not None:
+            write_levels(figure, panels[0], lines)
+    return figure
 
 
-def _legend(answer: VerifyAnswer) -> list[Patch | Line2D]:
+def _legend(answer: DrawnVerification, lines: ContourSet | None) -> list[Patch | Line2D]:
     found = answer.verification
     handles: list[Patch | Line2D] = []
     if found.safe_set.shortfall > 0.0 or answer.part.shortfall > 0.0:
         handles.append(Patch(color=INFEASIBLE, alpha=0.6, label="no action meets the condition"))
     handles.append(Patch(color=UNSAFE, alpha=0.5, label="unsafe"))
-    handles.append(Line2D([], [], color="black", linewidth=1.4, label="h = 0"))
+    handles.append(Line2D([], [], color="black", linewidth=1.1, label="$h = 0$"))
+    if lines is not None:
+        levels = ", ".join(f"{level:.3g}" for level in lines.levels)
+        handles.append(Line2D([], [], color=QUIET, linewidth=0.5, label=f"$h =$ {levels}"))
     degree = max(stage.stop - stage.start for stage in found.formulas.stages)
     handles += [
-        Line2D([], [], color=COLORS[j - 1], linestyle="--", label=f"b_{j} = 0")
+        Line2D([], [], color=COLORS[j - 1], linestyle=DASHES[j], label=f"$b_{j} = 0$")
         for j in range(1, degree)
     ]
     marker: Any = {"linestyle": "", "color": INFEASIBLE, "marker": "X", "markeredgecolor": "black"}
     cross = "worst state" if answer.part.shortfall else "least to spare"
-    handles.append(Line2D([], [], **marker, markersize=9, label=cross))
+    handles.append(Line2D([], [], **marker, markersize=6, label=cross))
     starts = "starts, projected" if answer.problem.plant.n > 2 else "starts"
     marker = {"linestyle": "", "color": COLORS[0], "marker": "o"}
-    handles.append(Line2D([], [], **marker, markersize=4, label=starts))
+    handles.append(Line2D([], [], **marker, markersize=3, label=starts))
     return handles

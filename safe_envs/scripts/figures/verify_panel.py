@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.style import COLORS, UNSAFE
-from safe_envs.scripts.reports.verify_answer import VerifyAnswer
+from safe_envs.scripts.figures.labels import quantity
+from safe_envs.scripts.figures.style import COLORS, DASHES, UNSAFE
+from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
 from safe_envs.wrappers.verification.formulas import Formulas
 
 INFEASIBLE = "#D55E00"
@@ -17,7 +19,32 @@ _SHOWN_STARTS = 200
 _NEAREST = 500
 
 
-def window(answer: VerifyAnswer, indices: Sequence[int]) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class DrawnVerification:
+    """A verification with what is drawn with it.
+
+    Attributes:
+        verification: where the conditions can be met.
+        starts: to mark, shape (B, n).
+        title: name of the env.
+    """
+
+    verification: Verification
+    starts: np.ndarray
+    title: str
+
+    @property
+    def problem(self) -> SafetyProblem:
+        """The problem that was looked at."""
+        return self.verification.formulas.problem
+
+    @property
+    def part(self) -> SetFeasibility:
+        """The feasibility in the set whose worst state is shown."""
+        return self.verification.part
+
+
+def window(answer: DrawnVerification, indices: Sequence[int]) -> np.ndarray:
     """Return limits that show C within the workspace, or what happens in it if it has no end.
 
     Args:
@@ -71,9 +98,9 @@ def mark_states(axes: Axes, starts: tuple[np.ndarray, np.ndarray], worst: Sequen
     """
     limits = {"xlim": axes.get_xlim(), "ylim": axes.get_ylim()}
     shown = [coordinates[:_SHOWN_STARTS] for coordinates in starts]
-    size = 2.5 if len(shown[0]) > 1 else 6
+    size = 1.8 if len(shown[0]) > 1 else 4
     axes.plot(*shown, "o", color=COLORS[0], markersize=size, alpha=0.7, zorder=4)
-    cross = {"color": INFEASIBLE, "markeredgecolor": "black", "markersize": 10}
+    cross = {"color": INFEASIBLE, "markeredgecolor": "black", "markersize": 7}
     axes.plot(*worst, "X", **cross, zorder=5, clip_on=False)
     axes.set(**limits)
 
@@ -88,11 +115,10 @@ def axis_label(problem: SafetyProblem, i: int) -> str:
     Returns:
         The name with the unit.
     """
-    state = problem.states[i]
-    return f"{state.symbol.name} ({state.unit})" if state.unit else state.symbol.name
+    return quantity(problem.states[i].symbol.name, problem.states[i].unit)
 
 
-def draw_line(axes: Axes, answer: VerifyAnswer) -> None:
+def draw_line(axes: Axes, answer: DrawnVerification) -> None:
     """Draw h and the chain over the only state of a problem.
 
     Args:
@@ -103,9 +129,9 @@ def draw_line(axes: Axes, answer: VerifyAnswer) -> None:
     (low, high), *_ = window(answer, [0])
     x = np.linspace(low, high, 1000)[:, None]
     chain = formulas.chain(x)
-    axes.plot(x[:, 0], chain[:, 0], color="black", linewidth=1.4)
+    axes.plot(x[:, 0], chain[:, 0], color="black", linewidth=1.1)
     for j in range(1, chain.shape[1]):
-        axes.plot(x[:, 0], chain[:, j], "--", color=COLORS[j - 1])
+        axes.plot(x[:, 0], chain[:, j], color=COLORS[j - 1], linestyle=DASHES[j])
     axes.axhline(0.0, color="black", linewidth=0.6)
     violated = infeasible(formulas, x, formulas.barrier_level) == 1.0
     for where, color, alpha in ((chain[:, 0] < 0.0, UNSAFE, 0.5), (violated, INFEASIBLE, 0.6)):
@@ -122,5 +148,5 @@ def draw_line(axes: Axes, answer: VerifyAnswer) -> None:
     axes.set_xlim(low, high)
     heights = formulas.chain(starts)[:, 0]
     mark_states(axes, (starts[:, 0], heights), (answer.part.worst[0], 0.0))
-    title = "h" + ", and where no action meets the condition" * bool(violated.any())
-    axes.set(xlabel=axis_label(answer.problem, 0), ylabel="h", title=title)
+    title = "$h$" + ", and where no action meets the condition" * bool(violated.any())
+    axes.set(xlabel=axis_label(answer.problem, 0), ylabel="$h$", title=title)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, to_rgba
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE
+from safe_envs.scripts.figures.labels import labelled, symbol
+from safe_envs.scripts.figures.style import COLORS, DASHES, QUIET, UNSAFE
 from safe_envs.scripts.figures.verify_panel import (
     INFEASIBLE,
+    DrawnVerification,
     axis_label,
     infeasible,
     mark_states,
     window,
 )
-from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.feasibility import Verification
 from safe_envs.wrappers.verification.safe_set import sample
 
@@ -27,13 +29,17 @@ _LISTED = 3
 _LEVELS = (0.2, 0.4, 0.6, 0.8)
 
 
-def draw_slice(axes: Axes, answer: VerifyAnswer) -> None:
+def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
     """Draw h, the chain and where no action meets the conditions, in the plane of the worst state.
 
     Args:
         axes: to draw on.
         answer: to draw.
+
+    Returns:
+        The contours of h inside the safe set, for `write_levels`; None without any.
     """
+    lines = None
     found, problem, worst = answer.verification, answer.problem, answer.part.worst
     formulas, plane = found.formulas, _plane(problem)
     grid, x = _states_over(answer, plane, worst, _GRID)
@@ -46,28 +52,31 @@ def draw_slice(axes: Axes, answer: VerifyAnswer) -> None:
     violated = shaped(infeasible(formulas, x, formulas.barrier_level))
     axes.contourf(*grid, violated, levels=[0.5, 2.0], colors=[INFEASIBLE], alpha=0.6, zorder=1)
     axes.contourf(*grid, shaped(h), levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.5, zorder=0)
-    axes.contour(*grid, shaped(h), levels=[0.0], colors="black", linewidths=1.4, zorder=3)
+    axes.contour(*grid, shaped(h), levels=[0.0], colors="black", linewidths=1.1, zorder=3)
     if np.nanmax(h) > 1e-3 * min(b.deepest_h for b in found.barriers) or found.beyond:
         # Quantiles, since equal steps of a steep function crowd together at one end.
         inner = np.unique(np.quantile(h[h > 0.0], _LEVELS))
         lines = axes.contour(*grid, shaped(h), levels=inner, colors=QUIET, linewidths=0.5, zorder=2)
-        axes.clabel(lines, fontsize=7, fmt="%.3g")
     for stage in formulas.stages:
         for j in range(stage.start + 1, stage.stop):
-            style = {"colors": COLORS[j - stage.start - 1], "linestyles": "--", "linewidths": 1.2}
+            style = {"colors": COLORS[j - stage.start - 1], "linestyles": [DASHES[j - stage.start]]}
             inside = np.where(shaped(h) >= 0.0, shaped(chain[:, j]), np.nan)
             axes.contour(*grid, inside, levels=[0.0], zorder=3, **style)
     starts = answer.starts[:, plane[0]], answer.starts[:, plane[1]]
     mark_states(axes, starts, (worst[plane[0]], worst[plane[1]]))
     _label(axes, problem, plane)
     others = [
-        f"{s.symbol} = {worst[i] + 0.0:.3g}" for i, s in enumerate(problem.states) if i not in plane
+        f"{symbol(s.symbol.name)} = {worst[i] + 0.0:.3g}"
+        for i, s in enumerate(problem.states)
+        if i not in plane
     ]
     listing = ", ".join(others) if len(others) < _LISTED else "other states"
-    axes.set_title(f"Contours of h; {listing} as at the worst state" if others else "Contours of h")
+    title = "Contours of $h$"
+    axes.set_title(f"{title}, at the worst state's\n{listing}" if others else title)
+    return lines
 
 
-def draw_shares(figure: Figure, axes: Axes, answer: VerifyAnswer) -> None:
+def draw_shares(figure: Figure, axes: Axes, answer: DrawnVerification) -> None:
     """Draw for which share of the other states no action meets the conditions.
 
     Args:
@@ -93,11 +102,13 @@ def draw_shares(figure: Figure, axes: Axes, answer: VerifyAnswer) -> None:
     colors = LinearSegmentedColormap.from_list("infeasible", ["#FFFFFF", INFEASIBLE])
     image = axes.pcolormesh(*grid, share, cmap=colors, vmin=0.0, vmax=top, rasterized=True)
     axes.set_facecolor(to_rgba(UNSAFE, 0.5))
-    where = "C" if formulas.first_order else "the intersection of the C_j"
+    where = "$C$" if formulas.first_order else "the intersection of the $C_j$"
     rest = [str(s.symbol) for i, s in enumerate(problem.states) if i not in plane]
-    figure.colorbar(image, ax=axes, label=f"part of {where} where no action does (%)", shrink=0.9)
+    label = labelled(f"part of {where}", "%")
+    figure.colorbar(image, ax=axes, label=label, shrink=0.9)
     _label(axes, problem, plane)
-    axes.set_title(f"Over all {rest[0] if len(rest) == 1 else 'values of the other states'}")
+    over = symbol(rest[0]) if len(rest) == 1 else "values of the other states"
+    axes.set_title(f"Where no action meets the conditions,\nover all {over}")
 
 
 def _plane(problem: SafetyProblem) -> tuple[int, int]:
@@ -107,7 +118,7 @@ def _plane(problem: SafetyProblem) -> tuple[int, int]:
 
 
 def _states_over(
-    answer: VerifyAnswer, plane: tuple[int, int], state: np.ndarray, count: int
+    answer: DrawnVerification, plane: tuple[int, int], state: np.ndarray, count: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Return a grid over a plane, and its states, with the other coordinates of a state."""
     ticks = [np.linspace(low, high, count) for low, high in window(answer, plane)]

@@ -43,8 +43,9 @@ Engine = Annotated[
         ),
     ),
 ]
-PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "svgz", "tif", "tiff", "webp")
-"""Suffixes of pictures, all of which matplotlib writes: to ask it takes longer than all else."""
+PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "tif", "tiff", "webp")
+"""Suffixes of pictures, all of which matplotlib writes: to ask it takes longer than all else. Not
+among them are pgf, which needs a TeX installation, and svgz, which holds the time."""
 
 FORMATS = ".png, .pdf, .svg, .eps, .jpg, .tif or .webp."
 

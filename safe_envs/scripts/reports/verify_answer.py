@@ -67,7 +67,7 @@ class VerifyAnswer:
     @property
     def part(self) -> SetFeasibility:
         """The feasibility in the set that becomes invariant; in C if there is none."""
-        return self.verification.invariant_set or self.verification.safe_set
+        return self.verification.part
 
     @property
     def filter_text(self) -> str:

@@ -55,10 +55,10 @@ def reproduce(
 ) -> None:
     """Compute the tables and figures of the thesis, and compare them with the printed ones.
 
-    Each gets a picture (PNG and SVG) or a table, a JSON file with all numbers, and, but for a quick
-    run, a verdict from a fixed list by stated rules. DIR/index.html is one page with all that is in
-    DIR by the same options, DIR/index.md the same as Markdown. What is computed is kept by its
-    configuration and the version of the code: a run that was stopped goes on.
+    Each gets a picture (PNG, PDF and SVG) or a table, a JSON file with all numbers, and, but for a
+    quick run, a verdict from a fixed list by stated rules. DIR/index.html is one page with all that
+    is in DIR by the same options, DIR/index.md the same as Markdown. What is computed is kept by
+    its configuration and the version of the code: a run that was stopped goes on.
     """
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.fingerprint import source_checksum

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -86,16 +87,22 @@ class ChainGuarantee:
         if not reason and self.analysis.invariant_set is None:
             reason = _EMPTY
         if not reason:
-            against = (*failures(self.analysis), self._unbounded, *self._unverified)
-            reason = next(filter(None, against), "")
+            reason = next(filter(None, self._against), "")
         if not reason and self.formulas.certain and not self._certain_up_to_a_time:
             reason = self.remark
         return reason
 
     @property
+    def _against(self) -> Iterator[str]:
+        """Reasons why there is no bound, the cheapest first; a proof only where it decides."""
+        yield from failures(self.analysis)
+        yield self._unbounded
+        yield from self._unverified
+
+    @property
     def _unbounded(self) -> str:
         """Which supremum is infinite, where one matters, in words; may be empty."""
-        proved = all(math.isfinite(c) for c in self.stages.suprema)
+        proved = self.formulas.certain or all(math.isfinite(c) for c in self._suprema)
         return "" if proved else unbounded(self.analysis)
 
     @property

@@ -131,6 +131,11 @@ class Verification:
         """The states that were searched."""
         return self.analysis.region
 
+    @property
+    def part(self) -> SetFeasibility:
+        """The feasibility in the set that becomes invariant; in C if there is none."""
+        return self.invariant_set or self.safe_set
+
     @cached_property
     def guarantee(self) -> ChainGuarantee | CertificateGuarantee:
         """The bounds of the conditions, with what the judge proves of them."""

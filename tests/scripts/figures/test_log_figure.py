@@ -42,7 +42,12 @@ def spans(panel):
 def test_panels_lines_and_marks():
     figure = plot_log(log_of(UNSAFE))
     panels = figure.axes
-    assert [panel.get_ylabel() for panel in panels] == ["u (m/s²)", "rotor_speed", "h", "slack"]
+    assert [panel.get_ylabel() for panel in panels] == [
+        r"$u$ [$\mathrm{m}/\mathrm{s}^{2}$]",
+        "rotor speed",
+        "$h$",
+        "slack",
+    ]
     nominal, executed, low, high = panels[0].lines
     np.testing.assert_allclose(nominal.get_ydata(), 1.0)
     np.testing.assert_allclose(executed.get_ydata(), [1, 0.9, 0.8, 0.7, 0.6, 0.2, 0.2])
@@ -56,13 +61,13 @@ def test_panels_lines_and_marks():
         assert panel.get_xlim() == pytest.approx((0.0, 0.7))
     (legend,) = figure.legends
     texts = [text.get_text() for text in legend.get_texts()]
-    assert {"nominal input", "infeasible", "h wall, min -4.5"} <= set(texts)
+    assert {"nominal input", "infeasible", "$h$ wall, min -4.5"} <= set(texts)
     assert "1 infeasible" in figure.get_suptitle()
 
 
 def test_slacks_have_a_panel_where_there_are_some():
     figure = plot_log(log_of(SAFE))
-    assert [panel.get_ylabel() for panel in figure.axes][-1] == "h"
+    assert [panel.get_ylabel() for panel in figure.axes][-1] == "$h$"
     assert "infeasible" not in [t.get_text() for t in figure.legends[0].get_texts()]
 
 
@@ -134,7 +139,7 @@ def test_the_legend_has_what_can_be_seen():
     figure = plot_log(with_barriers(rows, bounds=(-1e6, np.inf)))
     assert [t for t in texts_of(figure) if t.strip()] == [
         "executed input",
-        "h b0, min 0",
+        "$h$ b0, min 0",
         "outside the panel: 2 more",
     ]
     figure = plot_log(with_barriers(rows, proposed=0.8))
@@ -144,7 +149,7 @@ def test_the_legend_has_what_can_be_seen():
 
 def test_the_panel_says_where_it_is_cut_off():
     cut = plot_log(with_barriers([[1.0, 7.0], [2.0, 1e6]]))
-    assert cut.axes[1].get_title("right") == "h cut off at 2.1"
+    assert cut.axes[1].get_title("right") == "$h$ cut off at 2.1"
     whole = plot_log(with_barriers([[1.0, 1.0], [2.0, 2.0]]))
     assert whole.axes[1].get_title("right") == ""
 

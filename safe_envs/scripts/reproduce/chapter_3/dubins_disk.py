@@ -8,11 +8,12 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Patch
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
+from safe_envs.scripts.figures.labels import quantity, unit_text
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3.disk_starts import (
     PRINTED_START,
     RATES,
@@ -211,7 +212,7 @@ def _draw_disk(figure: Figure, outcome: Findings) -> None:
     for panel, (axes, name, start) in enumerate(
         zip(panels, names, outcome.data["starts"], strict=True)
     ):
-        axes.set(aspect="equal", xlim=(-1.65, 1.65), ylim=(-1.65, 1.65), xlabel="x (m)")
+        axes.set(aspect="equal", xlim=(-1.65, 1.65), ylim=(-1.65, 1.65), xlabel=quantity("x", "m"))
         axes.axvspan(-1.65, 1.65, **SHADED)
         edge: dict[str, Any] = {"facecolor": "white", "edgecolor": "black", "linewidth": 1.2}
         axes.add_patch(Circle((0, 0), outcome.data["radius"], zorder=0.5, **edge))
@@ -220,16 +221,18 @@ def _draw_disk(figure: Figure, outcome: Findings) -> None:
             nominal = {"linewidth": 0.8, "linestyle": (0, (4, 2)), "alpha": 0.8, "zorder": 1.5}
             style = learned if curve["kind"] == "learned" else nominal
             axes.plot(curve["x"], curve["y"], color=colors[curve["p"]], **style)
-        axes.plot(*start[:2], "*", color="black", markersize=9, zorder=3)
-        axes.text(-1.6, -1.6, "unsafe", color=QUIET, va="bottom")
+        axes.plot(*start[:2], "*", color="black", markersize=7, zorder=3)
         axes.set_title(f"({'abc'[panel]}) start ({start[0]:g}, {start[1]:g})\n{name}")
-    panels[0].set_ylabel("y (m)")
+    panels[0].set_ylabel(quantity("y", "m"))
     handles = [
-        Line2D([], [], color=colors[p], linewidth=1.8, label=f"$p_1 = p_2 = {p:g}$ 1/s")
+        Line2D(
+            [], [], color=colors[p], linewidth=1.8, label=f"$p_1 = p_2 = {p:g}$ {unit_text('1/s')}"
+        )
         for p in RATES
     ]
     nominal = Line2D([], [], color=QUIET, linewidth=0.8, linestyle="--", label="nominal")
-    add_legend(figure, [*handles, nominal])
+    unsafe = Patch(color=UNSAFE, alpha=0.35, label="unsafe")
+    add_legend(figure, [*handles, nominal, unsafe])
 
 
 def _values(sample: Workload) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.labels import labelled, quantity
+from safe_envs.scripts.figures.style import COLORS, HALO, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
@@ -199,7 +200,7 @@ def _draw_passage(figure: Figure, outcome: Findings) -> None:
     """Draw the paths past the obstacle, with both at three instants."""
     axes, shade = figure.add_subplot(), {"alpha": 0.45, "linewidth": 0}
     axes.add_patch(Circle(GOAL, GOAL_RADIUS, facecolor="#56B4E9", **shade))
-    axes.text(GOAL[0], GOAL[1] + 0.38, "goal", ha="center", color=QUIET)
+    axes.text(GOAL[0] + 0.4, GOAL[1], "goal", va="center", color="black", path_effects=HALO)
     lines = (
         ("nominal", learned_runs.NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
         ("learned", learned_runs.LEARNED_COLOR, "-", 1.8, "learned derivatives"),
@@ -212,10 +213,12 @@ def _draw_passage(figure: Figure, outcome: Findings) -> None:
         edge = {"fill": False, "edgecolor": color, "linewidth": 1.5}
         axes.add_patch(Circle(at, OBSTACLE_RADIUS, facecolor=UNSAFE, zorder=0, **shade))
         axes.add_patch(Circle(at, OBSTACLE_RADIUS, **edge))
-        axes.text(at[0], at[1], label, ha="center", va="center", color=QUIET)
-        star: dict[str, Any] = {"color": color, "markersize": 12, "zorder": 3}
-        axes.plot(*instant["vehicle"], "*", label=f"learned, t = {label}", **star)
-    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(-2.4, 5.2), ylim=(-2.4, 2.2))
+        above = at[1] + OBSTACLE_RADIUS + 0.1
+        axes.text(at[0], above, label, ha="center", color="black", path_effects=HALO)
+        star: dict[str, Any] = {"color": color, "markersize": 8, "zorder": 3}
+        axes.plot(*instant["vehicle"], "*", label=f"learned, $t$ = {label}", **star)
+    axes.set(aspect="equal", xlim=(-2.4, 5.2), ylim=(-2.4, 2.2))
+    axes.set(xlabel=quantity("x", "m"), ylabel=quantity("y", "m"))
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
@@ -233,10 +236,10 @@ def _draw_clearance(figure: Figure, outcome: Findings) -> None:
     lowest, last = min(min(c["h"]) for c in curves), max(c["time"][-1] for c in curves)
     # The fall from the far start would flatten what matters.
     bottom = min(lowest, 0.0) - 0.15
-    axes.set(xlim=(0.0, last), ylim=(bottom, 2.5), xlabel="time (s)", ylabel="barrier h (m$^2$)")
-    axes.axhspan(bottom, 0.0, **SHADED)
+    axes.set(xlim=(0.0, last), ylim=(bottom, 2.5), xlabel=labelled("time", "s"))
+    axes.set_ylabel(labelled("barrier $h$", "m^2"))
+    axes.axhspan(bottom, 0.0, label="collision", **SHADED)
     axes.axhline(0.0, color="black", linewidth=1.2)
-    axes.text(0.01, 0.02, "collision", transform=axes.transAxes, va="bottom", color=QUIET)
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 

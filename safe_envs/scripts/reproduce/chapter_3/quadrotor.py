@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
@@ -145,10 +146,11 @@ def _draw(figure: Figure, outcome: Findings) -> None:
     draw_lines(axes, outcome.data, lines, "time", "z")
     low, high = 1.5, 8.5
     for edge, end in ((CENTER - HALF_WIDTH, low), (CENTER + HALF_WIDTH, high)):
-        axes.axhspan(min(edge, end), max(edge, end), **SHADED)
+        label = "unsafe" if end == low else None
+        axes.axhspan(min(edge, end), max(edge, end), label=label, **SHADED)
         axes.axhline(edge, color="black", linewidth=1.2, linestyle="--")
-    axes.text(0.99, 0.02, "unsafe", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
-    axes.set(xlim=(0.0, time[-1]), ylim=(low, high), xlabel="time (s)", ylabel="altitude z (m)")
+    axes.set(xlim=(0.0, time[-1]), ylim=(low, high), xlabel=labelled("time", "s"))
+    axes.set_ylabel(labelled("altitude $z$", "m"))
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 

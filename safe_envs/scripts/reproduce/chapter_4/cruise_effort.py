@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents import NominalController
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_4 import cruise_setting as car
 from safe_envs.scripts.reproduce.chapter_4.effort_claims import (
@@ -139,22 +140,23 @@ def _draw_figure(figure: Figure, outcome: Findings) -> None:
         label = f"{name}: median, and 5 to 95 %"
         ends = np.array(data["effort"][name])
         draw_interval(left, data["time"], ends, color, 0.2, linewidth=1.3, label=label)
-        right.plot(data["h"], np.square(data["forces"][name]), color=color, linewidth=2)
-    for axes, label in ((left, "|u| = .3 M g"), (right, None)):
+        right.plot(data["h"], np.square(data["forces"][name]), color=color, linewidth=1.5)
+    for axes, label in ((left, r"$|u| = 0.3\,M g$"), (right, None)):
         axes.axhline(car.ASSUMED.limit**2, color=QUIET, linestyle=":", label=label)
-    labels: dict[str, Any] = {"xlabel": "time (s)", "ylabel": r"effort J = u$^2$ (N$^2$)"}
+    labels: dict[str, Any] = {"xlabel": labelled("time", "s")}
+    left.set_ylabel(labelled("effort $J = u^2$", "N^2"))
     left.set(yscale="log", xlim=(0, car.HORIZON), title="(a)", **labels)
     right.set(xscale="log", yscale="log", xlim=(DISTANCES[0], DISTANCES[-1]), title="(b)")
-    right.set_xlabel("barrier h (m), edge at the left")
+    right.set_xlabel(f"{labelled('barrier $h$', 'm')}, edge at the left")
     _mark_step(right)
-    add_legend(figure, left.get_legend_handles_labels()[0])
+    handles = [each for axes in (left, right) for each in axes.get_legend_handles_labels()[0]]
+    add_legend(figure, handles)
 
 
 def _mark_step(axes: Axes) -> None:
     """Shade the distances that the noise of one control period crosses."""
-    axes.axvspan(DISTANCES[0], car.ASSUMED.tau * car.NOISE * math.sqrt(car.STEP), **SHADED)
-    style: dict[str, Any] = {"transform": axes.transAxes, "color": QUIET, "fontsize": 8}
-    axes.text(0.03, 0.2, "within the noise\nof one step", **style)
+    end = car.ASSUMED.tau * car.NOISE * math.sqrt(car.STEP)
+    axes.axvspan(DISTANCES[0], end, label="within the noise of one step", **SHADED)
 
 
 ARTEFACTS = (

@@ -10,7 +10,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.labels import labelled, quantity, unit_text
+from safe_envs.scripts.figures.style import COLORS, HALO, QUIET, SMALL, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_4.dubins_runs import ALPHAS, FILTERS, RADIUS
 from safe_envs.scripts.reproduce.framework.artefact import Findings
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
@@ -51,13 +52,13 @@ def draw_noises(figure: Figure, outcome: Findings) -> None:
     for horizon in data["horizons"]:
         right.axvline(horizon, color=UNSAFE, linewidth=0.8, zorder=0)
     left.set(
-        xlabel=r"noise $\sigma_1 = \sigma_2$ (m/$\sqrt{\mathrm{s}}$)",
-        ylabel="safe (%)",
+        xlabel=labelled(r"noise $\sigma_1 = \sigma_2$", "m/sqrt(s)"),
+        ylabel=labelled("safe", "%"),
         ylim=(-3, 103),
-        title=f"(a) T = {data['horizon']:g} s",
+        title=f"(a) $T$ = {data['horizon']:g} s",
     )
-    title = rf"(b) $\sigma$ = {max(data['levels']):g} m/$\sqrt{{\mathrm{{s}}}}$"
-    right.set(xlabel="horizon T (s)", xlim=(0, max(data["horizons"])), title=title)
+    title = rf"(b) $\sigma$ = {max(data['levels']):g} {unit_text('m/sqrt(s)')}"
+    right.set(xlabel=labelled("horizon $T$", "s"), xlim=(0, max(data["horizons"])), title=title)
     add_legend(figure, left.get_legend_handles_labels()[0])
 
 
@@ -73,7 +74,7 @@ def draw_points(figure: Figure, outcome: Findings) -> None:
     index = np.arange(1, len(data["starts"]) + 1)
     short, long = data["horizons"]
     for i, name in enumerate(FILTERS):
-        style: Any = {"fmt": "os^"[i], "color": _COLOR[name], "markersize": 4.5, "linewidth": 1}
+        style: Any = {"fmt": "os^"[i], "color": _COLOR[name], "markersize": 3.5, "linewidth": 1}
         for horizon, face, label in ((short, _COLOR[name], _LABEL[name]), (long, "white", None)):
             low, rate, high = np.array(data["rates"][name][f"{horizon:g}"]).T
             left.errorbar(
@@ -86,11 +87,13 @@ def draw_points(figure: Figure, outcome: Findings) -> None:
             )
     product = np.array(data["product"])
     black: dict[str, Any] = {"color": "black", "label": "product of Thm. 4.2.10"}
-    left.plot(index[product > 0], 100 * product[product > 0], "_", markersize=14, **black)
+    left.plot(index[product > 0], 100 * product[product > 0], "_", markersize=10, **black)
     for horizon, face in ((short, "black"), (long, "white")):
-        black = {"color": "black", "label": f"T = {horizon:g} s", "markerfacecolor": face}
+        black = {"color": "black", "label": f"$T$ = {horizon:g} s", "markerfacecolor": face}
         left.plot([], [], "o", markersize=4.5, **black)
-    left.set(xlabel="start", ylabel="safe (%)", xticks=index, ylim=(-3, 103), title="(a)")
+    left.set(
+        xlabel="start", ylabel=labelled("safe", "%"), xticks=index, ylim=(-3, 103), title="(a)"
+    )
     _draw_starts(right, np.array(data["starts"]))
     handles, labels = left.get_legend_handles_labels()
     ordered = sorted(labels, key=lambda label: label not in _LABEL.values())
@@ -98,13 +101,33 @@ def draw_points(figure: Figure, outcome: Findings) -> None:
 
 
 def _draw_starts(axes: Axes, starts: np.ndarray) -> None:
-    """Draw the disk with the starts and their headings, each number behind its arrow."""
+    """Draw the disk with the starts and their headings, each number at its arrow."""
     axes.set_facecolor(to_rgba(UNSAFE, 0.35))
     axes.add_patch(Circle((0, 0), RADIUS, facecolor="white", edgecolor="black", linewidth=1.2))
     x, y = starts[:, :2].T
     along, up = np.cos(starts[:, 2]), np.sin(starts[:, 2])
     axes.quiver(x, y, along, up, color=QUIET, scale=9, width=0.009)
-    for i, place in enumerate(zip(x - 0.28 * along, y - 0.28 * up, strict=True), 1):
-        axes.text(*place, str(i), ha="center", va="center", fontsize=8)
+    for i, place in enumerate(_places(starts), 1):
+        style: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "path_effects": HALO}
+        axes.text(*place, str(i), **style)
     limits = (-1.12 * RADIUS, 1.12 * RADIUS)
-    axes.set(xlabel="x (m)", ylabel="y (m)", xlim=limits, ylim=limits, aspect="equal", title="(b)")
+    axes.set(xlim=limits, ylim=limits, aspect="equal", title="(b)")
+    axes.set(xlabel=quantity("x", "m"), ylabel=quantity("y", "m"))
+
+
+def _places(starts: np.ndarray) -> list[np.ndarray]:
+    """Return where the numbers of starts are written: behind the arrow, or where there is room.
+
+    Args:
+        starts: x, y and heading, shape (k, 3).
+    """
+    points = starts[:, :2]
+    along = np.stack([np.cos(starts[:, 2]), np.sin(starts[:, 2])], axis=1)
+    aside = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    found: list[np.ndarray] = []
+    for i, at in enumerate(points):
+        places = [at - 0.28 * along[i], at + 0.28 * aside[i], at - 0.28 * aside[i]]
+        taken = np.array([*np.delete(points, i, axis=0), *found])
+        room = [float(np.hypot(*(taken - place).T).min(initial=np.inf)) for place in places]
+        found.append(places[0] if room[0] > 0.35 else places[int(np.argmax(room))])
+    return found

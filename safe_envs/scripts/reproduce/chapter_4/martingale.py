@@ -17,6 +17,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import rate_interval
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_4 import reciprocal_inputs as scalar
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
@@ -238,9 +239,11 @@ def _draw_bound(axes: Axes, data: dict[str, Any]) -> None:
         axes.plot(time[1:], 100 * np.array(closed), **dotted)
         axes.axhline(100 * curve["bound"], color=color, **dashed)
     axes.plot([], [], label="closed form", **dotted)
-    axes.plot([], [], color="black", label="h/c of the same colour", **dashed)
+    axes.plot([], [], color="black", label="$h/c$ of the same colour", **dashed)
     limits = {"ylim": (35, 101), "xlim": (0, HORIZON)}
-    axes.set(xlabel="time (s)", ylabel="safe so far (%)", title="(b)", **limits)
+    axes.set(
+        xlabel=labelled("time", "s"), ylabel=labelled("safe so far", "%"), title="(b)", **limits
+    )
 
 
 ARTEFACTS = (

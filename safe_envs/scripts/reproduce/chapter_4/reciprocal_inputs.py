@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from safe_envs.agents import make_problem
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Claim
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
@@ -79,6 +80,7 @@ def draw_inputs(axes: Axes, data: dict[str, Any]) -> None:
     near = np.array(data["h"]) < 0.5
     h, what = np.array(data["h"])[near], ("no noise", rf"$\sigma$ = {NOISE:g}")
     for (name, values), color, noise in zip(data["asked"].items(), COLORS[:2], what, strict=True):
-        axes.plot(h, -np.array(values)[near], color=color, linewidth=2, label=f"{name}, {noise}")
-    labels = {"xlabel": "h = 1 - x, edge at the left", "ylabel": "minimum effort -u (1/s)"}
+        axes.plot(h, -np.array(values)[near], color=color, linewidth=1.5, label=f"{name}, {noise}")
+    labels = {"xlabel": "$h = 1 - x$, edge at the left"}
+    axes.set_ylabel(labelled("minimum effort $-u$", "1/s"))
     axes.set(xscale="log", yscale="log", title="(a)", **labels)

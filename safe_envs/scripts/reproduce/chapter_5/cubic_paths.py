@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import COLORS, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_5.cubic import CBF, ENV, LEVELS, SETTINGS
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import repeated
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER, EPISODES, measured
@@ -199,9 +199,9 @@ def _draw_paths(figure: Figure, outcome: Findings) -> None:
         axes.plot(*line.T, label="other starts", **thin)
         axes.plot(*line[0], "o", color=COLORS[4], markersize=2.5)
     label = "the same start in all figures"
-    axes.plot(*lines[0].T, color=COLORS[0], linewidth=2.2, label=label)
+    axes.plot(*lines[0].T, color=COLORS[0], linewidth=1.6, label=label)
     axes.plot(*lines[0][0], "o", color="black", markersize=4, zorder=3)
-    axes.plot(0.0, 0.0, "+", color="black", markersize=9, markeredgewidth=1.5)
+    axes.plot(0.0, 0.0, "+", color="black", markersize=6, markeredgewidth=1.5)
     low, high = (-3.2, -2.3), (2.2, 2.3)
     grid = np.meshgrid(*[np.linspace(*ends, 300) for ends in zip(low, high, strict=True)])
     h = compile_function(problem.plant.states, (problem.barriers[0].expression,), "arrays")(*grid)[
@@ -209,12 +209,14 @@ def _draw_paths(figure: Figure, outcome: Findings) -> None:
     ]
     axes.contourf(*grid, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0)
     axes.contour(*grid, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
-    axes.text(0.98, 0.03, "unsafe", transform=axes.transAxes, ha="right", color=QUIET)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.set(xlabel="$x_1$", ylabel="$x_2$", title=outcome.data["name"])
     handles, labels = axes.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
-    add_legend(figure, [*reversed(kinds.values()), Patch(color=UNSAFE, alpha=0.35, label="h < 0")])
+    add_legend(
+        figure,
+        [*reversed(kinds.values()), Patch(color=UNSAFE, alpha=0.35, label="unsafe: $h < 0$")],
+    )
 
 
 def _values(sample: Workload) -> dict[str, Any]:

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import sympy as sp
 from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient, ito_correction
+from safe_envs.scripts.figures.labels import labelled, quantity
 from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     REPETITIONS,
@@ -91,7 +91,7 @@ def learning_outcome(
     term = compile_function((problem.plant.states[state],), (expression,), "arrays")
     missed = {name: values - term(first.x[:, state])[0] for name, values in first.labels.items()}
     grid = np.linspace(*problem.sampling_domain.region[state], 200)
-    unit = f" ({problem.states[state].unit})" if problem.states[state].unit else ""
+    shown = problem.states[state]
     return Findings(
         numbers=[
             root_mean_square("rms of the analytic term", repaired.truth.ravel()),
@@ -106,7 +106,7 @@ def learning_outcome(
         ],
         printed_formula=[printed.number, root_mean_square(_LABELS, missed["printed"])],
         data={
-            "state": f"${sp.latex(problem.plant.states[state])}${unit}",
+            "state": quantity(shown.symbol.name, shown.unit),
             "grid": grid.tolist(),
             "term": term(grid)[0].tolist(),
             "points": first.x[:, state].tolist(),
@@ -223,16 +223,18 @@ def draw_learning(figure: Figure, outcome: Findings) -> None:
     data = outcome.data
     panels = list(figure.subplots(1, 2))
     for axes, key in zip(panels, ("repaired", "printed"), strict=True):
-        wide: dict[str, Any] = {"color": COLORS[3], "linewidth": 5.0, "alpha": 0.7}
+        wide: dict[str, Any] = {"color": COLORS[3], "linewidth": 4.0, "alpha": 0.7}
         labels, network = data[key]["labels"], data[key]["network"]
         axes.plot(data["grid"], data["term"], label="analytic term", **wide)
-        axes.plot(data["points"], labels, "k.", markersize=5, label="training data")
+        axes.plot(data["points"], labels, "k.", markersize=3.5, label="training data")
         dots: dict[str, Any] = {"color": COLORS[0], "markersize": 2.2}
         axes.plot(data["validation"], network, ".", label="network, other states", **dots)
         axes.axhline(0.0, color=QUIET, linewidth=0.6, zorder=0)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 2))
         axes.set_xlabel(data["state"])
     low, high = (float(np.ptp(axes.get_ylim())) for axes in panels)
-    panels[0].set(title="(a) repaired estimator", ylabel="noise part of the generator of h (1/s)")
+    panels[0].set(
+        title="(a) repaired estimator", ylabel=labelled("noise part of the generator of $h$", "1/s")
+    )
     panels[1].set_title(f"(b) printed estimator\n(other scale: {high / low:.3g} times that of (a))")
     add_legend(figure, panels[0].get_legend_handles_labels()[0])

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from safe_envs.agents import make_problem
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
@@ -94,11 +95,12 @@ def _draw_drift(figure: Figure, outcome: Findings) -> None:
     data = outcome.data
     panels = figure.subplots(1, 2)
     for i, (letter, unit, axes) in enumerate(
-        zip("ab", ("m/s²", "m/s"), panels, strict=True), start=1
+        zip("ab", ("m/s^2", "m/s"), panels, strict=True), start=1
     ):
         estimate = data[f"estimate {i}"], data[f"deviation {i}"]
         bayes.draw_estimate(axes, (data["v"], data[f"truth {i}"]), data["v"], *estimate, COLORS[0])
-        axes.set(xlabel="speed v (m/s)", ylabel=f"$f_{i}$ ({unit})", title=f"({letter}) $f_{i}$")
+        label = labelled(f"$f_{i}$", unit)
+        axes.set(xlabel=labelled("speed $v$", "m/s"), ylabel=label, title=f"({letter}) $f_{i}$")
     add_legend(figure, panels[0].get_legend_handles_labels()[0])
 
 

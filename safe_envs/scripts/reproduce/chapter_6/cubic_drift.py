@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
@@ -227,8 +228,8 @@ def _draw_drift(figure: Figure, outcome: Findings) -> None:
     for letter, axes, k in zip("abc", panels, bayes.REPETITIONS, strict=True):
         estimate = data[f"estimate {k}"], data[f"deviation {k}"]
         bayes.draw_estimate(axes, (line, line**3), data["x_1"], *estimate, COLORS[0])
-        axes.set(xlabel="$x_1$", title=f"({letter}) K = {k}")
-    panels[0].set_ylabel("$f_2$ (1/s)")
+        axes.set(xlabel="$x_1$", title=f"({letter}) $K$ = {k}")
+    panels[0].set_ylabel(labelled("$f_2$", "1/s"))
     add_legend(figure, panels[0].get_legend_handles_labels()[0])
 
 

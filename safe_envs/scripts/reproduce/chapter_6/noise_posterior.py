@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents import make_problem
+from safe_envs.scripts.figures.labels import labelled
 from safe_envs.scripts.figures.style import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
@@ -118,7 +119,7 @@ def _draw_levels(figure: Figure, outcome: Findings) -> None:
         name, style = f"$\\sigma_{i}$", {"color": COLORS[i - 1], "alpha": 0.6}
         axes.stairs(data[f"counts {i}"], data[f"edges {i}"], fill=True, label=name, **style)
         axes.axvline(data["truth"][i - 1], color="black", linewidth=1.4, label="true value")
-        axes.set(xlabel=f"{name} ({_pretty(number.unit)})", title=f"({letter}) {name}")
+        axes.set(xlabel=labelled(name, number.unit), title=f"({letter}) {name}")
         axes.locator_params(axis="x", nbins=4)
     panels[0].set_ylabel("draws")
     _draw_likelihoods(panels[2], outcome)
@@ -132,7 +133,7 @@ def _draw_likelihoods(axes: Axes, outcome: Findings) -> None:
     for row, numbers in enumerate((outcome.numbers, outcome.printed_formula)):
         for i, number in enumerate(numbers):
             # One above the other, for they are nearly equal.
-            style: dict[str, Any] = {"color": COLORS[i], "markersize": 6, "alpha": 0.8}
+            style: dict[str, Any] = {"color": COLORS[i], "markersize": 4.5, "alpha": 0.8}
             axes.plot(number.ours, row + 0.12 * (1 - 2 * i), "os"[i], **style)
     axes.axvline(truth, color="black", linewidth=1.0, zorder=0)
     low = outcome.printed_formula[0].ours
@@ -141,16 +142,12 @@ def _draw_likelihoods(axes: Axes, outcome: Findings) -> None:
         xscale="log",
         xlim=(low / 2, truth * 2),
         ylim=(-0.6, 1.6),
-        xlabel="median of $\\sigma$ (units of a, b)",
+        xlabel="median of $\\sigma$ [units of a, b]",
         title="(c) both likelihoods",
     )
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes.minorticks_off()
     axes.set_yticks([0, 1], ["corrected", "printed"], rotation=90, va="center")
-
-
-def _pretty(unit: str) -> str:
-    return unit.replace("sqrt(s)", "$\\sqrt{\\mathrm{s}}$")
 
 
 def _values(sigma: str, sample: Workload) -> dict[str, Any]:

@@ -7,10 +7,13 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, get_type_hints
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.errors import require_whole
+from safe_envs.scripts.figures.style import STYLE
+from safe_envs.scripts.options.figure_options import WIDTHS
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,7 @@ class Artefact:
         errata: errors of the thesis that are not in ours, with the equation.
         argument: why it cannot be reproduced, for a verdict that says so.
         draw: fills an empty figure from the outcome; None for a table.
-        size: of the figure, in inches.
+        size: of the figure; its shape is kept, and its width that of two columns of a paper.
     """
 
     name: str
@@ -227,3 +230,17 @@ class Artefact:
     argument: str = ""
     draw: Callable[[Figure, Findings], None] | None = None
     size: tuple[float, float] = (7.0, 4.2)
+
+    def picture(self, outcome: Findings) -> Figure:
+        """Return the figure of an artefact that has one, two columns of a paper wide.
+
+        Args:
+            outcome: of the artefact.
+        """
+        width, height = self.size
+        wide = WIDTHS["double"]
+        with mpl.rc_context(STYLE):
+            figure = Figure(figsize=(wide, wide * height / width))
+            if self.draw is not None:
+                self.draw(figure, outcome)
+        return figure

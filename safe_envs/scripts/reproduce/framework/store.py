@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from matplotlib.figure import Figure
 
 from safe_envs.agents.jobs.fingerprint import file_checksum, package_versions, source_checksum
 from safe_envs.agents.jobs.store import ResultStore, reading
-from safe_envs.atomic_io import write_atomically
+from safe_envs.scripts.figures.saving import save
 from safe_envs.scripts.figures.style import STYLE
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
 
-_SUFFIXES = (".png", ".svg")
+_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def configuration(artefact: Artefact, sample: Workload) -> dict[str, Any]:
@@ -107,17 +106,11 @@ def _drawn(folder: Path, artefact: Artefact, outcome: Findings) -> dict[str, str
     if artefact.draw is None:
         return {}
     pictures = {}
-    with mpl.rc_context({**STYLE, "svg.hashsalt": artefact.name}):
-        figure = Figure(figsize=artefact.size)
-        artefact.draw(figure, outcome)
+    with mpl.rc_context(STYLE):
+        figure = artefact.picture(outcome)
         for suffix in _SUFFIXES:
-            # Without a date, so that equal results are equal files.
-            metadata = {"Date": None} if suffix == ".svg" else {"Software": None}
             picture = folder / f"{artefact.name}{suffix}"
-            write_atomically(
-                picture,
-                lambda part, metadata=metadata: figure.savefig(part, dpi=150, metadata=metadata),
-            )
+            save(figure, picture)
             pictures[suffix] = file_checksum(picture)
             # Its layout takes as long as writing it, and the next one is to look the same.
             figure.set_layout_engine("none")
