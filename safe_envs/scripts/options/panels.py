@@ -21,7 +21,7 @@ PANELS: dict[str, str] = {
     ),
     "Speed": "num-envs jobs engine threads quick seconds",
     "Output": (
-        "out folder json latex episodes-out timing plot pictures markdown page worst tensorboard"
+        "out folder json latex episodes-out timing plot size pictures markdown page worst tensorboard"
         " compare float32 name quiet"
     ),
     "Other": "version install-completion show-completion help",
