@@ -66,6 +66,17 @@ def shortened(given: Any, most: int = 120) -> str:
     return f"{text[:half]}...({len(text) - 2 * half} more characters)...{text[-half:]}"
 
 
+def unknown(what: str, name: Any, allowed: Iterable[str]) -> ConfigurationError:
+    """Return the error of a name that nobody knows.
+
+    Args:
+        what: is named.
+        name: what was given.
+        allowed: names.
+    """
+    return ConfigurationError(f"unknown {what} {shown(name)}; {nearest(str(name), allowed)}")
+
+
 _FEW = 6
 """So many allowed names are listed in full, of more of them the nearest three."""
 

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.agents.policies.registry import is_place
+from safe_envs.agents.policies.names import is_place
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.hyperparameters import ALGORITHMS
 from safe_envs.agents.training.study import Variant

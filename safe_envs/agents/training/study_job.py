@@ -13,7 +13,7 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum, json_checksum
 from safe_envs.agents.jobs.store import ResultStore
-from safe_envs.agents.policies.registry import policy_file
+from safe_envs.agents.policies.names import policy_file
 from safe_envs.agents.training.config import Training
 from safe_envs.errors import NumericalError, SafeEnvsError
 from safe_envs.wrappers.conditions.text_parts import files_of

@@ -43,7 +43,10 @@ Engine = Annotated[
         ),
     ),
 ]
-FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
+PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "svgz", "tif", "tiff", "webp")
+"""Suffixes of pictures, all of which matplotlib writes: to ask it takes longer than all else."""
+
+FORMATS = ".png, .pdf, .svg, .eps, .jpg, .tif or .webp."
 
 
 def require_outputs(
@@ -95,15 +98,10 @@ def require_outputs(
 
 def _require_format(path: Path) -> None:
     """Raise ConfigurationError unless the suffix of a path names a format that can be drawn."""
-    # Not imported before it is needed: completion has to be quick.
-    from matplotlib.backend_bases import FigureCanvasBase
-
-    # pgf is left out: it needs a TeX installation.
-    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})
     suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in formats:
+    if suffix not in PLOT_FORMATS:
         raise ConfigurationError(
-            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}"
+            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, PLOT_FORMATS)}"
         )
 
 
