@@ -33,5 +33,7 @@ def test_every_id_and_command_is_listed():
 
 
 def test_its_picture_is_there():
-    for path in re.findall(r"!\[.*?\]\((.*?)\)", README):
-        assert (ROOT / path).is_file()
+    shown = re.findall(r"!\[.*?\]\((.*?)\)|(?:src|srcset)=\"(.*?)\"", README)
+    assert shown
+    for written, tagged in shown:
+        assert (ROOT / (written or tagged)).is_file()

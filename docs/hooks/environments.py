@@ -212,8 +212,9 @@ def _picture(env: Any) -> tuple[np.ndarray, str]:
     seen = f" The minimum of $h$ so far is {info['h_min']:.3g}{why}." if info["h_min"] < 0 else ""
     return filtered.render(), (
         f"The nominal controller under {_link(problem)} after {count * problem.dt:g} s, seed 0."
-        " Green: the safe set; hatched: $h < 0$. The panel shows the executed action (bar), the"
-        f" nominal action (diamond), and $h$ over time.{seen}"
+        " Green: the safe set; hatched: $h < 0$. The axes have the units of the [states](#states);"
+        " time is in s. The panel shows the executed action (bar) and the nominal action"
+        f" (diamond) in physical units, and $h$ over time.{seen}"
     )
 
 

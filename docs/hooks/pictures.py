@@ -26,7 +26,7 @@ from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
 
 WIDE, NARROW = (1, 2), (2, 1)
-"""Rows and columns of a picture with two parts, on a desktop and on a phone."""
+"""Parts of a picture from top to bottom and from left to right, on a desktop and on a phone."""
 
 _GRID = 241
 _EPISODES = 1000

@@ -168,7 +168,7 @@ class CubicSDE(SystemEnv):
     condition $A V + V <= d$ at the cost $u^2 + d^2$.
 
     ## Start
-    `near-edge`: uniform where $0 < h < .5$ in the box from $(-3, -2)$ to $(1, 2)$.
+    `near-edge`: uniform where $0 < h < .5$ in the rectangle from $(-3, -2)$ to $(1, 2)$.
 
     ## Episode end
     Terminated outside the workspace, truncated after 2 s = 200 steps.

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import nbformat
+import PIL.Image
 import pytest
 import yaml
 from IPython.display import Image
@@ -226,6 +227,21 @@ def test_the_repository_is_that_of_the_project_file(hook: Any, tmp_path: Path):
     assert repository.on_page_markdown(text, SimpleNamespace(repo_url=None)) == "before "
     (tmp_path / "pyproject.toml").write_text('[project.urls]\nRepository = "https://a.b/c"\n')
     assert repository.repository_url(tmp_path / "pyproject.toml") == "https://a.b/c"
+
+
+def test_the_animation_of_the_home_page_is_small_and_has_a_still_for_reduced_motion():
+    film, still = (DOCS / "assets" / f"compare.{suffix}" for suffix in ("gif", "png"))
+    assert film.stat().st_size <= 400_000
+    with PIL.Image.open(film) as moving, PIL.Image.open(still) as last:
+        assert moving.size == last.size
+        assert getattr(moving, "n_frames", 1) > 10
+    for page, folder in ((DOCS / "index.md", ""), (ROOT / "README.md", "docs/")):
+        picture = page.read_text().split("<picture>")[1].split("</picture>")[0]
+        assert f'<img src="{folder}assets/compare.gif"' in picture
+        assert (
+            f'srcset="{folder}assets/compare.png" media="(prefers-reduced-motion: reduce)"'
+            in picture
+        )
 
 
 def test_abbreviations_are_in_the_glossary():
