@@ -21,8 +21,8 @@ PANELS: dict[str, str] = {
     ),
     "Speed": "num-envs jobs engine threads quick seconds",
     "Output": (
-        "out folder json latex episodes-out timing plot size pictures markdown page worst tensorboard"
-        " compare float32 name quiet"
+        "out folder json latex episodes-out timing plot size pictures markdown page worst"
+        " tensorboard compare float32 name quiet"
     ),
     "Other": "version install-completion show-completion help",
 }
