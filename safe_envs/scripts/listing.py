@@ -15,29 +15,13 @@ def list_envs(json: Json = None) -> None:
     """List the registered envs."""
     from rich.text import Text
 
-<<<<<<< HEAD
-    from safe_envs.registry import env_class, make_problem
     from safe_envs.scripts.reports.tables import print_columns
-    from safe_envs.text_tables import Column
-=======
-    from safe_envs.scripts.reports.tables import make_table
     from safe_envs.systems.summary import summaries
->>>>>>> 17ac74e34a9daaf833769a2c63186ad0480e4b63
+    from safe_envs.text_tables import Column
 
     require_result(json)
     rows = []
     for env_id in ENV_IDS:
-<<<<<<< HEAD
-        about = " ".join((env_class(env_id).__doc__ or "").strip().partition("\n\n")[0].split())
-        rows.append({"env_id": env_id, "about": about, **_defaults(make_problem(env_id))})
-    ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")
-    abouts = Column("what is to be kept safe", tuple(row["about"] for row in rows), "p")
-    settings = [
-        Column(name, tuple(_cell(name, row[name]) for row in rows), "l", part=1 + (i > 2))
-        for i, name in enumerate(_COLUMNS)
-    ]
-    print_columns(stdout(), [ids], [abouts, *settings])
-=======
         found = summaries()[env_id]
         values = {
             "states": len(found.states),
@@ -49,10 +33,13 @@ def list_envs(json: Json = None) -> None:
             "horizon": found.horizon,
         }
         rows.append({"env_id": env_id, "about": found.about, **values})
-        cells = [_cell(name, value) for name, value in values.items()]
-        table.add_row(f"[bold]{env_id}[/]\n{escape(found.about)}\n", *cells)
-    stdout().print(table)
->>>>>>> 17ac74e34a9daaf833769a2c63186ad0480e4b63
+    ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")
+    abouts = Column("what is to be kept safe", tuple(row["about"] for row in rows), "p")
+    settings = [
+        Column(name, tuple(_cell(name, row[name]) for row in rows), "l", part=1 + (i > 2))
+        for i, name in enumerate(_COLUMNS)
+    ]
+    print_columns(stdout(), [ids], [abouts, *settings])
     write_result(json, lambda: {"envs": rows})
 
 
