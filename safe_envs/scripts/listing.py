@@ -23,19 +23,16 @@ def list_envs(json: Json = None) -> None:
     rows = []
     for env_id in ENV_IDS:
         found = summaries()[env_id]
-        rows.append(
-            {
-                "env_id": env_id,
-                "about": found.about,
-                "states": len(found.states),
-                "inputs": len(found.inputs),
-                "degree": list(found.degree.values()),
-                "filter": found.filter,
-                "noise": list(found.noise.values()),
-                "dt": found.dt,
-                "horizon": found.horizon,
-            }
-        )
+        values = {
+            "states": len(found.states),
+            "inputs": len(found.inputs),
+            "degree": list(found.degree.values()),
+            "filter": found.filter,
+            "noise": list(found.noise.values()),
+            "dt": found.dt,
+            "horizon": found.horizon,
+        }
+        rows.append({"env_id": env_id, "about": found.about, **values})
     ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")
     abouts = Column("what is to be kept safe", tuple(row["about"] for row in rows), "p")
     settings = [
