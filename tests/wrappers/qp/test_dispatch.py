@@ -255,9 +255,9 @@ import numpy as np
 from safe_envs.wrappers.qp import dispatch
 for k, m in ((1, 2), (3, 1), (3, 2), (3, 4)):
     for solver in dispatch.SOLVERS:
+        rng = np.random.default_rng(0)
         dispatch.prepare(k, m, solver)
         known = set(sys.modules)
-        rng = np.random.default_rng(0)
         for shift in (0.0, 5.0):
             a, b, v = rng.normal(size=(k, m)), rng.normal(size=k) - shift, rng.normal(size=m)
             ends = [-1.0] * m, [1.0] * m, [1.0] * m, [1.0] * k
