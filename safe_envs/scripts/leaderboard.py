@@ -130,6 +130,7 @@ def leaderboard(
         leaderboard_notes,
         leaderboard_tables,
     )
+    from safe_envs.scripts.reports.tables import print_columns
 
     require_result(json_file)
     if all_envs and env_ids:
@@ -166,9 +167,9 @@ def leaderboard(
     if markdown:
         print_markdown(written)
     else:
-        for heading, table in leaderboard_tables(report):
+        for heading, columns in leaderboard_tables(report):
             say(stdout(), f"\n{heading}")
-            stdout().print(table)
+            print_columns(stdout(), columns[:1], columns[1:])
         for note in leaderboard_notes(report):
             say(stdout(), f"Note: {note}")
     settings = {"algo": algo, "seeds": study.seeds, "seed": seed, "episodes": study.episodes}

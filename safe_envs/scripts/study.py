@@ -20,7 +20,7 @@ from safe_envs.scripts.options.console import (
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.tables import print_whole
+from safe_envs.scripts.reports.tables import print_columns
 
 _QUICK: dict[str, Any] = {"n_timesteps": 1024, "eval_freq": 1024, "eval_episodes": 5}
 
@@ -86,7 +86,7 @@ def study(
     from safe_envs.agents.training.study import Study, run_study
     from safe_envs.agents.training.study_file import read_study
     from safe_envs.agents.training.study_summary import differences, summaries
-    from safe_envs.scripts.reports.study_report import study_markdown, study_notes, study_table
+    from safe_envs.scripts.reports.study_report import study_columns, study_markdown, study_notes
 
     require_result(json_file)
     read = read_study(what)
@@ -117,7 +117,8 @@ def study(
             print_markdown(f"**{heading}**\n\n{study_markdown(rows, against is not None)}\n")
         else:
             say(stdout(), f"\n{heading}")
-            print_whole(stdout(), study_table(rows, against is not None))
+            columns = study_columns(rows, against is not None)
+            print_columns(stdout(), columns[:2], columns[2:])
     for note in study_notes(found):
         say(stdout(), f"Note: {note}")
     write_result(json_file, lambda: document)

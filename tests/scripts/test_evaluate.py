@@ -489,3 +489,23 @@ def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):
         ):
             assert text in svg_texts(name)
     assert [p.name for p in Path().iterdir()] == [name]
+
+
+def test_latex_goes_to_a_file_or_alone_to_stdout(safe_envs_command, tmp_path):
+    asked = ("evaluate", "Scalar-v0", "--horizon", 0.1, "--episodes", 5, "--filter", "cbf")
+    status, out, err = safe_envs_command(*asked, "--latex", "-")
+    assert (status, err) == (0, "")
+    lines = out.splitlines()
+    assert (lines[0], lines[-1]) == (r"% \usepackage{booktabs}", r"\end{table}")
+    status, out, _ = safe_envs_command(*asked, "--latex", "table.tex", "--timing")
+    assert status == 0
+    assert Path("table.tex").read_text().splitlines() == lines
+    assert "steps/s" in out
+    assert "toprule" not in out
+    status, _, err = safe_envs_command(*asked, "--latex", "nowhere/table.tex")
+    assert (status, "nowhere does not exist" in err) == (2, True)
+    status, _, err = safe_envs_command(*asked[:-4], "--rare", "--latex", "table.tex")
+    assert (status, "--rare does not go with --latex" in err) == (2, True)
+    both = ("--latex", "same.txt", "--json", "same.txt")
+    assert "would overwrite" in safe_envs_command(*asked, *both)[2]
+    assert "would mix" in safe_envs_command(*asked, "--latex", "-", "--json", "-")[2]

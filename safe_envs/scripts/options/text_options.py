@@ -72,6 +72,10 @@ def require_outputs(
     Raises:
         ConfigurationError: one cannot.
     """
+    if json == latex == STDOUT:
+        raise ConfigurationError(
+            "--json - and --latex - would mix on standard output; give one of them a file"
+        )
     taken = {os.path.realpath(path): f"{option} {path}" for option, path in inputs}
     for option, path in (
         ("--out", out),

@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.best_text import best_notes, best_text
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.training.seed_statistics import caution
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.text_tables import Column, columns_of
 
 if TYPE_CHECKING:
     from safe_envs.agents.training.leaderboard import LeaderboardEntry
@@ -88,8 +86,8 @@ def short_name(env_id: str) -> str:
     return env_id.removeprefix("safe_envs/").removesuffix("-v0")
 
 
-def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]:
-    """Yield a heading and a table for each env, then those over all envs.
+def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, list[Column]]]:
+    """Yield a heading and the columns for each env, then those over all envs.
 
     Args:
         report: to tell.
@@ -103,19 +101,17 @@ def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]
             "\nunsafe\nsteps",
             "\n\nmin",
         )
-        table = make_table("lr", "variant", *titles)
-        for entry in report.of(env_id):
-            table.add_row(_name(report, entry), *_cells(entry, unit=""))
+        rows = [(_name(report, entry), *_cells(entry, unit="")) for entry in report.of(env_id)]
         best = report.best_of(env_id)
         if best is not None:
             safest = best_text(best).replace(_UNIT, "")
-            table.add_row("best", safest, *[_NONE] * (len(titles) - 1))
-        yield f"{short_name(env_id)}, filter {_filter(report, env_id)}", table
+            rows.append(("best", safest, *[_NONE] * (len(titles) - 1)))
+        columns = columns_of("lr", ("variant", *titles), rows)
+        yield f"{short_name(env_id)}, filter {_filter(report, env_id)}", columns
     if len(report.found.study.env_ids) > 1 and report.over_envs:
-        table = make_table("lr", "variant", "safe: IQM, 95 %")
-        for name, estimate in report.over_envs.items():
-            table.add_row(name, _percent(estimate))
-        yield f"All {len(report.found.study.env_ids)} envs", table
+        rows = [(name, _percent(estimate)) for name, estimate in report.over_envs.items()]
+        columns = columns_of("lr", ("variant", "safe: IQM, 95 %"), rows)
+        yield f"All {len(report.found.study.env_ids)} envs", columns
 
 
 def leaderboard_notes(report: LeaderboardReport) -> list[str]:

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-from rich.text import Text
-
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.training.seed_statistics import caution
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.text_tables import Column, columns_of
 
 if TYPE_CHECKING:
     from safe_envs.agents.training.seed_statistics import SeedEstimate
@@ -32,24 +29,21 @@ _PERCENT = ("safety", "interventions", "safety_alone")
 _WITHOUT_INTERVAL = ("violations", "seconds")
 
 
-def study_table(rows: Sequence[AgentSummary], differences: bool = False) -> Table:
-    """Return a table with a row for each agent and filter.
+def study_columns(rows: Sequence[AgentSummary], differences: bool = False) -> list[Column]:
+    """Return columns with an entry for each agent and filter; the first two are their names.
 
     Args:
         rows: of an env.
         differences: whether they are differences, which have a sign.
     """
-    table = make_table("lr", "agent", "filter", *_TITLES.values())
-    for row in rows:
-        # The names are a user's: brackets in them are no markup.
-        table.add_row(Text(row.name), Text(row.filter), *_cells(row, differences))
-    return table
+    cells = [(row.name, row.filter, *_cells(row, differences)) for row in rows]
+    return columns_of("llr", ("agent", "filter", *_TITLES.values()), cells)
 
 
 def study_markdown(rows: Sequence[AgentSummary], differences: bool = False) -> str:
     """Return two tables in Markdown: one with the filter, one without it and of the training.
 
-    One wide table would not fit a page. See `study_table` for the arguments.
+    One wide table would not fit a page. See `study_columns` for the arguments.
     """
     filtered = _markdown(
         ["agent", "filter", *map(_one_line, _FILTERED)],

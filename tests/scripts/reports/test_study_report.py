@@ -9,8 +9,8 @@ from rich.console import Console
 
 from safe_envs.agents.training.seed_statistics import SeedEstimate
 from safe_envs.agents.training.study_summary import AgentSummary
-from safe_envs.scripts.reports.study_report import study_markdown, study_table
-from safe_envs.scripts.reports.tables import print_whole
+from safe_envs.scripts.reports.study_report import study_columns, study_markdown
+from safe_envs.scripts.reports.tables import print_columns
 
 MOST_COLUMNS = 6
 
@@ -55,7 +55,8 @@ def test_differences_have_a_sign(which):
 
 def printed(rows):
     console = Console(file=io.StringIO(), width=100)
-    print_whole(console, study_table(rows))
+    columns = study_columns(rows)
+    print_columns(console, columns[:2], columns[2:])
     return console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
 
 
