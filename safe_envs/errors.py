@@ -91,3 +91,18 @@ def require_whole(name: str, value: Any, least: int) -> None:
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
         raise ConfigurationError(f"{name} = {shown(value)}; give a whole number from {least}")
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return a value that is True or False.
+
+    Args:
+        name: of the argument, for the error.
+        value: what was given.
+
+    Raises:
+        ConfigurationError: it is anything else, such as the text "false", which counts as true.
+    """
+    if not isinstance(value, bool):
+        raise ConfigurationError(f"{name} = {shown(value)}; give True or False")
+    return value

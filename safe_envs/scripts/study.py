@@ -98,7 +98,8 @@ def study(
             lambda text: print(text, file=sys.stderr, flush=True),
         )
     document: dict[str, Any] = {"study": what, "settings": _settings(asked, quick)}
-    document |= {"versions": package_versions(), "rows": [asdict(row) for row in found.rows]}
+    document |= {"against": against, "versions": package_versions()}
+    document |= {"rows": [asdict(row) for row in found.rows], "missing": found.reasons()}
     for env_id in asked.env_ids:
         rows = (
             summaries(found, read.agents, env_id)
@@ -115,6 +116,7 @@ def study(
     for note in study_notes(found):
         say(stdout(), f"Note: {note}")
     write_result(json_file, lambda: document)
+    found.require_all()
 
 
 def _settings(asked: Any, quick: bool) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def make_policy(
         return _NAMED[name](problem)
     if name in plugin_names(POLICY_PLUGINS):
         return as_policy(load_plugin(POLICY_PLUGINS, name), problem, spaces)
-    if _is_place(name):
+    if is_place(name):
         return as_policy(load_object(name), problem, spaces)
     if saved_policy_file(Path(name)) is not None:
         from safe_envs.agents.policies.network import load_policy
@@ -128,7 +128,7 @@ def policy_file(name: str) -> Path | None:
     """Return the file that `make_policy` reads; None for the name of a policy and MODULE:NAME."""
     if name in POLICIES or name in plugin_names(POLICY_PLUGINS):
         return None
-    if _is_place(name):
+    if is_place(name):
         source = name.rpartition(":")[0]
         return Path(source) if source.endswith(".py") else None
     return saved_policy_file(Path(name)) or Path(name)
@@ -141,15 +141,16 @@ def policy_module(name: str) -> str | None:
     if name in plugin_names(POLICY_PLUGINS):
         return module_of(POLICY_PLUGINS, name)
     source = name.rpartition(":")[0]
-    return source if _is_place(name) and not source.endswith(".py") else None
+    return source if is_place(name) and not source.endswith(".py") else None
 
 
 def absolute_policy(name: str) -> str:
     """Return the name of a policy with the whole path of its file, valid in any folder."""
-    if _is_place(name):
+    if is_place(name):
         return resolved(name)
     return os.path.realpath(name) if policy_file(name) and os.path.exists(name) else name
 
 
-def _is_place(name: str) -> bool:
+def is_place(name: str) -> bool:
+    """Return whether a text is FILE.py:NAME or MODULE:NAME of a policy, which runs that code."""
     return _PLACE.fullmatch(name) is not None and not os.path.exists(name)

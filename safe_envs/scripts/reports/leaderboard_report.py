@@ -10,6 +10,7 @@ from rich.table import Table
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.agents.training.seed_statistics import caution
 from safe_envs.scripts.reports.best_text import best_notes, best_text
 from safe_envs.scripts.reports.tables import make_table
 
@@ -78,10 +79,7 @@ class LeaderboardReport:
                 for key, each in self.best.items()
             },
             "frontiers": dict(self.frontiers),
-            "missing": [
-                {"env_id": env_id, "variant": variant, "k": k, "reason": reason}
-                for (env_id, variant, k), reason in self.found.missing.items()
-            ],
+            "missing": self.found.reasons(),
         }
 
 
@@ -107,7 +105,7 @@ def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]
         )
         table = make_table("lr", "variant", *titles)
         for entry in report.of(env_id):
-            table.add_row(entry.variant, *_cells(entry, unit=""))
+            table.add_row(_name(report, entry), *_cells(entry, unit=""))
         best = report.best_of(env_id)
         if best is not None:
             safest = best_text(best).replace(_UNIT, "")
@@ -131,6 +129,7 @@ def leaderboard_notes(report: LeaderboardReport) -> list[str]:
         " interval of the episodes are those of these agents alone. Unsafe steps are those of a"
         " training, min is its processor time in minutes.",
     ]
+    notes += filter(None, [caution(report.found.study.seeds)])
     for found in report.best.values():
         if not isinstance(found, str):
             notes += best_notes(found)[:1]
@@ -153,7 +152,7 @@ def leaderboard_markdown(report: LeaderboardReport, pictures: Mapping[str, str])
     titles = ["variant", "safe", "of the episodes", "return", "unsafe steps", "min"]
     for env_id in report.found.study.env_ids:
         name, best = short_name(env_id), report.best_of(env_id)
-        rows = [[entry.variant, *_cells(entry)] for entry in report.of(env_id)]
+        rows = [[_name(report, entry), *_cells(entry)] for entry in report.of(env_id)]
         if best is not None:
             rows.append(["best", best_text(best), *[_NONE] * (len(titles) - 2)])
         picture = ""
@@ -176,6 +175,12 @@ def _markdown(titles: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def _name(report: LeaderboardReport, entry: LeaderboardEntry) -> str:
+    """Return the name of a variant, with the number of its seeds where trainings failed."""
+    seeds = entry.safety.seeds
+    return entry.variant + (f", {seeds} seeds" if seeds < report.found.study.seeds else "")
+
+
 def _filter(report: LeaderboardReport, env_id: str) -> str:
     """Return the text of the env's own filter."""
     from safe_envs.registry import make_problem
@@ -196,7 +201,8 @@ def _count(value: float) -> str:
     for scale, letter in ((1e6, " M"), (1e3, " k")):
         if value >= 9.9995 * scale:
             return f"{value / scale:.{1 if value < 99.95 * scale else 0}f}{letter}"
-    return f"{value:,.0f}"
+    # What is seldom is not never.
+    return f"{value:,.{1 if 0.0 < value <= 0.5 else 0}f}"
 
 
 def _percent(estimate: SeedEstimate) -> str:

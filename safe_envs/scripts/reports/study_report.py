@@ -6,7 +6,10 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from rich.table import Table
+from rich.text import Text
 
+from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.agents.training.seed_statistics import caution
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
@@ -38,7 +41,8 @@ def study_table(rows: Sequence[AgentSummary], differences: bool = False) -> Tabl
     """
     table = make_table("lr", "agent", "filter", *_TITLES.values())
     for row in rows:
-        table.add_row(row.name, row.filter, *_cells(row, differences))
+        # The names are a user's: brackets in them are no markup.
+        table.add_row(Text(row.name), Text(row.filter), *_cells(row, differences))
     return table
 
 
@@ -49,7 +53,7 @@ def study_markdown(rows: Sequence[AgentSummary], differences: bool = False) -> s
     """
     filtered = _markdown(
         ["agent", "filter", *map(_one_line, _FILTERED)],
-        [[row.name, f"`{row.filter}`", *_cells(row, differences, _FILTERED)] for row in rows],
+        [[row.name, _code(row.filter), *_cells(row, differences, _FILTERED)] for row in rows],
     )
     # With several filters an agent has several rows, which differ in the first table only.
     alone = {row.name: _cells(row, differences, _ALONE) for row in rows}
@@ -64,8 +68,10 @@ def study_notes(found: StudyResult) -> list[str]:
     """Return what has to be known to read the tables, and what is missing in them."""
     study = found.study
     notes = [
-        f"interquartile means over {study.seeds} seeds with the 95 % bootstrap interval over them,"
-        f" {study.episodes} episodes each; s is the processor time of a training."
+        f"interquartile means over {study.seeds} seed{'s' if study.seeds > 1 else ''} with the 95 %"
+        f" bootstrap interval, {study.episodes} episodes each; s is the processor time of a"
+        " training.",
+        *filter(None, [caution(study.seeds)]),
     ]
     for (env_id, variant, k), reason in found.missing.items():
         which = variant if k is None else f"{variant}, training {k}"
@@ -75,6 +81,11 @@ def study_notes(found: StudyResult) -> list[str]:
 
 def _markdown(titles: list[str], lines: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *lines))
+
+
+def _code(text: str) -> str:
+    """Return a text as code in a cell, which a bar such as that of a specification would end."""
+    return f"`{text.replace('|', chr(92) + '|')}`"
 
 
 def _one_line(name: str) -> str:
@@ -88,9 +99,14 @@ def _cells(row: AgentSummary, differences: bool, names: Iterable[str] = _TITLES)
 def _text(name: str, estimate: SeedEstimate | None, differences: bool) -> str:
     if estimate is None:
         return "-"
-    factor = 100.0 if name in _PERCENT else 1.0
-    ends = [factor * end for end in (estimate.value, estimate.low, estimate.high)]
-    digits = 0 if name in _WITHOUT_INTERVAL else 1
+    ends = (estimate.value, estimate.low, estimate.high)
+    if name in _PERCENT and not differences:
+        return percent_in(*ends).replace(" %", "")
     sign = "+" if differences else ""
-    value, low, high = (f"{end:{sign},.{digits}f}" for end in ends)
-    return value if name in _WITHOUT_INTERVAL else f"{value} [{low}, {high}]"
+    if name in _WITHOUT_INTERVAL:
+        # What is seldom is not never.
+        digits = 1 if 0.0 < abs(estimate.value) <= 0.5 else 0
+        return f"{estimate.value:{sign},.{digits}f}"
+    factor = 100.0 if name in _PERCENT else 1.0
+    value, low, high = (f"{factor * end:{sign},.1f}" for end in ends)
+    return f"{value} [{low}, {high}]"
