@@ -98,7 +98,8 @@ def test_equal_figures_are_equal_files_with_truetype_fonts(suffix, tmp_path):
         "with matplotlib.rc_context(style.STYLE):\n"
         "    figure = Figure(figsize=(3.5, 2)); axes = figure.subplots()\n"
         "    axes.plot([1, 2], [3, 4], label='a line')\n"
-        "    axes.set(xlabel=labels.quantity('sigma_1', 'm/s/sqrt(s)'), ylabel='−²·√')\n"
+        "    axes.set_xlabel(labels.quantity('sigma_1', 'm/s/sqrt(s)'))\n"
+        "    axes.set_ylabel('\\u2212\\u00b2\\u00b7\\u221a')\n"
         "    style.add_legend(figure, axes.get_legend_handles_labels()[0])\n"
         "    saving.save(figure, Path(sys.argv[1]))\n"
     )
