@@ -109,7 +109,7 @@ def _draw_starts(axes: Axes, starts: np.ndarray) -> None:
     axes.quiver(x, y, along, up, color=QUIET, scale=9, width=0.009)
     for i, place in enumerate(_places(starts), 1):
         style: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "path_effects": HALO}
-        axes.text(*place, str(i), **style)
+        axes.text(place[0], place[1], str(i), **style)
     limits = (-1.12 * RADIUS, 1.12 * RADIUS)
     axes.set(xlim=limits, ylim=limits, aspect="equal", title="(b)")
     axes.set(xlabel=quantity("x", "m"), ylabel=quantity("y", "m"))
