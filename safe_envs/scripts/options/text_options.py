@@ -88,8 +88,8 @@ def _require_format(path: Path) -> None:
     # Not imported before it is needed: completion has to be quick.
     from matplotlib.backend_bases import FigureCanvasBase
 
-    # pgf is left out, which needs a TeX installation, and svgz, which holds the time.
-    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf", "svgz"})
+    # pgf is left out: it needs a TeX installation.
+    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in formats:
         raise ConfigurationError(
