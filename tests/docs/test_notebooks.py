@@ -15,7 +15,7 @@ from matplotlib import pyplot as plt
 
 import safe_envs
 from safe_envs import agents, wrappers
-from safe_envs.scripts.figures.saving import Picture
+from safe_envs.scripts.figures.saving import StyledFigure
 
 pytestmark = pytest.mark.slow
 
@@ -70,7 +70,7 @@ def test_notebook_is_kept_without_outputs_and_runs_in_an_empty_folder(
     names: dict[str, Any] = {}
     for source in code_of(path):
         value = run_cell(source, names)
-        if isinstance(value, Picture):
+        if isinstance(value, StyledFigure):
             pictures.append(value)
     plt.close("all")
     assert pictures
