@@ -22,7 +22,7 @@ class Written:
 
     Attributes:
         text: as given.
-        mask: pixels of its box, shape (height, width).
+        pixels: flat indices of the pixels of its box, in ascending order.
         color: of the letters, from 0 to 255.
         halo: colour of the outline around the letters; None without one.
         size: of the letters, in points or pixels.
@@ -30,7 +30,7 @@ class Written:
     """
 
     text: str
-    mask: np.ndarray
+    pixels: np.ndarray
     color: tuple[int, int, int]
     halo: tuple[int, int, int] | None
     size: float
@@ -56,11 +56,11 @@ def unreadable(texts: list[Written], background: np.ndarray) -> list[str]:
         texts: of the picture.
         background: the picture without texts, uint8 of shape (height, width, 3).
     """
-    found, lights = [], luminance(background)
+    found, lights = [], luminance(background).ravel()
     for each in texts:
         if not each.inside:
             found.append(f"{each.text!r} is cut off")
-        below = lights[each.mask]
+        below = lights[each.pixels]
         if not below.size:
             continue
         if each.halo is None:
@@ -72,8 +72,8 @@ def unreadable(texts: list[Written], background: np.ndarray) -> list[str]:
             least = contrast(luminance(each.color), luminance(each.halo))
         if least < LEGIBLE:
             found.append(f"{each.text!r} is hard to tell from what is below (contrast {least:.2f})")
-    pixels = [np.flatnonzero(each.mask) for each in texts]
-    for (one, a), (other, b) in itertools.combinations(zip(texts, pixels, strict=True), 2):
+    for one, other in itertools.combinations(texts, 2):
+        a, b = one.pixels, other.pixels
         if a.size and b.size and a[0] <= b[-1] and b[0] <= a[-1] and np.intersect1d(a, b).size:
             found.append(f"{one.text!r} overlaps {other.text!r}")
     return found
@@ -111,7 +111,9 @@ def _written(text: Any, canvas: Any) -> Written:
     width, height = canvas.get_width_height()
     turned = text.get_rotation() % 90.0
     box = text.get_window_extent()
-    y, x = np.mgrid[0:height, 0:width] + 0.5
+    left, right = (int(np.clip(edge, 0, width)) for edge in (box.x0 - 1, box.x1 + 2))
+    top, low = (int(np.clip(height - edge, 0, height)) for edge in (box.y1 + 1, box.y0 - 2))
+    y, x = np.mgrid[top:low, left:right] + 0.5
     across, up = x - 0.5 * (box.x0 + box.x1), height - y - 0.5 * (box.y0 + box.y1)
     half = np.array([box.width, box.height]) / 2
     if turned:
@@ -123,12 +125,13 @@ def _written(text: Any, canvas: Any) -> Written:
         cos, sin = np.cos(np.radians(angle)), np.sin(np.radians(angle))
         across, up = cos * across + sin * up, cos * up - sin * across
     # Half a pixel of anti-aliasing is none of it.
-    mask = (abs(across) < half[0] - 0.5) & (abs(up) < half[1] - 0.5)
+    within = (abs(across) < half[0] - 0.5) & (abs(up) < half[1] - 0.5)
+    pixels = (np.floor(y) * width + np.floor(x)).astype(int)[within]
     effects = [e for e in text.get_path_effects() if "foreground" in getattr(e, "_gc", {})]
     halo = _bytes(to_rgb(effects[0]._gc["foreground"])) if effects else None
     inside = box.x0 >= -0.5 and box.y0 >= -0.5 and box.x1 <= width + 0.5 and box.y1 <= height + 0.5
     color = _bytes(to_rgb(text.get_color()))
-    return Written(text.get_text(), mask, color, halo, text.get_fontsize(), inside)
+    return Written(text.get_text(), pixels, color, halo, text.get_fontsize(), inside)
 
 
 def _bytes(color: Any) -> tuple[int, int, int]:

@@ -21,7 +21,8 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.object_import import load_object
-from safe_envs.scripts.figures.style import COLORS, QUIET, STYLE, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE
+from safe_envs.scripts.figures.style import SCREEN as STYLE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
 

@@ -60,8 +60,8 @@ def _written(
     options = bound.arguments
     text, size, color = (options[key] for key in ("text", "size", "color"))
     bold, widest = options.get("bold", False), options.get("widest")
-    shown = text if widest is None else cut(text, size, bold, widest)
-    letters = text_surface(shown, size, bold, color, options.get("turned", False))
+    line = text if widest is None else cut(text, size, bold, widest)
+    letters = text_surface(line, size, bold, color, options.get("turned", False))
     alpha = pygame.surfarray.array_alpha(letters).T
     left, top = (
         round(place - share * side)
@@ -73,10 +73,13 @@ def _written(
     rows, columns = np.nonzero(alpha)
     ink = alpha[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     box = pygame.Rect(left + columns.min(), top + rows.min(), *ink.shape[::-1])
-    mask = np.zeros(frame.shape[:2], dtype=bool)
-    mask[max(box.top, 0) : box.bottom, max(box.left, 0) : box.right] = True
+    height, width = frame.shape[:2]
+    shown = box.clip(pygame.Rect(0, 0, width, height))
+    y, x = np.mgrid[shown.top : shown.bottom, shown.left : shown.right]
+    pixels = (y * width + x).ravel()
+    halo = PAPER if name == "label" else None
     inside, seen = bool(clip.contains(box)), True
     if inside:
         letters_seen = frame[box.top : box.bottom, box.left : box.right][ink >= 250].astype(int)
         seen = bool((abs(letters_seen - np.array(color)) <= 40).all())
-    return Written(text, mask, color, PAPER if name == "label" else None, size, inside), seen
+    return Written(text, pixels, color, halo, size, inside), seen

@@ -58,6 +58,19 @@ STYLE: Any = {
     "svg.hashsalt": "safe-envs",
     "savefig.dpi": 300,
 }
+SCREEN: Any = {
+    **STYLE,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "figure.titlesize": 11,
+    "xtick.labelsize": 10,
+    "ytick.labelsize": 10,
+    "legend.fontsize": 10,
+    "axes.linewidth": 0.8,
+}
+"""Of pictures of pages, 10 inches wide, which a screen shows smaller."""
+
 HALO = [withStroke(linewidth=2.0, foreground="white")]
 """Of a text in a panel, which lines may cross."""
 
@@ -139,7 +152,7 @@ def add_legend(figure: Figure, handles: Sequence[Any], most: int = _MOST_COLUMNS
         if legend.get_window_extent().width <= figure.bbox.width:
             return
         legend.remove()
-    # Beside the labels there are the handle and the borders.
+    # The handle and the borders take room, too.
     room = figure.get_figwidth() - (mpl.rcParams["legend.handlelength"] + 3.0) * size / 72.0
     for handle in handles:
         handle.set_label(wrapped(figure, handle.get_label(), size, room))

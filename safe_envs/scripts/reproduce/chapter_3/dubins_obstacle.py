@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.labels import labelled, quantity
-from safe_envs.scripts.figures.style import COLORS, HALO, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import COLORS, HALO, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
@@ -200,7 +200,7 @@ def _draw_passage(figure: Figure, outcome: Findings) -> None:
     """Draw the paths past the obstacle, with both at three instants."""
     axes, shade = figure.add_subplot(), {"alpha": 0.45, "linewidth": 0}
     axes.add_patch(Circle(GOAL, GOAL_RADIUS, facecolor="#56B4E9", **shade))
-    axes.text(GOAL[0] + 0.4, GOAL[1], "goal", va="center", color="black", path_effects=HALO)
+    axes.text(GOAL[0] - 0.4, GOAL[1], "goal", ha="right", va="center", color=QUIET)
     lines = (
         ("nominal", learned_runs.NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
         ("learned", learned_runs.LEARNED_COLOR, "-", 1.8, "learned derivatives"),

@@ -13,6 +13,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.scripts.figures.labels import mathematics
 from safe_envs.scripts.figures.style import COLORS, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_5.cubic import CBF, ENV, LEVELS, SETTINGS
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import repeated
@@ -210,7 +211,7 @@ def _draw_paths(figure: Figure, outcome: Findings) -> None:
     axes.contourf(*grid, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0)
     axes.contour(*grid, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    axes.set(xlabel="$x_1$", ylabel="$x_2$", title=outcome.data["name"])
+    axes.set(xlabel="$x_1$", ylabel="$x_2$", title=mathematics(outcome.data["name"]))
     handles, labels = axes.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     add_legend(

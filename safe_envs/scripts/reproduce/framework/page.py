@@ -23,7 +23,7 @@ from safe_envs.scripts.reproduce.framework.artefact import (
 )
 from safe_envs.scripts.reproduce.framework.verdict import RULES, Judgement, judge
 
-_COLOURS = 64
+_COLOURS, _WIDTH = 64, 1432
 """Of a picture on the page, which need not be larger than its lines and few areas ask for."""
 
 
@@ -110,7 +110,10 @@ def _picture(folder: Path, artefact: Artefact) -> str:
     light, path = io.BytesIO(), folder / f"{artefact.name}.png"
     try:
         with Image.open(path, formats=["png"]) as picture:
-            picture.convert("RGB").quantize(_COLOURS).save(light, "png", optimize=True)
+            whole = picture.convert("RGB")
+            size = (_WIDTH, round(whole.height * _WIDTH / whole.width))
+            smaller = whole.resize(size, Image.Resampling.LANCZOS)
+            smaller.quantize(_COLOURS).save(light, "png", optimize=True)
     except (Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise ConfigurationError(
             f"{path} cannot be read ({error}); remove it, and it is drawn again"

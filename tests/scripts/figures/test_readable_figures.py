@@ -1,0 +1,175 @@
+"""Every figure in both sizes: what is written can be read, fonts are TrueType, bytes are equal."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import re
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+from unittest import mock
+
+import matplotlib as mpl
+import pytest
+from matplotlib.figure import Figure
+
+from safe_envs import ConfigurationError, plot_log
+from safe_envs.scripts import cli
+from safe_envs.scripts.figures import saving, sweep_figure
+from safe_envs.scripts.figures.style import COLORS, DASHES, MARKERS, STYLE, WARM, look
+from safe_envs.scripts.options.figure_options import WIDTHS
+from tests.readable import figure_texts, unreadable
+from tests.scripts.figures import test_log_figure, test_sweep_figure
+from tests.scripts.figures.colour_vision import VISIONS, ciede2000, lab
+
+pytestmark = pytest.mark.slow
+
+LEAST_DISTANCE = 10.0
+"""In CIEDE2000, of two colours of lines; 2.3 can just be noticed."""
+
+COMMANDS = {
+    "evaluation": "evaluate CubicSDEDisk-v0 --filter none --filter scbf --episodes 20",
+    "evaluation of a line": "evaluate Scalar-v0 --filter none --filter rcbf --episodes 20",
+    "evaluation of many inputs": (
+        "evaluate QuadrotorLimits-v0 --horizon 2 --filter none --filter hocbf --episodes 3"
+    ),
+    "verification": "verify CubicSDEDisk-v0 --no-simulate",
+    "verification of a line": "verify Scalar-v0 --no-simulate",
+    "verification of ACC": "verify ACCGap-v0 --no-simulate",
+    "best": "best Pendulum-v0 --cells 20x16 --inputs 3 --episodes 0",
+    "best over a line": "best Scalar-v0 --inputs 3 --episodes 0",
+    "best over an expression": "best StochasticDubins-v0 --cells 8x8 --inputs 3 --episodes 0",
+    "frontier": "frontier Pendulum-v0 --episodes 10 --cells 20x16 --attained 2",
+    "identification": "identify CubicSDE-v0 --method bayesian --set degree=3",
+    "identification of ACC": "identify ACC-v0 --method bayesian",
+}
+MODULES = {"evaluate": "evaluation", "verify": "verify", "best": "best", "frontier": "frontier"}
+
+
+@cache
+def drawn_from(kind: str) -> tuple[Any, tuple[Any, ...]]:
+    """The module that draws the figure of a command, and what it draws it from."""
+    words = COMMANDS[kind].split()
+    name = f"safe_envs.scripts.figures.{MODULES.get(words[0], 'identify')}_figure"
+    module = importlib.import_module(name)
+    more = ["--out", "learned.npz"] if words[0] == "identify" else []
+    with (
+        mock.patch.object(module, "draw") as draw,
+        mock.patch.object(sys, "argv", ["safe-envs", *words, *more, "--plot", "figure.pdf"]),
+        pytest.raises(SystemExit) as ended,
+    ):
+        cli.main()
+    assert not ended.value.code
+    *given, _, size = draw.call_args.args
+    assert size == "double"
+    return module, tuple(given)
+
+
+def figure_of(kind: str, size: str) -> Figure:
+    if kind == "log":
+        return plot_log(test_log_figure.log_of(test_log_figure.UNSAFE), size=size)
+    if kind == "sweep":
+        rows = test_sweep_figure.ROWS
+        layout = sweep_figure.Layout.of(rows, test_sweep_figure.SWEPT)
+        return sweep_figure.figure_of(rows, layout, size)[0]
+    module, given = drawn_from(kind)
+    return module.figure_of(*given, size)
+
+
+@pytest.mark.parametrize("size", list(WIDTHS))
+@pytest.mark.parametrize("kind", [*COMMANDS, "log", "sweep"])
+def test_every_text_can_be_read(kind, size, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    figure = figure_of(kind, size)
+    assert figure.get_figwidth() == pytest.approx(WIDTHS[size])
+    texts, without = figure_texts(figure)
+    assert len(texts) > 8
+    assert unreadable(texts, without) == []
+    assert min(text.size for text in texts) >= 7.0
+
+
+@pytest.mark.parametrize("suffix", ["pdf", "ps", "eps", "svg", "png"])
+def test_equal_figures_are_equal_files_with_truetype_fonts(suffix, tmp_path):
+    script = (
+        "import sys; from pathlib import Path; from matplotlib.figure import Figure\n"
+        "from safe_envs.scripts.figures import labels, saving, style; import matplotlib\n"
+        "with matplotlib.rc_context(style.STYLE):\n"
+        "    figure = Figure(figsize=(3.5, 2)); axes = figure.subplots()\n"
+        "    axes.plot([1, 2], [3, 4], label='a line')\n"
+        "    axes.set_xlabel(labels.quantity('sigma_1', 'm/s/sqrt(s)'))\n"
+        "    axes.set_ylabel('\\u2212\\u00b2\\u00b7\\u221a')\n"
+        "    style.add_legend(figure, axes.get_legend_handles_labels()[0])\n"
+        "    saving.save(figure, Path(sys.argv[1]))\n"
+    )
+    files = [tmp_path / f"{name}.{suffix}" for name in ("one", "another")]
+    for seed, file in enumerate(files):
+        subprocess.run(
+            [sys.executable, "-c", script, str(file)],
+            check=True,
+            env={"PYTHONHASHSEED": str(seed), "PYTHONPATH": ":".join(sys.path)},
+        )
+    one, other = (file.read_bytes() for file in files)
+    assert one == other
+    if suffix == "pdf":
+        assert b"/FontFile2" in one
+        assert b"/Subtype /CIDFontType2" in one
+        assert b"/Type3" not in one.replace(b" ", b"")
+        assert b"CreationDate" not in one
+    if suffix in ("ps", "eps"):
+        assert b"/FontType 42" in one
+        assert b"/FontType 3" not in one
+
+
+def test_a_pdf_of_a_command_embeds_truetype_fonts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for kind in ("verification", "identification", "log"):
+        saving.save(figure_of(kind, "single"), tmp_path / "figure.pdf")
+        content = (tmp_path / "figure.pdf").read_bytes()
+        assert b"/FontFile2" in content
+        assert not re.search(rb"/Subtype\s*/Type3", content)
+
+
+def test_the_check_finds_what_cannot_be_read():
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.5, 2.5))
+        axes = figure.subplots()
+        axes.plot([0, 1], [0, 1], color="black")
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        axes.text(0.45, 0.5, "crossed")
+        axes.text(0.1, 0.8, "twice")
+        axes.text(0.12, 0.8, "double")
+        axes.text(0.95, 0.2, "cut off at the right")
+        axes.text(0.2, 0.6, "pale", color="#DDDDDD")
+    found = " ".join(unreadable(*figure_texts(figure)))
+    assert "'crossed' is on a line" in found
+    assert "'twice' overlaps 'double'" in found
+    assert "'cut off at the right' is cut off" in found
+    assert "'pale' is hard to tell" in found
+    assert "'0.0'" not in found
+
+
+def test_colours_can_be_told_apart_whatever_the_vision():
+    for vision in VISIONS:
+        seen = [lab(color, vision) for color in (*COLORS, WARM)]
+        least = min(ciede2000(one, other) for one, other in itertools.combinations(seen, 2))
+        assert least > LEAST_DISTANCE, vision
+
+
+def test_lines_differ_in_more_than_their_colour():
+    assert len({str(look(i)) for i in range(36)}) == 36
+    assert len({str(look(i)["linestyle"]) for i in range(6)}) == len(DASHES) == len(set(MARKERS))
+
+
+@pytest.mark.parametrize("command", ["evaluate", "verify", "best", "frontier", "identify"])
+def test_an_unknown_size_is_refused(command, monkeypatch, capsys):
+    words = [command, "Scalar-v0", "--size", "singel", "--plot", "figure.pdf"]
+    words += ["--method", "bayesian"] if command == "identify" else []
+    monkeypatch.setattr(sys, "argv", ["safe-envs", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "did you mean 'single'" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(ConfigurationError, match="single"):
+        plot_log(test_log_figure.log_of(test_log_figure.SAFE), size="singel")
