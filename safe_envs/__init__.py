@@ -17,6 +17,7 @@ from safe_envs.errors import (
 )
 from safe_envs.gymnasium_ids import register_with_gymnasium
 from safe_envs.lazy_attributes import lazy_attributes
+from safe_envs.package_version import package_version
 from safe_envs.systems import ENV_IDS
 
 if TYPE_CHECKING:
@@ -75,16 +76,7 @@ _find, __dir__ = lazy_attributes(__name__, _MODULES, globals())
 
 
 def __getattr__(name: str) -> Any:
-    return _version() if name == "__version__" else _find(name)
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("safe-envs")
-    except PackageNotFoundError:  # a checkout on PYTHONPATH that is not installed
-        return "0+unknown"
+    return package_version() if name == "__version__" else _find(name)
 
 
 register_with_gymnasium()

@@ -66,6 +66,17 @@ def shortened(given: Any, most: int = 120) -> str:
     return f"{text[:half]}...({len(text) - 2 * half} more characters)...{text[-half:]}"
 
 
+def unknown(what: str, name: Any, allowed: Iterable[str]) -> ConfigurationError:
+    """Return the error of a name that nobody knows.
+
+    Args:
+        what: is named.
+        name: what was given.
+        allowed: names.
+    """
+    return ConfigurationError(f"unknown {what} {shown(name)}; {nearest(str(name), allowed)}")
+
+
 _FEW = 6
 """So many allowed names are listed in full, of more of them the nearest three."""
 
@@ -103,3 +114,18 @@ def require_whole(name: str, value: Any, least: int) -> None:
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
         raise ConfigurationError(f"{name} = {shown(value)}; give a whole number from {least}")
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return a value that is True or False.
+
+    Args:
+        name: of the argument, for the error.
+        value: what was given.
+
+    Raises:
+        ConfigurationError: it is anything else, such as the text "false", which counts as true.
+    """
+    if not isinstance(value, bool):
+        raise ConfigurationError(f"{name} = {shown(value)}; give True or False")
+    return value

@@ -78,12 +78,29 @@ def env_class(env_id: str) -> type[SystemEnv]:
     entry_point = gym.spec(full_id(env_id)).entry_point
     creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     if not (isinstance(creator, type) and issubclass(creator, SystemEnv)):
-        raise ConfigurationError(
-            f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id}"
-            " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium's. For the envs of"
-            f" this project: `safe-envs list`, such as {ENV_IDS[0]}"
-        )
+        raise _not_own(env_id)
     return creator
+
+
+def require_own(env_id: str) -> None:
+    """Raise ConfigurationError for an env of Gymnasium itself; nothing else is imported.
+
+    Args:
+        env_id: registered id.
+    """
+    import gymnasium as gym
+
+    entry_point = gym.spec(env_id).entry_point
+    if isinstance(entry_point, str) and entry_point.startswith("gymnasium."):
+        raise _not_own(env_id)
+
+
+def _not_own(env_id: str) -> ConfigurationError:
+    return ConfigurationError(
+        f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id} --filter-spec"
+        " FILE.py:NAME` puts a filter over any env of Gymnasium. For the envs of this project:"
+        f" `safe-envs list`, such as {ENV_IDS[0]}"
+    )
 
 
 def make_problem(env_id: str, **options: Any) -> SafetyProblem:

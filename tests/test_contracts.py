@@ -111,7 +111,7 @@ ALLOWED = (
     (r".*/(value|promise)[^/]*(/.*)?", r"promis", "the name of that filter"),
     (
         r".*",
-        r"`?promise`? (filter|policy)|[\"'`{]promise[\"'`:}]|--promise-curriculum|promise:p=",
+        r"`?promise`? (filter|policy)|[\"'`{]promise[\"'`:}]|(--| )promise-curriculum|promise:p=",
         "the name of that filter",
     ),
     (

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import inspect
-from pathlib import Path
 from typing import Any
 
 import typer
 
-from safe_envs.scripts.cli import app
+from safe_envs.scripts.cli import COMMANDS, app
+from safe_envs.scripts.options.help_text import default_of, sections_of, written
+from safe_envs.scripts.options.panels import EXAMPLES
 
 _INTRODUCTION = """# Command line
 
 Every command exits with status 0, or with status 2 and one message for an error that the user can
 correct. `--help` after a command prints its section of this page. These options precede a command:
 """
-
-_LETTERS = {int: "N", Path: "PATH"}
-"""Placeholders for the values of options without a metavar, by the type of the default."""
 
 
 def commands() -> dict[str, Any]:
@@ -40,22 +38,33 @@ def options_of(command: Any) -> set[str]:
 
 def command_line_page() -> str:
     """Return Markdown with a section for each command."""
-    common = _table(typer.main.get_command(app))
+    known = commands()
     return "\n".join(
         [
             _INTRODUCTION,
-            *common,
+            *_table(typer.main.get_command(app).params, grouped=False),
             "",
-            *(_section(name, command) for name, command in commands().items()),
+            *(
+                f"- {panel}: {', '.join(f'[{name}](#{name})' for name in names)}"
+                for panel, names in _panels().items()
+            ),
+            "",
+            *(_section(name, command) for name, command in known.items()),
         ]
     )
 
 
+def _panels() -> dict[str, list[str]]:
+    """Return the names of the commands of each group."""
+    found: dict[str, list[str]] = {}
+    for entry in COMMANDS:
+        found.setdefault(entry.panel, []).append(entry.name)
+    return found
+
+
 def _section(name: str, command: Any) -> str:
-    arguments = [
-        p.metavar or p.name.upper() for p in command.params if p.param_type_name == "argument"
-    ]
-    usage = " ".join(["safe-envs", name, *arguments, "[OPTIONS]"])
+    arguments = [written(p) for p in command.params if p.param_type_name == "argument"]
+    usage = " ".join(["safe-envs", name, "[OPTIONS]", *arguments])
     return "\n".join(
         [
             f"## {name}",
@@ -64,36 +73,38 @@ def _section(name: str, command: Any) -> str:
             "",
             inspect.cleandoc(command.help or ""),
             "",
-            *_table(command),
+            *_table(command.params),
+            "",
+            "Examples:",
+            "",
+            "```text",
+            *EXAMPLES[name],
+            "```",
             "",
         ]
     )
 
 
-def _table(command: Any) -> list[str]:
-    arguments = [p for p in command.params if p.param_type_name == "argument"]
-    options = [p for p in command.params if p.param_type_name == "option"]
-    rows = [f"| `{p.metavar or p.name.upper()}` | {_cell(p.help)} | |" for p in arguments]
-    rows += [f"| `{_written(p)}` | {_cell(p.help)} | {_default(p)} |" for p in options]
+def _table(params: list[Any], grouped: bool = True) -> list[str]:
+    """Return the arguments and options as a table, with the title of each group."""
+    by_name = {written(p): p for p in params}
+    rows = []
+    for title, entries in sections_of(params).items():
+        rows += [f"| **{title}** | | |"] * grouped
+        for name, _ in entries:
+            found = by_name[name]
+            rows.append(f"| `{name}` | {_cell(found.help)} | {_default(found)} |")
     return ["| | meaning | default |", "|---|---|---|", *rows] if rows else []
 
 
-def _written(option: Any) -> str:
-    names = ", ".join((*option.opts, *option.secondary_opts))
-    return (
-        names
-        if option.is_flag
-        else f"{names} {option.metavar or _LETTERS.get(type(option.default), 'X')}"
-    )
-
-
-def _default(option: Any) -> str:
-    return (
-        ""
-        if option.default is None or option.is_flag or callable(option.default)
-        else f"`{option.default}`"
-    )
+def _default(param: Any) -> str:
+    if param.required:
+        return "required"
+    default = default_of(param) if param.param_type_name == "option" else ""
+    return default and f"`{default}`"
 
 
 def _cell(text: str | None) -> str:
-    return (text or "").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+    found = (text or "").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+    # Entries of a table have one line.
+    return found.replace("\n\n", "<br>").replace("\n", " ")

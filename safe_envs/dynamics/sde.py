@@ -20,7 +20,7 @@ from safe_envs.dynamics.declarations import (
 )
 from safe_envs.dynamics.fixed_dict import FixedDict
 from safe_envs.dynamics.identities import is_zero
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, unknown
 
 
 @dataclass(frozen=True)
@@ -254,9 +254,7 @@ class ControlAffineSDE:
         by_name = {p.name: p for p in self.parameters}
         for name in values:
             if name not in by_name:
-                raise ConfigurationError(
-                    f"unknown parameter {shown(name)}; {nearest(name, by_name)}"
-                )
+                raise unknown("parameter", name, by_name)
         return replace(
             self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}}
         )

@@ -19,7 +19,7 @@ from safe_envs.envs.reset_options import RequestedStart, ResetOptions
 from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import SystemSpec
-from safe_envs.errors import InvalidInputError, NumericalError
+from safe_envs.errors import InvalidInputError, NumericalError, flag
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
@@ -80,7 +80,7 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         self._scales = list(zip(center, half, strict=True))
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
-        self._ends_on_violation = terminate_on_violation
+        self._ends_on_violation = flag("terminate_on_violation", terminate_on_violation)
         self._spec: EnvSpec | None = None
         self._noise = NoiseStream(self._simulation.integrator.channels, self._limit)
         self._reader = StreamReader()

@@ -20,7 +20,7 @@ from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions, StartingPoints
 from safe_envs.envs.seeding import Seeds
 from safe_envs.envs.vector_interface import VectorInterface
-from safe_envs.errors import InvalidInputError, require_whole
+from safe_envs.errors import InvalidInputError, flag, require_whole
 from safe_envs.problem.problem import SafetyProblem
 
 _Stepper = ArrayBatch | CompiledBatch | BatchStepper
@@ -67,7 +67,7 @@ class SafeVectorEnv(VectorInterface):
     ) -> None:
         require_whole("num_envs", num_envs, 1)
         super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
-        self._ends_on_violation = terminate_on_violation
+        self._ends_on_violation = flag("terminate_on_violation", terminate_on_violation)
         self.episodes = Episodes(num_envs)
         self._reset_options = ResetOptions(problem, self._limit, num_envs)
         require_engine(engine)

@@ -15,6 +15,7 @@ from safe_envs.dynamics.philox import START, Key, StreamReader
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
+from safe_envs.problem.option_errors import wrong_start
 from safe_envs.problem.signals import Variable
 from safe_envs.validators import numbers_in
 
@@ -48,12 +49,9 @@ class Start:
         Raises:
             ConfigurationError: It has another number of them, or one is not in its range.
         """
-        names = ", ".join(s.symbol.name for s in states)
         found = numbers_in(start)
         if found.shape != (len(states),):
-            raise ConfigurationError(
-                f"start has {found.size} numbers; the state has {len(states)}: {names}"
-            )
+            raise wrong_start(found.size, [s.symbol.name for s in states])
         values = [
             finite_number(f"start of {s.symbol}", v)
             for s, v in zip(states, found.tolist(), strict=True)

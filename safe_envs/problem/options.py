@@ -12,6 +12,7 @@ from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, named_values, numbers
+from safe_envs.problem.option_errors import refused_noise
 
 Reader = Callable[[str, Any], Any]
 """From the name of an option and its text (texts, where it is repeatable) to its value."""
@@ -214,8 +215,5 @@ def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[st
         or not np.isfinite(given).all()
         or (given < 0).any()
     ):
-        raise ConfigurationError(
-            f"noise = {shown(noise)}; give one number >= 0, or {len(names)} of them"
-            f" ({', '.join(names)})"
-        )
+        raise refused_noise(noise, names)
     return dict(zip(names, np.broadcast_to(given, len(names)).tolist(), strict=True))

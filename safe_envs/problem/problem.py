@@ -14,9 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import (
     ConfigurationError,
     SystemDefinitionError,
-    nearest,
     require_whole,
-    shown,
 )
 from safe_envs.problem.actuators import Limits, rate_limits, require_delay
 from safe_envs.problem.backup import BackupSource, require_backup
@@ -24,14 +22,12 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.option_errors import require_bounds, require_period, unknown_start
 from safe_envs.problem.options import ProblemOptions, noise_levels
 from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
 from safe_envs.problem.regions import sound_regions
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
-
-_WIDEST = 1e100
-"""Largest bound of a box: its square, an effort, is still a number."""
 
 
 @dataclass(frozen=True)
@@ -161,11 +157,7 @@ class SafetyProblem:
             self.frame.require_known(plant)
         require_backup(self.backup, plant)
         for i in self.inputs:
-            if not -_WIDEST <= i.low < i.high <= _WIDEST:
-                raise ConfigurationError(
-                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs bounds within"
-                    f" {_WIDEST:g}, the lower one below the upper. Unbounded control is a wide box"
-                )
+            require_bounds(i.symbol.name, i.low, i.high)
         self._check_timing()
         for coordinate in self.sampling.coordinates:
             plant.require_known(
@@ -192,8 +184,7 @@ class SafetyProblem:
             )
 
     def _check_timing(self) -> None:
-        if not self.dt > 0 or not math.isfinite(self.dt):
-            raise ConfigurationError(f"dt = {self.dt} s; a control period is positive and finite")
+        require_period(self.dt)
         if not math.isfinite(self.horizon / self.dt) or round(self.horizon / self.dt) < 1:
             raise ConfigurationError(
                 f"horizon = {self.horizon} s; it must hold at least one control period of"
@@ -277,10 +268,7 @@ class SafetyProblem:
         start = given.start
         if isinstance(start, str):
             if start not in self.starts:
-                raise ConfigurationError(
-                    f"unknown start {shown(start)}; {nearest(start, self.starts)}, or"
-                    f" {len(self.states)} numbers"
-                )
+                raise unknown_start(start, self.starts, len(self.states))
             changes["start"] = start
         elif start is not None:
             changes["starts"] = {**self.starts, "given": Start.given(self.states, start)}

@@ -11,7 +11,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics import declarations
-from safe_envs.errors import ConfigurationError, shown
+from safe_envs.problem.option_errors import refused_box
 from safe_envs.validators import numbers_in
 
 TIME = declarations.TIME
@@ -79,7 +79,5 @@ def input_bounds(box: Any, count: int) -> list[tuple[float, float]]:
     pairs = numbers_in(box)
     pairs = np.broadcast_to(pairs, (count, 2)) if pairs.shape == (2,) else pairs
     if pairs.shape != (count, 2):
-        raise ConfigurationError(
-            f"box = {shown(box)}; give (low, high), or one such pair for each of the {count} inputs"
-        )
+        raise refused_box(box, count)
     return [(float(low), float(high)) for low, high in pairs]

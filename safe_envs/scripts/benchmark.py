@@ -13,6 +13,7 @@ from rich.console import Console
 
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.options import early_checks
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.reports.tables import print_rows
@@ -24,7 +25,11 @@ def benchmark(
     json: Json = None,
     compare: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Of an earlier run with --json: print the ratios to it."),
+        typer.Option(
+            metavar="FILE",
+            callback=early_checks.file_that_is_there(_ADVICE),
+            help="Of an earlier run with --json: print the ratios to it.",
+        ),
     ] = None,
 ) -> None:
     """Measure the speed of filters and envs."""

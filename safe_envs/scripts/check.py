@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options import early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import require_result, stdout, write_result
 
@@ -17,7 +17,12 @@ from safe_envs.scripts.options.console import require_result, stdout, write_resu
 def check(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="Of a certificate.", show_default=False),
+        typer.Argument(
+            metavar="FILE",
+            callback=early_checks.file_that_is_there("`safe-envs certify --out FILE` writes one"),
+            help="Of a certificate.",
+            show_default=False,
+        ),
     ],
     state: Annotated[
         list[str] | None,

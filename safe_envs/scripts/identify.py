@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.scripts.options import completion, figure_options, text_options
+from safe_envs.scripts.options import completion, early_checks, figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -34,6 +34,7 @@ def identify(
         typer.Option(
             metavar="NAME",
             autocompletion=completion.words(tuple(SETTINGS)),
+            callback=early_checks.known_method,
             help=(
                 "learned-hocbf: residuals of derivatives of the barriers; ddscbf: unknown noise;"
                 " bayesian: the whole system."

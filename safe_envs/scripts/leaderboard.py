@@ -119,6 +119,7 @@ def leaderboard(
     """
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.fingerprint import package_versions
+    from safe_envs.agents.jobs.store import make_folder
     from safe_envs.agents.training.leaderboard import board, require_no_older
     from safe_envs.agents.training.study import run_study
     from safe_envs.scripts.reports.leaderboard_page import put_into
@@ -127,6 +128,7 @@ def leaderboard(
         leaderboard_notes,
         leaderboard_tables,
     )
+    from safe_envs.scripts.reports.tables import print_columns
 
     require_result(json_file)
     if all_envs and env_ids:
@@ -144,6 +146,8 @@ def leaderboard(
     require_no_older(out)
     if page is not None:
         put_into(page, None)
+    if pictures is not None:
+        make_folder(pictures)
     with progress_bar("Leaderboard") as tell:
         found = run_study(
             study,
@@ -161,15 +165,16 @@ def leaderboard(
     if markdown:
         print_markdown(written)
     else:
-        for heading, table in leaderboard_tables(report):
+        for heading, columns in leaderboard_tables(report):
             say(stdout(), f"\n{heading}")
-            stdout().print(table)
+            print_columns(stdout(), columns[:1], columns[1:])
         for note in leaderboard_notes(report):
             say(stdout(), f"Note: {note}")
     settings = {"algo": algo, "seeds": study.seeds, "seed": seed, "episodes": study.episodes}
     settings |= {"quick": quick, "knowledge": study.knowledge}
     document = {"settings": settings, "versions": package_versions()}
     write_result(json_file, lambda: document | report.document())
+    found.require_all()
 
 
 def _report(found: Any, out: Path, best: bool | None) -> LeaderboardReport:
@@ -201,30 +206,34 @@ def _report(found: Any, out: Path, best: bool | None) -> LeaderboardReport:
 
 def _draw(report: LeaderboardReport, folder: Path) -> None:
     """Draw a picture for each env that has agents."""
-    from safe_envs.agents.jobs.store import make_folder
     from safe_envs.scripts.figures.leaderboard_figure import draw
     from safe_envs.scripts.reports.leaderboard_report import short_name
 
-    make_folder(folder)
     study = report.found.study
     variants = [variant.name for variant in study.variants]
     for env_id in study.env_ids:
         rows = [row for row in report.found.rows if row.env_id == env_id]
-        path = folder / f"{short_name(env_id)}.png"
         if rows:
             frontier = report.frontiers.get(env_id)
+            path = _picture(folder, env_id)
             draw(short_name(env_id), report.of(env_id), rows, frontier, variants, path)
+
+
+def _picture(folder: Path, env_id: str) -> Path:
+    from safe_envs.scripts.reports.leaderboard_report import short_name
+
+    # Envs of other packages keep their namespace in their names.
+    return folder / f"{short_name(env_id).replace('/', '-')}.png"
 
 
 def _links(report: LeaderboardReport, folder: Path | None, page: Path | None) -> dict[str, str]:
     """Return links to the pictures, as they are written in a page."""
     from safe_envs.scripts.reports.leaderboard_page import link_from
-    from safe_envs.scripts.reports.leaderboard_report import short_name
 
     if folder is None:
         return {}
     return {
-        env_id: link_from(page, folder / f"{short_name(env_id)}.png")
+        env_id: link_from(page, _picture(folder, env_id))
         for env_id in report.found.study.env_ids
         if report.of(env_id)
     }

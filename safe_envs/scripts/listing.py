@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, stdout, write_result
 from safe_envs.systems import ENV_IDS
-
-if TYPE_CHECKING:
-    from safe_envs.problem.problem import SafetyProblem
 
 _COLUMNS = ("states", "inputs", "degree", "filter", "noise", "dt", "horizon")
 
@@ -18,15 +15,24 @@ def list_envs(json: Json = None) -> None:
     """List the registered envs."""
     from rich.text import Text
 
-    from safe_envs.registry import env_class, make_problem
     from safe_envs.scripts.reports.tables import print_columns
+    from safe_envs.systems.summary import summaries
     from safe_envs.text_tables import Column
 
     require_result(json)
     rows = []
     for env_id in ENV_IDS:
-        about = " ".join((env_class(env_id).__doc__ or "").strip().partition("\n\n")[0].split())
-        rows.append({"env_id": env_id, "about": about, **_defaults(make_problem(env_id))})
+        found = summaries()[env_id]
+        values = {
+            "states": len(found.states),
+            "inputs": len(found.inputs),
+            "degree": list(found.degree.values()),
+            "filter": found.filter,
+            "noise": list(found.noise.values()),
+            "dt": found.dt,
+            "horizon": found.horizon,
+        }
+        rows.append({"env_id": env_id, "about": found.about, **values})
     ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")
     abouts = Column("what is to be kept safe", tuple(row["about"] for row in rows), "p")
     settings = [
@@ -35,21 +41,6 @@ def list_envs(json: Json = None) -> None:
     ]
     print_columns(stdout(), [ids], [abouts, *settings])
     write_result(json, lambda: {"envs": rows})
-
-
-def _defaults(problem: SafetyProblem) -> dict[str, Any]:
-    from safe_envs.dynamics.lie import relative_degree
-
-    levels = {p.name: value for p, value in problem.plant.parameters.items()}
-    return {
-        "states": problem.plant.n,
-        "inputs": problem.plant.m,
-        "degree": [relative_degree(problem.model, b.expression) for b in problem.barriers],
-        "filter": problem.filter,
-        "noise": [levels[name] for name in problem.noise],
-        "dt": problem.dt,
-        "horizon": problem.horizon,
-    }
 
 
 def _cell(name: str, value: Any) -> str:

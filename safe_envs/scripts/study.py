@@ -20,7 +20,7 @@ from safe_envs.scripts.options.console import (
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.tables import print_whole
+from safe_envs.scripts.reports.tables import print_columns
 
 _QUICK: dict[str, Any] = {"n_timesteps": 1024, "eval_freq": 1024, "eval_episodes": 5}
 
@@ -81,7 +81,7 @@ def study(
     from safe_envs.agents.training.study import Study, run_study
     from safe_envs.agents.training.study_file import read_study
     from safe_envs.agents.training.study_summary import differences, summaries
-    from safe_envs.scripts.reports.study_report import study_markdown, study_notes, study_table
+    from safe_envs.scripts.reports.study_report import study_columns, study_markdown, study_notes
 
     require_result(json_file)
     read = read_study(what)
@@ -98,7 +98,8 @@ def study(
             lambda text: print(text, file=sys.stderr, flush=True),
         )
     document: dict[str, Any] = {"study": what, "settings": _settings(asked, quick)}
-    document |= {"versions": package_versions(), "rows": [asdict(row) for row in found.rows]}
+    document |= {"against": against, "versions": package_versions()}
+    document |= {"rows": [asdict(row) for row in found.rows], "missing": found.reasons()}
     for env_id in asked.env_ids:
         rows = (
             summaries(found, read.agents, env_id)
@@ -111,10 +112,12 @@ def study(
             print_markdown(f"**{heading}**\n\n{study_markdown(rows, against is not None)}\n")
         else:
             say(stdout(), f"\n{heading}")
-            print_whole(stdout(), study_table(rows, against is not None))
+            columns = study_columns(rows, against is not None)
+            print_columns(stdout(), columns[:2], columns[2:])
     for note in study_notes(found):
         say(stdout(), f"Note: {note}")
     write_result(json_file, lambda: document)
+    found.require_all()
 
 
 def _settings(asked: Any, quick: bool) -> dict[str, Any]:

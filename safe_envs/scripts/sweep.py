@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options import early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.options.job_progress import run_jobs
@@ -19,6 +19,7 @@ def sweep(
         Path,
         typer.Argument(
             metavar="SPEC.yaml",
+            callback=early_checks.file_that_is_there("name a YAML file that says what to sweep"),
             help="What to sweep: sections fixed, grid and cells.",
             show_default=False,
         ),

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest
-from safe_envs.scripts.options import figure_options, text_options
+from safe_envs.scripts.options import early_checks, figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, say, stdout, write_result
 
@@ -20,7 +20,12 @@ def sweep_report(
     folder: Annotated[
         Path,
         typer.Argument(
-            metavar="DIR", help="The folder of `safe-envs sweep ... --out DIR`.", show_default=False
+            metavar="DIR",
+            callback=early_checks.file_that_is_there(
+                "give the folder of `safe-envs sweep ... --out`"
+            ),
+            help="The folder of `safe-envs sweep ... --out DIR`.",
+            show_default=False,
         ),
     ],
     x: Annotated[

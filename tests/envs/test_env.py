@@ -297,3 +297,10 @@ def test_a_problem_is_stated_once_for_the_same_arguments():
     # What cannot be looked up is an error of ours all the same.
     with pytest.raises(ConfigurationError, match="radius"):
         gym.make("safe_envs/DubinsDisk-v0", radius=[2.0])
+
+
+@pytest.mark.parametrize("given", ["false", None, 1])
+def test_whether_a_violation_ends_an_episode_is_true_or_false(given):
+    for make in (gym.make, gym.make_vec):
+        with pytest.raises(ConfigurationError, match=r"terminate_on_violation = .*True or"):
+            make("safe_envs/Scalar-v0", terminate_on_violation=given)

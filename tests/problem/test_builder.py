@@ -115,7 +115,7 @@ def test_from_rate_takes_a_rate_apart():
         ({"start": [0.0]}, SystemDefinitionError, "2 states: x, v"),
         ({"start": [(0.0, math.inf), 0.0]}, ConfigurationError, "not finite"),
         ({"box": (1.0, -1.0)}, ConfigurationError, "the lower one below the upper"),
-        ({"box": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "each of the 1 inputs"),
+        ({"box": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "give \\(low, high\\)"),
         ({"box": 3.0}, ConfigurationError, "give \\(low, high\\)"),
         ({"nominal": [u, u]}, SystemDefinitionError, "nominal expression for each of the 1 inputs"),
     ],

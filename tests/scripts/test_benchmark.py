@@ -18,7 +18,7 @@ from safe_envs.agents.training import vec_env_speed as sb3_speed
 from safe_envs.compiled.program import Program
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import benchmark
-from safe_envs.scripts.reports import benchmark_cases, benchmark_figures, latency
+from safe_envs.scripts.reports import benchmark_cases, benchmark_figures, command_times, latency
 from safe_envs.scripts.reports.benchmark_cases import Case
 from safe_envs.scripts.reports.benchmark_figures import Part
 from safe_envs.scripts.reports.hand_written_loop import step_by_hand
@@ -47,6 +47,8 @@ def quick(monkeypatch):
     monkeypatch.setattr(benchmark_figures, "_EPISODES", {"numpy": 20, "compiled": 2})
     monkeypatch.setattr(latency, "_CALLS", 50)
     monkeypatch.setattr(latency, "_DRAWN", 1024)
+    monkeypatch.setattr(command_times, "_ROUNDS", 1)
+    monkeypatch.setattr(command_times, "MISTAKES", command_times.MISTAKES[:1])
 
 
 def measured():

@@ -63,7 +63,7 @@ USER_ERRORS = (
     ([DUBINS, "--noise", "loud"], ["--noise 'loud'"]),
     ([DUBINS, "--noise", "1,2,3"], ["sigma_1, sigma_2"]),
     ([DUBINS, "--episodes", "0"], ["episodes = 0"]),
-    ([DUBINS, "--num-envs", "0"], ["num_envs = 0"]),
+    ([DUBINS, "--num-envs", "0"], ["--num-envs = 0"]),
     ([DUBINS, "--seed", "-1"], ["seed = -1"]),
     ([DUBINS, "--engine", "compile"], ["engine = 'compile'", "did you mean 'compiled'"]),
     ([DUBINS, "--jobs", "0"], ["jobs = 0"]),
@@ -97,11 +97,11 @@ USER_ERRORS = (
     ),
     (
         [DUBINS, "--json", "ppo.zip", "--policy", "ppo.zip"],
-        ["would overwrite the file of --policy ppo.zip"],
+        ["'ppo.zip': there is no such file"],
     ),
     (
         [DUBINS, "--json", "policy.npz", "--policy", "."],
-        ["would overwrite the file of --policy policy.npz"],
+        ["policy.npz does not exist"],
     ),
     ([DUBINS, "--plot", "nowhere/out.png"], ["cannot write nowhere/out.png"]),
     ([DUBINS, "--plot", "out.pong"], ["unknown format 'pong'", "did you mean 'png'"]),
@@ -155,6 +155,15 @@ def test_a_trained_policy_needs_trust_only_as_a_zip(safe_envs_command, ppo):
         )
     status, _, err = safe_envs_command(*verification, "--policy", "ppo/model.zip", "--trust")
     assert (status, "another observation space" in " ".join(err.split())) == (2, True)
+
+
+@pytest.mark.parametrize("policy", ["ppo", "ppo/model.zip"])
+def test_a_policy_is_not_overwritten(safe_envs_command, ppo, policy):
+    file = Path("ppo/policy.npz" if policy == "ppo" else policy)
+    before = file.read_bytes()
+    status, _, err = safe_envs_command("evaluate", DUBINS, "--policy", policy, "--json", file)
+    assert (status, file.read_bytes()) == (2, before)
+    assert f"would overwrite the file of --policy {file}" in err
 
 
 def test_forces_beyond_floating_point_are_an_error_not_a_crash(safe_envs_command):

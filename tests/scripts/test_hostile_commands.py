@@ -17,11 +17,11 @@ LONG = "x" * 100_000
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((*SCALAR, "--seed", "1_0"), "'1_0' is not a valid integer"),
-        ((*SCALAR, "--seed", "٣"), "'٣' is not a valid integer"),
-        ((*SCALAR, "--seed", "9" * 5000), "is not a valid integer"),
-        ((*SCALAR, "--dt", "1_0"), "'1_0' is not a valid float"),
-        (("demo", "--episodes", 0), "0 is not in the range x>=1"),
+        ((*SCALAR, "--seed", "1_0"), "--seed = '1_0'; give a whole number"),
+        ((*SCALAR, "--seed", "٣"), "--seed = '٣'; give a whole number"),
+        ((*SCALAR, "--seed", "9" * 5000), "give a whole number"),
+        ((*SCALAR, "--dt", "1_0"), "--dt = '1_0'; give a number"),
+        (("demo", "--episodes", 0), "--episodes = 0; give a whole number from 1"),
         ((*SCALAR, "--noise", "1_0"), "'1_0' is no number"),
         ((*SCALAR, "--noise", "٣"), "'٣' is no number"),
         ((*SCALAR, "--box=-1_0,1"), "is no number"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.evaluation.filter_texts import checked_filter
 from safe_envs.agents.evaluation.identification import Learning
 from safe_envs.agents.evaluation.spec import (
     UNFILTERED,
@@ -22,18 +23,14 @@ from safe_envs.agents.policies.custom import policy_name
 from safe_envs.agents.policies.names import policy_file
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
     Condition,
     SafetyFilterVectorWrapper,
-    parse_conditions,
-    require_readable,
     spec_of,
 )
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
-from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
 from safe_envs.wrappers.env_wrappers import lone_filters
 from safe_envs.wrappers.value.closed_loop import require_few_states
 from safe_envs.wrappers.value.reduction import reduced
@@ -85,7 +82,7 @@ class ResolvedEvaluation:
             settings.require_fit(self.problem, spec.objective)
         self._in_use: list[lone_filters.LoneFilter] = []
         known = self.problem.plant if spec.knowledge == "plant" else self.problem.model
-        self._texts = {name: _checked(name, self.problem, known) for name in texts}
+        self._texts = {name: checked_filter(name, self.problem, known) for name in texts}
         self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
         if self.target.filter_spec is not None and self.learning.missing():
             raise ConfigurationError(
@@ -259,35 +256,6 @@ def _require_third_party(spec: EvaluationSpec) -> None:
         raise ConfigurationError(
             f"knowledge = {shown(spec.knowledge)}: nothing is known but the model of such an env"
         )
-
-
-def _checked(name: str, problem: SafetyProblem, known: ControlAffineSDE) -> str | None:
-    """Return the text of a filter with all parameters; None where it has to be learned first.
-
-    Args:
-        name: of the filter, as it was given.
-        problem: whose barriers it is for.
-        known: the system that it knows.
-    """
-    if name == UNFILTERED:
-        return UNFILTERED
-    if UNFILTERED in name.split("+"):
-        raise ConfigurationError(
-            f"filter {shown(name)}: {UNFILTERED!r} is the unfiltered env, no condition; give it"
-            " alone or leave it out"
-        )
-    require_known(name, UNFILTERED)
-    settings = lone_filters.settings_of(name)
-    if settings is not None:
-        return settings.text
-    if learned_parts(name):
-        require_readable(name, problem)
-        return None
-    conditions = parse_conditions(name, problem)
-    # What does not suit a barrier is an error before tables are read, which may take long.
-    for condition, barrier in zip(conditions, problem.barriers, strict=True):
-        condition.constraint(known, barrier)
-    return spec_of(conditions)
 
 
 def _describe(problem: SafetyProblem) -> dict[str, Any]:

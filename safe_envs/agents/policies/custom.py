@@ -65,8 +65,9 @@ def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) 
     """Return an object with `predict` for a policy from outside this project.
 
     Args:
-        given: an object with `predict`; a class that takes the problem and makes one; or a
-            function of a batch of observations, see `FunctionPolicy`.
+        given: an object with `predict`; a class that takes the problem and makes one; a function
+            that does so, whose only parameter is called `problem`; or a function of a batch of
+            observations, see `FunctionPolicy`.
         problem: which the policy is to act in.
         spaces: of observations and actions; by default those of the problem's env.
 
@@ -74,7 +75,7 @@ def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) 
         ConfigurationError: It is none of these, or the class cannot be called with the problem.
     """
     made: Any = given
-    if inspect.isclass(given):
+    if inspect.isclass(given) or _is_factory(given):
         make: Any = given
         try:
             made = make(problem)
@@ -83,8 +84,8 @@ def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) 
         except Exception as error:
             raise ConfigurationError(
                 f"the policy {given.__name__} cannot be made with the problem {problem.name}"
-                f" ({type(error).__name__}: {shortened(error)}); a class takes the SafetyProblem as"
-                " its only argument"
+                f" ({type(error).__name__}: {shortened(error)}); a class, and a function whose"
+                " only parameter is called problem, takes the SafetyProblem"
             ) from error
     if callable(getattr(made, "predict", None)):
         return made
@@ -94,9 +95,15 @@ def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) 
         return FunctionPolicy(made, *map(gym.spaces.flatdim, spaces))
     raise ConfigurationError(
         f"a {type(made).__name__} is no policy; give an object with predict(observation, state,"
-        " episode_start, deterministic), a class that takes the SafetyProblem, or a function of a"
-        " batch of observations (B, k) that returns actions (B, m)"
+        " episode_start, deterministic), a class or function(problem) that takes the SafetyProblem"
+        " and makes one, or a function of a batch of observations (B, k) that returns actions"
+        " (B, m)"
     )
+
+
+def _is_factory(given: Any) -> bool:
+    """Return whether a function takes a problem, and not a batch of observations."""
+    return inspect.isfunction(given) and list(inspect.signature(given).parameters) == ["problem"]
 
 
 def policy_name(given: Any) -> str:

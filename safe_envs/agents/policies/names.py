@@ -31,7 +31,12 @@ def require_policy(name: str) -> None:
     Args:
         name: as for `safe_envs.agents.policies.registry.make_policy`.
     """
-    if name in POLICIES or name in plugin_names(POLICY_PLUGINS) or os.path.exists(name):
+    if name in POLICIES or name in plugin_names(POLICY_PLUGINS):
+        return
+    if os.path.exists(name):
+        saved = saved_policy_file(Path(name))
+        if saved is not None and not os.path.exists(saved):
+            raise ConfigurationError(f"{saved} does not exist; `safe-envs train` writes such files")
         return
     if is_place(name):
         file = policy_file(name)

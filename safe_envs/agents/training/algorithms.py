@@ -77,8 +77,6 @@ def new_model(
     # Stable-Baselines3 writes into what it is given.
     left = scheduled(copy.deepcopy(dict(settings)))
     _require_known(name, left)
-    # So that Stable-Baselines3 can load its files without this package.
-    envs.action_space = getattr(envs.action_space, "plain", envs.action_space)
     try:
         envs = _normalized(envs, left.pop("normalize", False), left.get("gamma", 0.99))
         left |= _action_noise(

@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
+from safe_envs.agents.training.lazy_info import of_each
 from safe_envs.agents.training.multiplier import PIDMultiplier, require_at_least_zero
 from safe_envs.errors import ConfigurationError, shown
 
@@ -165,26 +167,37 @@ def costs_of(infos: Sequence[Any]) -> np.ndarray:
         infos: with the entry "cost"; infos of a `SafeVecEnv` are read at once.
 
     Raises:
-        ConfigurationError: an info has no cost, or one that is negative or not finite.
+        ConfigurationError: an info has no cost, or one that is negative or no finite number.
     """
-    batch = getattr(infos[0], "batch", None)
-    if batch is not None and all(getattr(info, "batch", None) is batch for info in infos):
-        costs = batch.get("cost")
-        costs = None if costs is None else costs[[info.index for info in infos]]
-    else:
-        each = [info.get("cost") for info in infos]
-        costs = None if any(cost is None for cost in each) else each
-    if costs is None:
+    given = of_each(infos, "cost")
+    if isinstance(given, list) and any(cost is None for cost in given):
         raise ConfigurationError(
             "the infos have no entry 'cost', on which a constrained algorithm learns; give an env"
             " that reports one, or wrap it so that it does"
         )
-    costs = np.asarray(costs, dtype=np.float64)
-    if not ((costs >= 0.0) & np.isfinite(costs)).all():
+    try:
+        costs = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        costs = np.empty(0)
+    if costs.shape != (len(infos),) or not ((costs >= 0.0) & np.isfinite(costs)).all():
         raise ConfigurationError(
-            f"info['cost'] = {shown(costs.tolist())}; costs are numbers from 0"
+            f"info['cost'] = {shown(given if isinstance(given, list) else given.tolist())}; the"
+            " cost of a step is one finite number from 0"
         )
     return costs
+
+
+def require_one_part(space: spaces.Space[Any]) -> None:
+    """Raise ConfigurationError for observations of several parts.
+
+    Args:
+        space: of the observations.
+    """
+    if isinstance(space, spaces.Dict):
+        raise ConfigurationError(
+            "the observations have several parts; flatten them, as with"
+            " gymnasium.wrappers.FlattenObservation"
+        )
 
 
 def _require_numbers(name: str, given: Any, count: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any
 
@@ -90,6 +90,25 @@ class LazyInfo(dict[str, Any]):
             self[key] = self[key]
         # What is deleted from now on stays away.
         self._left = {}
+
+
+def of_each(infos: Sequence[Any], key: str) -> np.ndarray | list[Any]:
+    """Return an entry of every info: an array if they are views of one batch, or a list.
+
+    Args:
+        infos: any; those that have `batch`, a dict of arrays over the envs, and `index`, their row
+            in them, are read at once, unless the entry of one was written to.
+        key: of the entry, for which the list has None where it is missing.
+    """
+    batch = getattr(infos[0], "batch", None)
+    if (
+        batch is None
+        or key not in batch
+        or any(getattr(info, "batch", None) is not batch for info in infos)
+        or any(dict.__contains__(info, key) for info in infos)
+    ):
+        return [info.get(key) for info in infos]
+    return batch[key][[info.index for info in infos]]
 
 
 def _same(a: Any, b: Any) -> bool:

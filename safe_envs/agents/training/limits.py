@@ -8,6 +8,7 @@ from typing import Any
 
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.training.constraint import EpisodeConstraint
+from safe_envs.errors import shown
 
 COST, VIOLATION = "cost_limit", "violation_limit"
 """Names of the limits: of the expected number of unsafe steps of an episode, and of the probability
@@ -40,7 +41,7 @@ def judged(
         `kind`, `limit`, the `multiplier` and whether it is `saturated`; number of `episodes` in
         training, their `mean` cost, and its 95 % interval from `low` to `high`, all None before
         every env ended an episode; `met`: False if this interval, or that of the evaluation, lies
-        above the limit, otherwise True, or None as long as nothing was measured; and
+        above the limit, otherwise True, or None as long as nothing was measured in training; and
         `evaluation_met`: the same for the evaluation alone, None for a limit of the cost, which it
         does not measure.
     """
@@ -55,8 +56,9 @@ def judged(
     else:
         found["evaluation_met"] = None
     if not constraint.recent:
-        unknown = dict.fromkeys(("mean", "low", "high", "met"))
-        return found | {"episodes": 0, **unknown}
+        unknown = dict.fromkeys(("mean", "low", "high"))
+        met = False if found["evaluation_met"] is False else None
+        return found | {"episodes": 0, "met": met, **unknown}
     episodes, cost, squares, violated = (
         sum(numbers) for numbers in zip(*constraint.recent, strict=True)
     )
@@ -73,6 +75,24 @@ def judged(
         "high": high,
         "met": low <= constraint.limit and found["evaluation_met"] is not False,
     }
+
+
+def require_judgement(given: Any) -> None:
+    """Raise ValueError unless it is what `judged` returns, as far as it is read again.
+
+    Args:
+        given: content of a file.
+    """
+    numbers = [given[name] for name in ("limit", "multiplier", "episodes")]
+    numbers += [given[name] for name in ("mean", "low", "high") if given["episodes"]]
+    kept = [given[name] for name in ("met", "evaluation_met")]
+    if not (
+        given["kind"] in UNITS
+        and type(given["saturated"]) is bool
+        and all(met is None or type(met) is bool for met in kept)
+        and all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
+    ):
+        raise ValueError(f"the limit is judged as {shown(given)}")
 
 
 def rank(evaluation: Mapping[str, Any]) -> tuple[bool, float]:

@@ -128,3 +128,15 @@ def require_at_least_zero(name: str, number: Any) -> None:
     real = isinstance(number, numbers.Real) and not isinstance(number, bool)
     if not real or not 0.0 <= float(number) < math.inf:
         raise ConfigurationError(f"{name} = {shown(number)}; give a finite number from 0")
+
+
+def require_share(name: str, number: Any) -> None:
+    """Raise ConfigurationError unless a number is from 0 to 1.
+
+    Args:
+        name: in the message.
+        number: to check.
+    """
+    real = isinstance(number, numbers.Real) and not isinstance(number, bool)
+    if not real or not 0.0 <= float(number) <= 1.0:
+        raise ConfigurationError(f"{name} = {shown(number)}; give a number from 0 to 1")

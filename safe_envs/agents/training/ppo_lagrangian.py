@@ -6,13 +6,12 @@ import copy
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of
+from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of, require_one_part
 from safe_envs.agents.training.cost_critic import CostCritic
-from safe_envs.errors import ConfigurationError
+from safe_envs.agents.training.multiplier import require_share
 
 _LEAST_SPREAD = 1e-6
 _OF_THE_CONSTRAINT = (
@@ -81,8 +80,7 @@ class PPOLagrangian(PPO):
         **kwargs: Any,
     ) -> None:
         for name, number in {"cost_gamma": cost_gamma, "cost_gae_lambda": cost_gae_lambda}.items():
-            if not 0.0 <= number <= 1.0:
-                raise ConfigurationError(f"{name} = {number!r}; give a number from 0 to 1")
+            require_share(name, number)
         self.cost_limit, self.cost_unit = cost_limit, cost_unit
         self.cost_gamma, self.cost_gae_lambda = cost_gamma, cost_gae_lambda
         self.multiplier_gains = {
@@ -96,11 +94,7 @@ class PPOLagrangian(PPO):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if isinstance(self.observation_space, spaces.Dict):
-            raise ConfigurationError(
-                "the observations have several parts; flatten them, as with"
-                " gymnasium.wrappers.FlattenObservation"
-            )
+        require_one_part(self.observation_space)
         known: EpisodeConstraint | None = vars(self).get("constraint")
         self.constraint = EpisodeConstraint(
             self.cost_limit, self.n_envs, unit=self.cost_unit, gains=self.multiplier_gains
@@ -185,6 +179,9 @@ class PPOLagrangian(PPO):
     def _weighted(self, rewards: np.ndarray, costs: np.ndarray) -> np.ndarray:
         """Return the advantages that the policy learns on, float32 of the arguments' shape."""
         weight = self.constraint.value
+        # 0 times a cost that has diverged is no number.
+        if weight == 0.0:
+            return rewards
         scale = rewards.std() / max(costs.std(), _LEAST_SPREAD)
         return ((rewards - weight * scale * costs) / (1.0 + weight)).astype(np.float32)
 

@@ -44,9 +44,10 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from safe_envs.agents.training.hyperparameters import ACTIONS
+from safe_envs.agents.training.lazy_info import of_each
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.env_wrappers.filtered_box import FilteredBox
+from safe_envs.wrappers.env_wrappers.filtered_box import ends_of
 
 _ROUNDING = 1e-6
 """How far beyond [-1, 1] rounding may move an action on the input bounds."""
@@ -95,12 +96,12 @@ class FilteredReplayBuffer(ReplayBuffer):
                 " optimize_memory_usage=False"
             )
         self.action = action
-        space = self.action_space
+        ends = ends_of(self.action_space)
         if box is not None:
             self._center, self._half = _center_and_half_width(box, self.action_dim)
-        elif isinstance(space, FilteredBox):
-            self._center = 0.5 * (space.at_low + space.at_high)
-            self._half = 0.5 * (space.at_high - space.at_low)
+        elif ends is not None:
+            at_low, at_high = ends
+            self._center, self._half = 0.5 * (at_low + at_high), 0.5 * (at_high - at_low)
         else:  # there may be no filter, and nothing to scale
             self._center = self._half = None
 
@@ -140,7 +141,7 @@ class FilteredReplayBuffer(ReplayBuffer):
 
     def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """Return executed actions in [-1, 1], or proposals without a filter, shape (n_envs, m)."""
-        each = _of_each(infos, "safe_action")
+        each = of_each(infos, "safe_action")
         if isinstance(each, np.ndarray):
             return self._normalized(each)
         filtered = [i for i, u in enumerate(each) if u is not None]
@@ -225,26 +226,10 @@ def replay_options(
 
 def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
     """Return the rewards before a penalty on interventions, shape (n_envs,)."""
-    penalties = _of_each(infos, "intervention_penalty")
+    penalties = of_each(infos, "intervention_penalty")
     if isinstance(penalties, list):
         penalties = np.array([penalty or 0.0 for penalty in penalties])
     return reward + penalties
-
-
-def _of_each(infos: Sequence[Any], key: str) -> np.ndarray | list[Any]:
-    """Return an entry of every info: an array if they are views of one batch, or a list.
-
-    An info may have `batch`, a dict of arrays over the envs, and `index`, its row in them. The list
-    has None for a missing entry.
-    """
-    batch = getattr(infos[0], "batch", None)
-    if (
-        batch is None
-        or key not in batch
-        or any(getattr(info, "batch", None) is not batch for info in infos)
-    ):
-        return [info.get(key) for info in infos]
-    return batch[key][[info.index for info in infos]]
 
 
 def _center_and_half_width(

@@ -13,6 +13,7 @@ from typing import Any
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import MOST_BYTES, reading
 from safe_envs.agents.training.config import Training
+from safe_envs.agents.training.limits import require_judgement
 from safe_envs.atomic_io import write_json, writing
 from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError, shortened
@@ -73,15 +74,39 @@ def _require_same_training(folder: Path, training: Training) -> None:
             f" {', '.join(unknown)}; go on with that version, or start it again in another folder"
         )
     wanted = _flat(json.loads(json.dumps(asdict(training))))
-    # Another system may change others too, such as a default, which come after it.
-    for name in sorted(
-        {*known, *wanted}, key=lambda name: (name != "env_id", name != "system", name)
-    ):
+    # These may change others too, such as a default.
+    first = ("env_id", "system", "algorithm", "n_timesteps")
+    for name in (*first, *sorted({*known, *wanted}.difference(first))):
         if known.get(name) != wanted.get(name):
             raise ConfigurationError(
                 f"--resume: the training in {folder} has {name} = {known.get(name)!r}, not"
                 f" {wanted.get(name)!r}; give the same arguments"
             )
+
+
+def require_same_versions(folder: Path, versions: Mapping[str, str]) -> None:
+    """Check that no agent of other versions of the packages is in a folder.
+
+    Args:
+        folder: of a training, begun or not.
+        versions: those in use.
+
+    Raises:
+        ConfigurationError: the folder has an agent of others, or its file is damaged.
+    """
+    path = folder / CONFIG
+    if not os.path.isfile(path):
+        return
+    with reading(path, _ADVICE):
+        known = dict(_read(path)["versions"])
+    changed = sorted(name for name in {*known, *versions} if known.get(name) != versions.get(name))
+    if changed:
+        others = ", ".join(f"{name} {known.get(name, 'none')}" for name in changed)
+        now = ", ".join(f"{name} {versions.get(name, 'none')}" for name in changed)
+        raise ConfigurationError(
+            f"the agent in {folder} was trained with {others}, and in use is {now}; remove that"
+            " folder, and it is trained again, or give another --out"
+        )
 
 
 def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -120,12 +145,12 @@ def read_evaluations(folder: Path) -> list[dict[str, Any]]:
         rows = _read(path)
         for row in rows:
             numbers = [row["timesteps"], *(row[name] for name in SHOWN)]
-            numbers.append(row["training"]["violations"])
-            for name in ("met", "evaluation_met"):
-                if (met := row.get("constraint", {}).get(name)) not in (None, True, False):
-                    raise ValueError(f"its limit is met: {met!r}")
+            numbers += [row["episodes"], row["training"]["violations"]]
+            if "constraint" in row:
+                require_judgement(row["constraint"])
             if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
                 raise ValueError(f"its numbers are {numbers}")
+        json.dumps(rows, allow_nan=False)  # as it is to be written again
     return rows
 
 

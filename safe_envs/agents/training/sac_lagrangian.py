@@ -28,7 +28,6 @@ Sources: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018,
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any
 
 import numpy as np
@@ -38,8 +37,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional
 
-from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of
+from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of, require_one_part
 from safe_envs.agents.training.cost_replay_buffer import with_costs
+from safe_envs.agents.training.multiplier import require_at_least_zero, require_share
 from safe_envs.errors import ConfigurationError
 
 _OF_THE_CRITICS = 0xC057
@@ -85,7 +85,8 @@ class SACLagrangian(SAC):
         **kwargs: those of SAC. The replay buffer is `replay_buffer_class` with costs.
 
     Raises:
-        ConfigurationError: an argument is out of range, or the buffer cannot hold costs.
+        ConfigurationError: an argument is out of range, the buffer cannot hold costs, or the env
+            has observations of several parts.
     """
 
     def __init__(  # noqa: PLR0913  (hyperparameters)
@@ -102,10 +103,12 @@ class SACLagrangian(SAC):
         multiplier_most: float = 100.0,
         **kwargs: Any,
     ) -> None:
-        if cost_gamma is not None and not 0.0 <= cost_gamma <= 1.0:
-            raise ConfigurationError(f"cost_gamma = {cost_gamma!r}; give a number from 0 to 1")
-        if cost_scale is not None and not 0.0 < cost_scale < math.inf:
-            raise ConfigurationError(f"cost_scale = {cost_scale!r}; give a positive number")
+        if cost_gamma is not None:
+            require_share("cost_gamma", cost_gamma)
+        if cost_scale is not None:
+            require_at_least_zero("cost_scale", cost_scale)
+            if cost_scale == 0.0:
+                raise ConfigurationError(f"cost_scale = {cost_scale!r}; give a positive number")
         if kwargs.get("n_steps", 1) != 1:
             raise ConfigurationError(
                 f"n_steps = {kwargs['n_steps']!r}: costs have targets of one step; set n_steps=1"
@@ -122,6 +125,7 @@ class SACLagrangian(SAC):
         super().__init__(*args, **kwargs)
 
     def _setup_model(self) -> None:
+        require_one_part(self.observation_space)
         given = vars(self).get("_buffer_class") or self.replay_buffer_class or ReplayBuffer
         self._buffer_class, self.replay_buffer_class = given, with_costs(given)
         super()._setup_model()
@@ -138,6 +142,8 @@ class SACLagrangian(SAC):
                 th.manual_seed(int(seed.generate_state(1)[0]))
             self.cost_critic = self.policy.make_critic()
             self.cost_critic_target = self.policy.make_critic()
+        # Even where the policy's critic takes the features that its actor learns.
+        self.cost_critic.share_features_extractor = False
         self.cost_critic_target.load_state_dict(self.cost_critic.state_dict())
         self.cost_critic_target.set_training_mode(False)
         self.cost_critic.optimizer = self.policy.optimizer_class(

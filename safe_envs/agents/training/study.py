@@ -25,6 +25,7 @@ from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.study_job import Planned, StudyJob, StudyRow
 from safe_envs.errors import ConfigurationError, SafeEnvsError, require_whole
+from safe_envs.file_locks import locked
 from safe_envs.registry import full_id, make_problem
 from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.value.reduction import reduced
@@ -32,7 +33,7 @@ from safe_envs.wrappers.value.reduction import reduced
 DEFAULT = "default"
 """The filter of the env, wherever a variant names a filter."""
 
-_RESULTS, _AGENTS = "results", "agents"
+_RESULTS, _AGENTS, _LOCK = "results", "agents", ".lock"
 _EVALUATION = 1
 """Key of the seeds of evaluations; those of trainings have 0."""
 
@@ -117,6 +118,24 @@ class StudyResult:
         """
         return [r for r in self.rows if (r.env_id, r.variant) == (env_id, variant)]
 
+    def reasons(self) -> list[dict[str, Any]]:
+        """Return what is missing, and why, as JSON-able data."""
+        return [
+            {"env_id": env_id, "variant": variant, "k": k, "reason": reason}
+            for (env_id, variant, k), reason in self.missing.items()
+        ]
+
+    def require_all(self) -> None:
+        """Raise ConfigurationError if an evaluation failed, or the training before it."""
+        failed = [(*key, reason) for key, reason in self.missing.items() if key[2] is not None]
+        if failed:
+            env_id, variant, k, reason = failed[0]
+            count = f"{len(failed)} evaluation{'s' if len(failed) > 1 else ''}"
+            raise ConfigurationError(
+                f"{count} failed, without which the tables are; {env_id}, {variant}, training {k}:"
+                f" {reason}"
+            )
+
 
 def training_seed(seed: int, env_id: str, k: int) -> int:
     """Return the seed of training k of an env.
@@ -157,31 +176,37 @@ def run_study(
         The rows of all agents, and what is missing.
 
     Raises:
-        ConfigurationError: the folder cannot be written, or has files that are damaged.
+        ConfigurationError: the folder cannot be written, has files that are damaged, or another
+            study writes to it.
     """
     missing: dict[tuple[str, str, int | None], str] = {}
     # Before a folder is made: the arguments may be refused.
     planned = list(_plans(study, out, missing))
     store = ResultStore(out / _RESULTS)
-    store.remove_unfinished()
-    kept = {each.key: row for each in planned if (row := _kept(store, each)) is not None}
-    jobs = _jobs([each for each in planned if each.key not in kept])
-    work = {key: job.work for key, job in jobs.items()}
-    done, total = 0, max(sum(work.values()), 1)
+    with locked(
+        out / _LOCK,
+        f"another study is writing to {out} just now; wait until it has ended, or give another"
+        " --out",
+    ):
+        store.remove_unfinished()
+        kept = {each.key: row for each in planned if (row := _kept(store, each)) is not None}
+        jobs = _jobs([each for each in planned if each.key not in kept])
+        work = {key: job.work for key, job in jobs.items()}
+        done, total = 0, max(sum(work.values()), 1)
 
-    def keep(outcome: JobOutcome) -> None:
-        nonlocal done
-        for each in jobs[outcome.key].planned:
-            row, error = (outcome.result or {}).get(each.key, (None, outcome.error))
-            if row is None:
-                missing[each.env_id, each.variant, each.k] = str(error)
-            else:
-                store.keep(each.key, each.configuration, {"row": asdict(row)})
-                kept[each.key] = row
-        done += work[outcome.key]
-        progress(done / total)
+        def keep(outcome: JobOutcome) -> None:
+            nonlocal done
+            for each in jobs[outcome.key].planned:
+                row, error = (outcome.result or {}).get(each.key, (None, outcome.error))
+                if row is None:
+                    missing[each.env_id, each.variant, each.k] = str(error)
+                else:
+                    store.keep(each.key, each.configuration, {"row": asdict(row)})
+                    kept[each.key] = row
+            done += work[outcome.key]
+            progress(done / total)
 
-    run(jobs.values(), backend or Backend(), keep, report)
+        run(jobs.values(), backend or Backend(), keep, report)
     found = [replace(kept[each.key], variant=each.variant) for each in planned if each.key in kept]
     return StudyResult(study, found, missing)
 
@@ -197,7 +222,7 @@ def _plans(
             of_seeds = [_planned(study, env_id, variant, k, default) for k in seeds]
             try:
                 for name in {of_seeds[0].filter, of_seeds[0].in_loop}:
-                    _require_suitable(study, env_id, name)
+                    _require_suitable(study, env_id, name, variant)
             except SafeEnvsError as error:
                 missing[env_id, variant.name, None] = str(error)
                 continue
@@ -236,9 +261,15 @@ def _named(text: str | None, default: str) -> str:
     return default if text == DEFAULT else text or UNFILTERED
 
 
-def _require_suitable(study: Study, env_id: str, name: str) -> None:
-    """Raise a SafeEnvsError if an env has no such filter, before agents are trained for it."""
-    spec = EvaluationSpec(env_id, filters=(name,), options=study.options, knowledge=study.knowledge)
+def _require_suitable(study: Study, env_id: str, name: str, variant: Variant) -> None:
+    """Raise a SafeEnvsError if an env has no such filter or policy, before agents are trained."""
+    spec = EvaluationSpec(
+        env_id,
+        variant.policy if variant.algorithm is None else "nominal",
+        (name,),
+        options=study.options,
+        knowledge=study.knowledge,
+    )
     found = ResolvedEvaluation(spec)
     if names_promise(name):
         reduced(found.problem, study.knowledge)

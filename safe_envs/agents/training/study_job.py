@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
 from functools import cached_property
@@ -10,10 +11,12 @@ from typing import Any, get_type_hints
 
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.agents.jobs.fingerprint import json_checksum
+from safe_envs.agents.jobs.fingerprint import file_checksum, json_checksum
 from safe_envs.agents.jobs.store import ResultStore
+from safe_envs.agents.policies.names import policy_file
 from safe_envs.agents.training.config import Training
-from safe_envs.errors import SafeEnvsError
+from safe_envs.errors import NumericalError, SafeEnvsError
+from safe_envs.wrappers.conditions.text_parts import files_of
 
 _LEARNED = "learned"
 """Name of the file in an agent's folder that tells what its training was like, once it is over."""
@@ -141,6 +144,7 @@ class Planned:
         """All that the result depends on but for the name of the variant."""
         names = ("filter", "options", "knowledge", "episodes")
         evaluation = {name: getattr(self, name) for name in names}
+        evaluation |= _checksums(self.filter, self.policy if self.training is None else None)
         return {
             "env_id": self.env_id,
             "k": self.k,
@@ -185,7 +189,7 @@ class StudyJob:
         policy, learned = first.policy, {"violations": None, "seconds": None}
         if first.training is not None:
             folder = first.agents / self.key
-            policy, learned = str(folder), _learned(first.training, folder)
+            policy, learned = str(folder), _learned(first.training, folder, first.versions)
         found = {}
         for planned in self.planned:
             try:
@@ -195,12 +199,17 @@ class StudyJob:
         return found
 
 
-def _learned(training: Training, folder: Path) -> dict[str, Any]:
+def _learned(training: Training, folder: Path, versions: dict[str, str]) -> dict[str, Any]:
     """Train an agent unless a folder has it, and return its violations and its time."""
     # Here, so that processes which only read results do not load torch.
-    from safe_envs.agents.training.run_folder import CONFIG, read_evaluations
+    from safe_envs.agents.training.run_folder import (
+        CONFIG,
+        read_evaluations,
+        require_same_versions,
+    )
     from safe_envs.agents.training.trainer import train
 
+    require_same_versions(folder, versions)
     store, configuration = ResultStore(folder), {"training": _told(training)}
     document = store.read(_LEARNED, configuration)
     if document is None:
@@ -224,6 +233,8 @@ def _row(planned: Planned, policy: str, learned: dict[str, Any]) -> StudyRow:
         best=False,
     )
     training, row = planned.training, found.rows[0]
+    if not math.isfinite(row.return_mean):
+        raise NumericalError(f"the mean return of the evaluation is {row.return_mean}")
     return StudyRow(
         env_id=planned.env_id,
         variant=planned.variant,
@@ -239,9 +250,20 @@ def _row(planned: Planned, policy: str, learned: dict[str, Any]) -> StudyRow:
 
 
 def _told(training: Training) -> dict[str, Any]:
-    """Return the attributes that are not the defaults: a new one leaves earlier results valid."""
+    """Return the attributes that are not the defaults, and the checksums of the filter's files.
+
+    A new attribute leaves earlier results valid.
+    """
     defaults = {
         each.name: each.default if each.default_factory is MISSING else each.default_factory()
         for each in fields(training)
     }
-    return {k: v for k, v in asdict(training).items() if v != defaults[k]}
+    told = {k: v for k, v in asdict(training).items() if v != defaults[k]}
+    return told | _checksums(training.filter or UNFILTERED)
+
+
+def _checksums(text: str, policy: str | None = None) -> dict[str, dict[str, str]]:
+    """Return the checksums of the files of a filter and a policy, as "files"; {} without files."""
+    of_policy = None if policy is None else policy_file(policy)
+    files = [*files_of(text), *([] if of_policy is None else [of_policy])]
+    return {"files": {str(each): file_checksum(each) for each in files}} if files else {}

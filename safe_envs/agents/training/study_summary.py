@@ -43,16 +43,19 @@ class AgentSummary:
     estimates: Estimates
 
 
-_QUANTITIES: dict[str, tuple[bool, Callable[[StudyRow], float | None]]] = {
-    "safety": (False, lambda row: row.safety_rate),
-    "returns": (False, lambda row: row.return_mean),
-    "interventions": (False, lambda row: row.intervention_rate),
-    "safety_alone": (True, lambda row: row.safety_rate),
-    "returns_alone": (True, lambda row: row.return_mean),
-    "violations": (False, lambda row: row.violations),
-    "seconds": (False, lambda row: row.seconds),
+_FILTERED, _ALONE, _TRAINING = "filtered", "alone", "training"
+
+_QUANTITIES: dict[str, tuple[str, Callable[[StudyRow], float | None]]] = {
+    "safety": (_FILTERED, lambda row: row.safety_rate),
+    "returns": (_FILTERED, lambda row: row.return_mean),
+    "interventions": (_FILTERED, lambda row: row.intervention_rate),
+    "safety_alone": (_ALONE, lambda row: row.safety_rate),
+    "returns_alone": (_ALONE, lambda row: row.return_mean),
+    "violations": (_TRAINING, lambda row: row.violations),
+    "seconds": (_TRAINING, lambda row: row.seconds),
 }
-"""Whether they are of the evaluation without a filter, and where they are in a row."""
+"""Whether they are of the evaluation with the filter, of that without one, or of the training,
+which all evaluations of an agent tell; and where they are in a row."""
 
 
 def summaries(found: StudyResult, agents: Sequence[Agent], env_id: str) -> list[AgentSummary]:
@@ -100,7 +103,9 @@ def _summarised(
                     for name, each in values.items()
                 }
                 rows = found.of(env_id, agent.variants[text].name)
-                result.append(AgentSummary(env_id, agent.name, rows[0].filter, estimates))
+                # An env that has no such filter may still have the agents without it.
+                name = rows[0].filter if rows else text
+                result.append(AgentSummary(env_id, agent.name, name, estimates))
     return result
 
 
@@ -112,14 +117,15 @@ def _values(
     found: StudyResult, agent: Agent, env_id: str, text: str
 ) -> dict[str, dict[int, float]]:
     """Return the values of each quantity by the number of the training."""
-    alone = agent.variants.get(UNFILTERED)
+    by_text = {key: found.of(env_id, each.name) for key, each in agent.variants.items()}
     rows = {
-        False: found.of(env_id, agent.variants[text].name),
-        True: [] if alone is None else found.of(env_id, alone.name),
+        _FILTERED: by_text[text],
+        _ALONE: by_text.get(UNFILTERED, []),
+        _TRAINING: [row for of_text in by_text.values() for row in of_text],
     }
     return {
-        name: {row.k: float(v) for row in rows[of_alone] if (v := value(row)) is not None}
-        for name, (of_alone, value) in _QUANTITIES.items()
+        name: {row.k: float(v) for row in rows[of] if (v := value(row)) is not None}
+        for name, (of, value) in _QUANTITIES.items()
     }
 
 

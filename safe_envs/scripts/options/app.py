@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.package_version import package_version
 from safe_envs.scripts.options.console import Quiet, quietly, run, with_quiet
 from safe_envs.scripts.options.help_text import (
     GroupedCommand,
@@ -73,15 +74,11 @@ class _Group(TyperGroup):
     """A group whose help lists the commands in groups, without importing them."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of the commands."""
+        """See `typer.core.TyperGroup.list_commands`."""
         return list(self.commands)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name, the command and the rest of a command line.
-
-        Raises:
-            ConfigurationError: There is no such command.
-        """
+        """See `typer.core.TyperGroup.resolve_command`; the error of a command that there is not."""
         if not args[0].startswith("-") and args[0] not in self.commands:
             raise ConfigurationError(
                 f"unknown command {shown(args[0])}; {nearest(args[0], self.commands)};"
@@ -90,7 +87,7 @@ class _Group(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the commands and then the options of all; called to format the help."""
+        """See `typer.core.TyperGroup.format_options`: the commands, and then the options."""
         found: dict[str, list[tuple[str, str]]] = {}
         entries = getattr(self.commands, "entries", {}).values()
         for entry in entries:
@@ -100,7 +97,7 @@ class _Group(TyperGroup):
         write_sections(formatter, {"Options": options})
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write what to do next."""
+        """See `typer.core.TyperGroup.format_epilog`."""
         with formatter.section(heading("More")):
             formatter.write_text("`safe-envs COMMAND --help` lists the options of a command.")
 
@@ -159,9 +156,7 @@ def _made(name: str, function: Callable[..., None]) -> Any:
 
 def _print_version(asked: bool) -> None:
     if asked:
-        from safe_envs import __version__
-
-        typer.echo(f"{_NAME} {__version__}")
+        typer.echo(f"{_NAME} {package_version()}")
         raise typer.Exit
 
 

@@ -6,10 +6,13 @@ where an evaluation is asked for in Python; what needs a problem is checked ther
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+from safe_envs.errors import ConfigurationError, nearest, shortened, shown, unknown
 from safe_envs.scripts.options import completion
 
 _UNFILTERED = "none"
@@ -28,10 +31,14 @@ def known_filter(text: str | None) -> str | None:
     Raises:
         ConfigurationError: It begins otherwise.
     """
-    from safe_envs.wrappers.conditions.text_parts import require_known
+    from safe_envs.wrappers.conditions.names import unfiltered_in_sum
+    from safe_envs.wrappers.conditions.text_parts import require_known, require_parameters
 
-    if text and _UNFILTERED not in text.split("+"):
+    if text and text != _UNFILTERED:
+        if _UNFILTERED in text.split("+"):
+            raise unfiltered_in_sum(text)
         require_known(text, _UNFILTERED)
+        require_parameters(text)
     return text
 
 
@@ -67,6 +74,35 @@ def known_algorithm(name: str) -> str:
     return name
 
 
+def file_that_is_there(advice: str) -> Callable[[Any], Any]:
+    """Return the check of an argument that names a file to read.
+
+    Args:
+        advice: what to do where there is none, for the message.
+    """
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None and not os.path.lexists(path):
+            reason = os.strerror(errno.ENOENT)
+            raise ConfigurationError(f"{shortened(path)} cannot be read: {reason}; {advice}")
+        return path
+
+    return check
+
+
+def known_method(name: str) -> str:
+    """Return the value of --method if there is such a method.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    from safe_envs.scripts.options.method_settings import SETTINGS
+
+    if name not in SETTINGS:
+        raise unknown("method", name, SETTINGS)
+    return name
+
+
 def known_artefacts(names: list[str] | None) -> list[str] | None:
     """Return the names of tables and figures of the thesis if there are all of them.
 
@@ -76,7 +112,7 @@ def known_artefacts(names: list[str] | None) -> list[str] | None:
     allowed = ("all", *completion.ARTEFACTS)
     for name in names or ():
         if name not in allowed:
-            raise ConfigurationError(f"unknown artefact {shown(name)}; {nearest(name, allowed)}")
+            raise unknown("artefact", name, allowed)
     return names
 
 

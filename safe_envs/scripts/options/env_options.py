@@ -14,6 +14,7 @@ import typer
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.console import with_signature
+from safe_envs.systems import ENV_IDS
 
 _KINDS = get_type_hints(ProblemOptions)
 
@@ -97,9 +98,32 @@ class EnvOptions:
             if value is not None
         }
 
-    def require_known(self) -> None:
-        """Raise ConfigurationError where the env is unknown or an option cannot be read."""
-        _ = self.full_id, self.arguments
+    def require_known(self, filters: Sequence[str] = ()) -> None:
+        """Check the env, its options and its filters by what is known without its problem.
+
+        Args:
+            filters: their texts.
+
+        Raises:
+            ConfigurationError: The env is unknown, or cannot have an option.
+            RelativeDegreeError: A filter does not suit a barrier.
+        """
+        from safe_envs.registry import require_own
+        from safe_envs.systems.summary import summaries
+        from safe_envs.wrappers.conditions.text_parts import require_degrees
+
+        env_id, arguments = self.full_id, self.arguments
+        if env_id not in ENV_IDS:
+            require_own(env_id)
+            return
+        summary = summaries()[env_id]
+        if arguments:
+            title = env_id.partition("/")[2].removesuffix("-v0")
+            summary.require_options(title, arguments)
+        # Where rates are limited, they are the inputs, and the degree is another one.
+        if "rate_limit" not in arguments:
+            for text in filters:
+                require_degrees(text, summary.degree)
 
     def evaluate_command(self, *words: str) -> str:
         """Return a command line that evaluates something in the same env, quoted for a shell.
@@ -136,7 +160,8 @@ def with_env(command: Callable[..., None], without: Sequence[str] = ()) -> Calla
         env = EnvOptions(given["env_id"], given["system"], changes)
         # A third-party env need not be among the ids; its name shows to be wrong when it is made.
         if not arguments.get("filter_spec"):
-            env.require_known()
+            filters = arguments.get("filters") or [arguments.get("filter_name")]
+            env.require_known([text for text in filters if text])
         command(env=env, **arguments)
 
     found: list[inspect.Parameter] = []

@@ -24,13 +24,12 @@ Filters = Annotated[
         autocompletion=completion.filters,
         callback=early_checks.known_filters,
         help=(
-            "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf,"
-            " ddscbf, bayesian-scbf; certified:file=FILE, of a barrier certificate; with "
-            "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1; a condition of"
-            " your own: FILE.py:NAME; promise:p=0.99, which keeps a probability of being safe;"
-            " backup, which lets pass what a backup law of the env can make good."
-            " Repeatable. By default none and the env's own. "
-            f"Parameters of learned ones: {LEARNED_PARAMETERS}."
+            "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf or scbf; with parameters: hocbf:p=2,8; one"
+            " for each barrier: hocbf:p=2,8+cbf:alpha=1; promise:p=0.99, which keeps a probability"
+            " of being safe; backup, which lets pass what a backup law of the env can make good;"
+            " certified:file=FILE, of a barrier certificate; learned: learned-hocbf, ddscbf,"
+            " bayesian-scbf; a condition of your own: FILE.py:NAME. Repeatable. By default none and"
+            " the env's own."
         ),
     ),
 ]
@@ -42,8 +41,9 @@ Policy = Annotated[
         callback=early_checks.known_policy,
         help=(
             "nominal, clf, zero, random, best (as safe as a table shows to be possible), a policy"
-            " of your own as FILE.py:NAME, a folder of `safe-envs train`, or with --trust a .zip of"
-            " Stable-Baselines3."
+            " of your own as FILE.py:NAME (an object with predict, a class or a function that makes"
+            " one of the problem, or a function of a batch of observations), a folder of"
+            " `safe-envs train`, or with --trust a .zip of Stable-Baselines3."
         ),
     ),
 ]
@@ -70,10 +70,15 @@ Learned = Annotated[
     typer.Option(
         "--learned",
         metavar="FILE",
-        help="What `safe-envs identify` wrote, for the learned filters. Repeatable.",
+        help=(
+            "What `safe-envs identify` wrote, for the learned filters. Repeatable. Parameters of"
+            f" these filters: {LEARNED_PARAMETERS}."
+        ),
     ),
 ]
-Episodes = Annotated[int | None, typer.Option(min=1, help="Episodes for each filter. [1000]")]
+Episodes = Annotated[
+    int | None, typer.Option(min=1, show_default="1000", help="Episodes for each filter.")
+]
 Repeats = Annotated[
     int,
     typer.Option(
@@ -134,22 +139,29 @@ Rare = Annotated[
 ]
 Particles = Annotated[
     int | None,
-    typer.Option(help="With --rare, in place of --episodes: episodes of a repetition. [250]"),
+    typer.Option(
+        show_default="250", help="With --rare, in place of --episodes: episodes of a repetition."
+    ),
 ]
 Repetitions = Annotated[
-    int | None, typer.Option(help="With --rare: independent ones, which give the interval. [20]")
+    int | None,
+    typer.Option(show_default="20", help="With --rare: independent ones, which give the interval."),
 ]
 NumEnvs = Annotated[
     int | None,
-    typer.Option(min=1, help="Episodes side by side; it changes the speed, not the answer. [1024]"),
+    typer.Option(
+        min=1,
+        show_default="1024",
+        help="Episodes side by side; it changes the speed, not the answer.",
+    ),
 ]
 Jobs = Annotated[
     int | None,
     typer.Option(
         min=1,
+        show_default="1, or all",
         help=(
             "Processes, or threads of the compiled engine; they change the speed, not the answer."
-            " [1, or all]"
         ),
     ),
 ]

@@ -6,6 +6,7 @@ the rest of a command that only prints its help.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -30,12 +31,17 @@ Entry = tuple[str, str]
 class GroupedCommand(TyperCommand):
     """A command whose help has its options in groups and examples at the end."""
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """See `typer.core.TyperCommand.collect_usage_pieces`."""
+        arguments = [p for p in self.get_params(ctx) if p.param_type_name == "argument"]
+        return ["[OPTIONS]", *map(written, arguments)]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments and options; called by the method that formats the help."""
+        """See `typer.core.TyperCommand.format_options`."""
         write_sections(formatter, sections_of(self.get_params(ctx)))
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the examples."""
+        """See `typer.core.TyperCommand.format_epilog`: examples."""
         examples = EXAMPLES.get(self.name or "", ())
         if examples:
             with formatter.section(heading("Examples")):
@@ -60,10 +66,16 @@ def sections_of(params: Iterable[Any]) -> dict[str, list[Entry]]:
     return {panel: entries for panel, entries in found.items() if entries}
 
 
+def _argument(param: Any) -> str:
+    """Return an argument as usage lines write it: in brackets if it may be left out."""
+    name = (param.metavar or param.name.upper()).strip("[].")
+    return f"{name if param.required else f'[{name}]'}{'...' if param.nargs != 1 else ''}"
+
+
 def written(param: Any) -> str:
     """Return an argument or an option as it is written, with a placeholder for its value."""
     if param.param_type_name == "argument":
-        return param.metavar or param.name.upper()
+        return _argument(param)
     names = ", ".join(sorted(param.opts, key=len))
     if param.is_flag:
         return " / ".join([names, *param.secondary_opts])
@@ -72,6 +84,8 @@ def written(param: Any) -> str:
 
 def default_of(param: Any) -> str:
     """Return the default of an option that takes a value, as text; "" if it has none to show."""
+    if isinstance(param.show_default, str):
+        return param.show_default
     if param.is_flag or param.default is None or callable(param.default) or not param.show_default:
         return ""
     return str(param.default)
@@ -79,8 +93,9 @@ def default_of(param: Any) -> str:
 
 def with_default(param: Any) -> str:
     """Return what an option means, and its default in brackets."""
-    default = "required" if param.required else default_of(param)
-    return f"{param.help or ''}  [{default}]" if default else param.help or ""
+    default = default_of(param)
+    note = "  [required]" if param.required else f"  [default: {default}]" * bool(default)
+    return f"{param.help or ''}{note}"
 
 
 def write_sections(formatter: Any, sections: dict[str, list[Entry]]) -> None:
@@ -92,10 +107,30 @@ def write_sections(formatter: Any, sections: dict[str, list[Entry]]) -> None:
     """
     names = [len(name) for entries in sections.values() for name, _ in entries]
     # All groups have the same columns; a longer name has a line of its own.
-    width = max(length for length in names if length <= _WIDEST)
+    column = max(length for length in names if length <= _WIDEST) + 4
     for title, entries in sections.items():
         with formatter.section(heading(title)):
-            formatter.write_dl([(n.ljust(width), text) for n, text in entries], col_max=width)
+            for name, text in entries:
+                formatter.write(_entry(name, text, column, formatter.width))
+
+
+def _entry(name: str, text: str, column: int, width: int) -> str:
+    """Return the lines of an entry.
+
+    Words are not divided at hyphens, as Click does: `--closed-loop` is to be found and copied.
+    """
+    lines = [
+        line
+        for paragraph in text.split("\n\n")
+        for line in textwrap.wrap(
+            paragraph, width - column, break_on_hyphens=False, break_long_words=False
+        )
+    ]
+    first = f"  {name}"
+    if len(first) > column - 2:
+        lines.insert(0, "")
+    rows = [f"{first:<{column}}{lines[0] if lines else ''}"]
+    return "".join(f"{row.rstrip()}\n" for row in (*rows, *(" " * column + s for s in lines[1:])))
 
 
 def heading(title: str) -> str:

@@ -52,7 +52,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "safe-envs leaderboard Pendulum-v0 --out board --quick",
         "safe-envs leaderboard Pendulum-v0 --out board --pictures pictures --markdown",
     ),
-    "study": ("safe-envs study --out study --quick",),
+    "study": ("safe-envs study filters-in-training Pendulum-v0 --out study --quick",),
     "best": (
         "safe-envs best StochasticDubins-v0",
         "safe-envs best Scalar-v0 --cells 2000 --check --plot value.png",

@@ -43,7 +43,11 @@ Engine = Annotated[
         ),
     ),
 ]
-FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
+PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "tif", "tiff", "webp")
+"""Suffixes of pictures, which Matplotlib writes: to ask it takes longer than all else. An svgz is left
+out, since it holds the time."""
+
+FORMATS = ".png, .pdf, .svg, .eps, .jpg, .tif or .webp."
 
 
 def require_outputs(
@@ -95,15 +99,10 @@ def require_outputs(
 
 def _require_format(path: Path) -> None:
     """Raise ConfigurationError unless the suffix of a path names a format that can be drawn."""
-    # Not imported before it is needed: completion has to be quick.
-    from matplotlib.backend_bases import FigureCanvasBase
-
-    # pgf is left out, which needs a TeX installation, and svgz, which holds the time.
-    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf", "svgz"})
     suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in formats:
+    if suffix not in PLOT_FORMATS:
         raise ConfigurationError(
-            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}"
+            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, PLOT_FORMATS)}"
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from safe_envs.compiled.program import is_available
 from safe_envs.registry import make_problem
-from safe_envs.scripts.reports import latency
+from safe_envs.scripts.reports import command_times, latency
 from safe_envs.scripts.reports.benchmark_cases import (
     ENV_ID,
     NUM_ENVS,
@@ -74,6 +74,7 @@ def parts() -> list[Part]:
         Part("filter calls and envs", _calls_and_envs),
         Part("learned filters", _learned_filters),
         Part("evaluations and the VecEnv of Stable-Baselines3", _engines),
+        Part("commands that compute nothing", command_times.measure),
     ]
 
 

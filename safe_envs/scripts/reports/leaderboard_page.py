@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
-from safe_envs.atomic_io import write_atomically
+from safe_envs.atomic_io import require_writable, write_atomically
 from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError
 
 BEGIN, END = "<!-- leaderboard -->", "<!-- end of leaderboard -->"
 """The lines between which it is."""
+
+_PART = re.compile(
+    rf"((?:.*\n)?{re.escape(BEGIN)}(\r?\n))(?:.*\n)?({re.escape(END)}(?:\r?\n.*)?)", re.DOTALL
+)
+"""A page: up to the first line, the end of that line, and from the second line on."""
 
 
 def put_into(page: Path, markdown: str | None) -> None:
@@ -26,18 +32,26 @@ def put_into(page: Path, markdown: str | None) -> None:
     """
     try:
         text = read_bytes(page).decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"--page {page} cannot be read ({error}); give a page") from error
-    before, begin, rest = text.partition(f"{BEGIN}\n")
-    _, end, after = rest.partition(f"{END}\n")
-    if not (begin and end) or text.count(BEGIN) != 1 or text.count(END) != 1:
+    except OSError as error:
+        raise ConfigurationError(
+            f"--page {page} cannot be read ({error.strerror}); give a page that is there"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(
+            f"--page {page} is no text in UTF-8 ({error}); give a page of Markdown"
+        ) from error
+    found = _PART.fullmatch(text)
+    if found is None or text.count(BEGIN) != 1 or text.count(END) != 1:
         raise ConfigurationError(
             f"--page {page} needs the line {BEGIN} and below it the line {END}, each once; what is"
             " between them is replaced"
         )
+    require_writable(page)
     if markdown is not None:
-        whole = f"{before}{begin}\n{markdown}\n\n{end}{after}"
-        write_atomically(page, lambda part: part.write_text(whole))
+        before, newline, after = found.groups()
+        lines = f"\n{markdown}\n\n".replace("\n", newline)
+        whole = f"{before}{lines}{after}"
+        write_atomically(page, lambda part: part.write_bytes(whole.encode()))
 
 
 def link_from(page: Path | None, file: Path) -> str:

@@ -6,12 +6,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.best_text import best_notes, best_text
 from safe_envs.agents.evaluation.rate_text import percent_in
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.agents.training.seed_statistics import caution
+from safe_envs.text_tables import Column, columns_of
 
 if TYPE_CHECKING:
     from safe_envs.agents.training.leaderboard import LeaderboardEntry
@@ -78,10 +77,7 @@ class LeaderboardReport:
                 for key, each in self.best.items()
             },
             "frontiers": dict(self.frontiers),
-            "missing": [
-                {"env_id": env_id, "variant": variant, "k": k, "reason": reason}
-                for (env_id, variant, k), reason in self.found.missing.items()
-            ],
+            "missing": self.found.reasons(),
         }
 
 
@@ -90,8 +86,8 @@ def short_name(env_id: str) -> str:
     return env_id.removeprefix("safe_envs/").removesuffix("-v0")
 
 
-def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]:
-    """Yield a heading and a table for each env, then those over all envs.
+def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, list[Column]]]:
+    """Yield a heading and the columns for each env, then those over all envs.
 
     Args:
         report: to tell.
@@ -105,19 +101,17 @@ def leaderboard_tables(report: LeaderboardReport) -> Iterator[tuple[str, Table]]
             "\nunsafe\nsteps",
             "\n\nmin",
         )
-        table = make_table("lr", "variant", *titles)
-        for entry in report.of(env_id):
-            table.add_row(entry.variant, *_cells(entry, unit=""))
+        rows = [(_name(report, entry), *_cells(entry, unit="")) for entry in report.of(env_id)]
         best = report.best_of(env_id)
         if best is not None:
             safest = best_text(best).replace(_UNIT, "")
-            table.add_row("best", safest, *[_NONE] * (len(titles) - 1))
-        yield f"{short_name(env_id)}, filter {_filter(report, env_id)}", table
+            rows.append(("best", safest, *[_NONE] * (len(titles) - 1)))
+        columns = columns_of("lr", ("variant", *titles), rows)
+        yield f"{short_name(env_id)}, filter {_filter(report, env_id)}", columns
     if len(report.found.study.env_ids) > 1 and report.over_envs:
-        table = make_table("lr", "variant", "safe: IQM, 95 %")
-        for name, estimate in report.over_envs.items():
-            table.add_row(name, _percent(estimate))
-        yield f"All {len(report.found.study.env_ids)} envs", table
+        rows = [(name, _percent(estimate)) for name, estimate in report.over_envs.items()]
+        columns = columns_of("lr", ("variant", "safe: IQM, 95 %"), rows)
+        yield f"All {len(report.found.study.env_ids)} envs", columns
 
 
 def leaderboard_notes(report: LeaderboardReport) -> list[str]:
@@ -131,6 +125,7 @@ def leaderboard_notes(report: LeaderboardReport) -> list[str]:
         " interval of the episodes are those of these agents alone. Unsafe steps are those of a"
         " training, min is its processor time in minutes.",
     ]
+    notes += filter(None, [caution(report.found.study.seeds)])
     for found in report.best.values():
         if not isinstance(found, str):
             notes += best_notes(found)[:1]
@@ -153,7 +148,7 @@ def leaderboard_markdown(report: LeaderboardReport, pictures: Mapping[str, str])
     titles = ["variant", "safe", "of the episodes", "return", "unsafe steps", "min"]
     for env_id in report.found.study.env_ids:
         name, best = short_name(env_id), report.best_of(env_id)
-        rows = [[entry.variant, *_cells(entry)] for entry in report.of(env_id)]
+        rows = [[_name(report, entry), *_cells(entry)] for entry in report.of(env_id)]
         if best is not None:
             rows.append(["best", best_text(best), *[_NONE] * (len(titles) - 2)])
         picture = ""
@@ -176,6 +171,12 @@ def _markdown(titles: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def _name(report: LeaderboardReport, entry: LeaderboardEntry) -> str:
+    """Return the name of a variant, with the number of its seeds where trainings failed."""
+    seeds = entry.safety.seeds
+    return entry.variant + (f", {seeds} seeds" if seeds < report.found.study.seeds else "")
+
+
 def _filter(report: LeaderboardReport, env_id: str) -> str:
     """Return the text of the env's own filter."""
     from safe_envs.registry import make_problem
@@ -196,7 +197,8 @@ def _count(value: float) -> str:
     for scale, letter in ((1e6, " M"), (1e3, " k")):
         if value >= 9.9995 * scale:
             return f"{value / scale:.{1 if value < 99.95 * scale else 0}f}{letter}"
-    return f"{value:,.0f}"
+    # What is seldom is not never.
+    return f"{value:,.{1 if 0.0 < value <= 0.5 else 0}f}"
 
 
 def _percent(estimate: SeedEstimate) -> str:

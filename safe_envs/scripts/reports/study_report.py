@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.agents.training.seed_statistics import caution
+from safe_envs.text_tables import Column, columns_of
 
 if TYPE_CHECKING:
     from safe_envs.agents.training.seed_statistics import SeedEstimate
@@ -29,27 +29,25 @@ _PERCENT = ("safety", "interventions", "safety_alone")
 _WITHOUT_INTERVAL = ("violations", "seconds")
 
 
-def study_table(rows: Sequence[AgentSummary], differences: bool = False) -> Table:
-    """Return a table with a row for each agent and filter.
+def study_columns(rows: Sequence[AgentSummary], differences: bool = False) -> list[Column]:
+    """Return columns with an entry for each agent and filter; the first two are their names.
 
     Args:
         rows: of an env.
         differences: whether they are differences, which have a sign.
     """
-    table = make_table("lr", "agent", "filter", *_TITLES.values())
-    for row in rows:
-        table.add_row(row.name, row.filter, *_cells(row, differences))
-    return table
+    cells = [(row.name, row.filter, *_cells(row, differences)) for row in rows]
+    return columns_of("llr", ("agent", "filter", *_TITLES.values()), cells)
 
 
 def study_markdown(rows: Sequence[AgentSummary], differences: bool = False) -> str:
     """Return two tables in Markdown: one with the filter, one without it and of the training.
 
-    One wide table would not fit a page. See `study_table` for the arguments.
+    One wide table would not fit a page. See `study_columns` for the arguments.
     """
     filtered = _markdown(
         ["agent", "filter", *map(_one_line, _FILTERED)],
-        [[row.name, f"`{row.filter}`", *_cells(row, differences, _FILTERED)] for row in rows],
+        [[row.name, _code(row.filter), *_cells(row, differences, _FILTERED)] for row in rows],
     )
     # With several filters an agent has several rows, which differ in the first table only.
     alone = {row.name: _cells(row, differences, _ALONE) for row in rows}
@@ -64,8 +62,10 @@ def study_notes(found: StudyResult) -> list[str]:
     """Return what has to be known to read the tables, and what is missing in them."""
     study = found.study
     notes = [
-        f"interquartile means over {study.seeds} seeds with the 95 % bootstrap interval over them,"
-        f" {study.episodes} episodes each; s is the processor time of a training."
+        f"interquartile means over {study.seeds} seed{'s' if study.seeds > 1 else ''} with the 95 %"
+        f" bootstrap interval, {study.episodes} episodes each; s is the processor time of a"
+        " training.",
+        *filter(None, [caution(study.seeds)]),
     ]
     for (env_id, variant, k), reason in found.missing.items():
         which = variant if k is None else f"{variant}, training {k}"
@@ -75,6 +75,11 @@ def study_notes(found: StudyResult) -> list[str]:
 
 def _markdown(titles: list[str], lines: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *lines))
+
+
+def _code(text: str) -> str:
+    """Return a text as code in a cell, which a bar such as that of a specification would end."""
+    return f"`{text.replace('|', chr(92) + '|')}`"
 
 
 def _one_line(name: str) -> str:
@@ -88,9 +93,14 @@ def _cells(row: AgentSummary, differences: bool, names: Iterable[str] = _TITLES)
 def _text(name: str, estimate: SeedEstimate | None, differences: bool) -> str:
     if estimate is None:
         return "-"
-    factor = 100.0 if name in _PERCENT else 1.0
-    ends = [factor * end for end in (estimate.value, estimate.low, estimate.high)]
-    digits = 0 if name in _WITHOUT_INTERVAL else 1
+    ends = (estimate.value, estimate.low, estimate.high)
+    if name in _PERCENT and not differences:
+        return percent_in(*ends).replace(" %", "")
     sign = "+" if differences else ""
-    value, low, high = (f"{end:{sign},.{digits}f}" for end in ends)
-    return value if name in _WITHOUT_INTERVAL else f"{value} [{low}, {high}]"
+    if name in _WITHOUT_INTERVAL:
+        # What is seldom is not never.
+        digits = 1 if 0.0 < abs(estimate.value) <= 0.5 else 0
+        return f"{estimate.value:{sign},.{digits}f}"
+    factor = 100.0 if name in _PERCENT else 1.0
+    value, low, high = (f"{factor * end:{sign},.1f}" for end in ends)
+    return f"{value} [{low}, {high}]"

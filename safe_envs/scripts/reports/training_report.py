@@ -48,22 +48,22 @@ def _print_constraint(console: Console, row: Mapping[str, Any]) -> None:
         return f"{100.0 * value:.3g} %" if of_violations else f"{value:.3g}"
 
     limit = f"{what} <= {number(judgement['limit'])}"
-    if not judgement["episodes"]:
-        say(console, f"Limit: {limit}. No measurement: not every env has ended an episode.")
-        return
-    measured = (
-        f"{number(judgement['mean'])} [{number(judgement['low'])}, {number(judgement['high'])}] in"
-        f" the last {judgement['episodes']} episodes of the training, which explore"
-    )
+    measured = "nothing in the training, as not every env has ended an episode"
+    if judgement["episodes"]:
+        interval = f"[{number(judgement['low'])}, {number(judgement['high'])}]"
+        measured = (
+            f"{number(judgement['mean'])} {interval} in the last {judgement['episodes']} episodes"
+            " of the training, which explore"
+        )
     if of_violations:
         low, high = 1.0 - row["ci_high"], 1.0 - row["ci_low"]
         measured += (
             f"; {number(1.0 - row['safety_rate'])} [{number(low)}, {number(high)}] in the"
-            f" {row['episodes']} of the last evaluation, which do not"
+            f" {row['episodes']} episodes of the last evaluation, which do not explore"
         )
     multiplier = f"The multiplier is {judgement['multiplier']:.3g}"
     multiplier += ", its greatest value." if judgement["saturated"] else "."
-    if judgement["met"]:
+    if judgement["met"] is not False:
         say(console, f"Limit: {limit}. Measured: {measured}. {multiplier}")
         return
     if judgement["evaluation_met"]:

@@ -26,7 +26,7 @@ def reproduce(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[all | NAME]...",
+            metavar="NAME",
             help="Such as table-4.1 or figure-3.3; all by default.",
             autocompletion=completion.artefacts,
             callback=early_checks.known_artefacts,

@@ -19,6 +19,7 @@ from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import ClassK, Rate, entries_of, positive_rates, rates
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
+from safe_envs.wrappers.conditions.names import ONLY_DEGREE_1
 
 _STEPS = 100
 """Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for
@@ -49,9 +50,7 @@ class CBF(Condition):
                 model, *chain_of(model, barrier, (self.alpha,), lie_derivative_f)
             )
         except RelativeDegreeError as error:
-            raise RelativeDegreeError(
-                f"{error}. A cbf is for relative degree 1; use hocbf or ecbf"
-            ) from error
+            raise RelativeDegreeError(f"{error}. {ONLY_DEGREE_1}") from error
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> CBF:

@@ -9,9 +9,10 @@ import sympy as sp
 
 from safe_envs.dynamics.lie import Derivative, has_kinks, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import RelativeDegreeError, SystemDefinitionError
+from safe_envs.errors import SystemDefinitionError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers.conditions.class_k import ClassK, Rate, applied
+from safe_envs.wrappers.conditions.names import wrong_rates
 
 
 def chain_of(
@@ -37,10 +38,7 @@ def chain_of(
     """
     degree = relative_degree(model, barrier.expression, derivative)
     if alphas is not None and len(alphas) != degree:
-        raise RelativeDegreeError(
-            f"barrier {barrier.name} has relative degree {degree} and needs as many rates;"
-            f" {len(alphas)} given"
-        )
+        raise wrong_rates(barrier.name, degree, len(alphas))
     for j, alpha in enumerate(alphas or (), start=1):
         if isinstance(alpha, ClassK) and not alpha.is_smooth(degree - j):
             raise SystemDefinitionError(

@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 from safe_envs import plugins
-from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 
-OF_MODEL = ("cbf", "ecbf", "hocbf", "rcbf", "srcbf", "szcbf", "scbf")
-"""Names of the conditions that need nothing but a model of the system."""
+PARAMETERS = {
+    "cbf": ("alpha", "sampling_margin"),
+    "ecbf": ("k", "poles", "sampling_margin"),
+    "hocbf": ("p", "sampling_margin"),
+    "rcbf": ("gamma", "form", "sampling_margin"),
+    "srcbf": ("gamma", "form", "sampling_margin"),
+    "szcbf": ("alphas", "sampling_margin"),
+    "scbf": ("sampling_margin",),
+}
+"""Names of the parameters of the conditions that need nothing but a model of the system."""
+
+OF_MODEL = tuple(PARAMETERS)
+"""Names of these conditions."""
 
 OF_DATA = ("learned-hocbf", "ddscbf", "bayesian-scbf")
 """Names of the conditions that need a learned model."""
+
+ONLY_DEGREE_1 = "A cbf is for relative degree 1; use hocbf or ecbf"
+"""Advice where a barrier has another one."""
 
 CERTIFIED = "certified"
 """Name of the condition of a barrier certificate."""
@@ -60,4 +74,25 @@ def unknown_filter(name: str, *more: str) -> ConfigurationError:
     return ConfigurationError(
         f"unknown filter {shown(name)}; {nearest(name, allowed)}, or a condition of your own as"
         " FILE.py:NAME"
+    )
+
+
+def unfiltered_in_sum(text: str) -> ConfigurationError:
+    """Return the error of a filter for several barriers that names the unfiltered env for one."""
+    return ConfigurationError(
+        f"filter {shown(text)}: 'none' is the unfiltered env, no condition; give it alone or leave"
+        " it out"
+    )
+
+
+def wrong_rates(barrier: str, degree: int, given: int) -> RelativeDegreeError:
+    """Return the error of a condition whose rates do not suit the degree of a barrier.
+
+    Args:
+        barrier: its name.
+        degree: its relative degree.
+        given: number of rates.
+    """
+    return RelativeDegreeError(
+        f"barrier {barrier} has relative degree {degree} and needs as many rates; {given} given"
     )

@@ -6,18 +6,23 @@ import importlib.util
 import os
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 from safe_envs.object_import import resolved
 from safe_envs.plugins import CONDITIONS, module_of
 from safe_envs.wrappers.conditions.names import (
     BACKUP,
     BY_THEMSELVES,
+    ONLY_DEGREE_1,
+    PARAMETERS,
     PROMISE,
     condition_names,
     is_built_in,
     unknown_filter,
+    wrong_rates,
 )
 
 _FILE = r"(?:\.{0,2}/[^:]{0,4096}?|[^+:,/][^+:,]{0,4096}?)\.py:[A-Za-z_]\w*"
@@ -28,6 +33,9 @@ _MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
 
 
 _HEAD_BY_ITSELF = re.compile(rf"\s*({'|'.join(BY_THEMSELVES)})\s*(?:[:+]|$)")
+
+_RATES = re.compile(r"p=[-+.0-9e]+(,[-+.0-9e]+)*")
+"""Rates that are numbers; with class-K functions among them more may be wrong than their count."""
 
 
 class ConditionText(NamedTuple):
@@ -58,6 +66,40 @@ def require_known(text: str, *more: str) -> None:
     name = parts_of(text)[0].name
     if not (_is_known(name) or name in BY_THEMSELVES):
         raise unknown_filter(name, *more)
+
+
+def require_parameters(text: str) -> None:
+    """Raise ConfigurationError for parameters that the conditions of a model do not have.
+
+    Args:
+        text: as for `parse_conditions`.
+    """
+    for part in parts_of(text):
+        allowed = PARAMETERS.get(part.name, ())
+        for key in (setting.partition("=")[0] for setting in part.settings if allowed):
+            if key not in allowed:
+                raise ConfigurationError(
+                    f"filter {part.name} has no parameter {shown(key)}; {nearest(key, allowed)}"
+                )
+
+
+def require_degrees(text: str, degrees: Mapping[str, int]) -> None:
+    """Raise an error for a cbf or hocbf that does not suit the degree of its barrier.
+
+    Args:
+        text: as for `parse_conditions`.
+        degrees: relative degree of each barrier, by its name.
+
+    Raises:
+        RelativeDegreeError: A number of rates is not the relative degree.
+    """
+    parts = parts_of(text)
+    for part, (barrier, degree) in zip(parts * len(degrees), degrees.items(), strict=False):
+        rates = next((s for s in part.settings if _RATES.fullmatch(s)), None)
+        if part.name == "cbf" and degree != 1:
+            raise RelativeDegreeError(f"{wrong_rates(barrier, degree, 1)}. {ONLY_DEGREE_1}")
+        if part.name == "hocbf" and rates is not None and rates.count(",") + 1 != degree:
+            raise wrong_rates(barrier, degree, rates.count(",") + 1)
 
 
 def name_by_itself(text: str) -> str:

@@ -149,6 +149,11 @@ def make_vec_with_cost(
             f"autoreset_mode = {autoreset_mode!r}; {nearest(str(autoreset_mode), resets)}"
         )
     require_whole("num_envs", num_envs, 1)
+    if given := sorted({"wrappers", "vector_kwargs"} & options.keys()):
+        raise ConfigurationError(
+            f"{', '.join(given)}: leave it out; make such envs by gym.make_vec, and put a"
+            " CostReturnWrapper around them"
+        )
     name, mode = full_id(env_id), AutoresetMode(autoreset_mode)
     if vectorization_mode in (None, VectorizeMode.VECTOR_ENTRY_POINT.value):
         env_class(name)  # others have no native vector env

@@ -191,12 +191,15 @@ def free_port() -> int:
 
 def test_a_killed_worker_and_a_failing_cell_cost_no_other(tmp_path: Path, document: Document):
     document = with_end(document)
-    # By itself, too, it has a process of its own.
-    single = {"fixed": {**document["fixed"], "barrier.kind": "ends"}}
+    # By itself, too, it has a process of its own; in a file of its own, as a process may remember
+    # the system that it has read.
+    (tmp_path / "alone.py").write_text((tmp_path / "system.py").read_text())
+    alone = {"system": f"{tmp_path / 'alone.py'}:problem", "barrier.kind": "ends"}
+    single = {"fixed": {**document["fixed"], **alone}}
     assert [row["error"] for row in computed(single, tmp_path / "single", Backend(jobs=2))] == [
         None
     ]
-    (tmp_path / "system.ended").unlink()
+    assert (tmp_path / "alone.ended").exists()
     found = computed(document, tmp_path / "two", Backend(jobs=2))
     assert (tmp_path / "system.ended").exists()
     *errors, last = [row["error"] for row in found]

@@ -28,6 +28,9 @@ class Gain:
 def function(observation):
     return np.tanh(-observation[:, :1])
 
+def factory(problem):
+    return Gain(problem)
+
 number = 3
 
 class Needy:
@@ -63,7 +66,7 @@ def rows(policy, **changes):
 def test_a_policy_may_be_a_function_a_class_or_an_object(file):
     wanted = rows(function)
     assert wanted != rows("zero")
-    places = [f"mine.py:{name}" for name in ("Gain", "function")]
+    places = [f"mine.py:{name}" for name in ("Gain", "function", "factory")]
     for policy in (lambda x: np.tanh(-x[:, 0]), *places, make_policy(places[0], problem())):
         assert rows(policy) == wanted
     assert rows(ZeroController) == rows("zero")

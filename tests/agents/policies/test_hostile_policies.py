@@ -108,7 +108,7 @@ def test_what_is_no_regular_file_is_refused(problem, tmp_path, what):
 
 @pytest.mark.parametrize("name", ["x" * 300, "x/" * 3000, "x" * 10**5, "a\0b"], ids=len)
 def test_names_that_no_file_can_have_are_unknown_policies(problem, name):
-    with pytest.raises(ConfigurationError, match="unknown policy") as raised:
+    with pytest.raises(ConfigurationError, match=r"unknown policy|there is no such file") as raised:
         make_policy(name, problem)
     assert len(str(raised.value)) < 500
 
@@ -159,5 +159,5 @@ def test_archives_without_a_policy_are_refused(problem, tmp_path, data):
 
 def test_pipes_are_no_archives(problem, tmp_path):
     os.mkfifo(tmp_path / "policy.zip")
-    with pytest.raises(ConfigurationError, match="unknown policy"):
+    with pytest.raises(ConfigurationError, match="is not a policy that Stable-Baselines3 saved"):
         make_policy(str(tmp_path / "policy.zip"), problem, trust=True)

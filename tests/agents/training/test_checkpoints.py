@@ -104,8 +104,6 @@ def outcome(folder):
         ),
         ("ppo-lag", {"normalize": True}, {"filter": None}),
         ("ppo-lag", {"use_sde": True, "multiplier_smoothing": 0.5}, {"cost_limit": 0.5}),
-        ("sac-lag", {}, {"action": "both"}),
-        ("sac-lag", {"buffer_size": 40}, {"filter": None, "cost_limit": 0.5}),
     ],
     ids=[
         "normalised",
@@ -117,8 +115,6 @@ def outcome(folder):
         "noise",
         "violation-limit",
         "cost-limit",
-        "off-policy-violation-limit",
-        "off-policy-cost-limit",
     ],
 )
 def test_a_stopped_training_ends_as_one_that_was_not(algorithm, changes, arguments, tmp_path):

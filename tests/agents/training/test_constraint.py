@@ -155,3 +155,20 @@ def test_infos_without_costs_are_refused(infos, message):
 def test_arguments_out_of_range_are_refused(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
         constraint(**arguments)
+
+
+@pytest.mark.parametrize(
+    "cost", [[1.0], np.array([1.0, 2.0]), "much", -1.0, float("nan"), float("inf")]
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_costs_that_are_not_one_number_are_refused(cost, count):
+    with pytest.raises(ConfigurationError, match="one finite number"):
+        costs_of([{"cost": cost}] * count)
+
+
+def test_costs_that_a_wrapper_wrote_count():
+    batch = {"cost": np.zeros(2)}
+    infos = [LazyInfo(batch, i) for i in range(2)]
+    infos[1]["cost"] = 3.0
+    assert costs_of(infos).tolist() == [0.0, 3.0]
+    assert costs_of([info.copy() for info in infos]).tolist() == [0.0, 3.0]

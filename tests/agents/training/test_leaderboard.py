@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.yardstick import best_for
+from safe_envs.agents.training import leaderboard
 from safe_envs.agents.training.leaderboard import (
     attainable_of,
     board,
@@ -137,19 +140,37 @@ def test_curves_are_computed_where_they_are_asked_for_and_kept(tmp_path, monkeyp
     assert frontiers_of(ids, tmp_path, False, none) == found
 
 
-@pytest.mark.slow
-def test_the_best_is_computed_where_it_is_asked_for_and_kept(tmp_path, monkeypatch):
-    monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path / "cache"))
+def require_computed_and_kept(folder):
+    """Check that what is known of the best is computed where it is asked for, and kept."""
     ids = (SCALAR, "safe_envs/QuadrotorLimits-v0")
     none = lambda _: None  # noqa: E731
     for compute in (False, None):
-        assert attainable_of(ids, tmp_path, compute, none) == {}
-    found = attainable_of(ids, tmp_path, True, none)
+        assert attainable_of(ids, folder, compute, none) == {}
+    found = attainable_of(ids, folder, True, none)
     best = found[SCALAR]
     assert not isinstance(best, str)
     assert best.lower is not None
     assert "at most 4" in str(found[ids[1]])
-    again = attainable_of(ids[:1], tmp_path, False, none)[SCALAR]
+    again = attainable_of(ids[:1], folder, False, none)[SCALAR]
     assert not isinstance(again, str)
     assert (again.lower, again.upper) == (best.lower, best.upper)
     assert again.as_dict()["cells"] == list(best.cells)
+
+
+def test_the_best_is_computed_where_it_is_asked_for_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path / "cache"))
+    known = AttainableSafety(
+        0.25, 0.5, None, "", "plant", "violation", "", ("x",), (40,), 41, 100, 1.0, 1000
+    )
+    monkeypatch.setattr(
+        leaderboard,
+        "best_for",
+        lambda problem, *how: known if problem.name == "Scalar" else best_for(problem, *how),
+    )
+    require_computed_and_kept(tmp_path)
+
+
+@pytest.mark.oracle
+def test_the_best_of_an_env_is_computed_and_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path / "cache"))
+    require_computed_and_kept(tmp_path)

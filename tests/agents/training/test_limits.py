@@ -124,9 +124,12 @@ def test_costs_are_judged_by_the_interval_of_their_mean():
 
 
 def test_nothing_measured_is_no_judgement():
-    found = judged(observed(0.1, []), VIOLATION, row(0.0, 0.1))
+    found = judged(observed(0.1, []), VIOLATION, row())
     assert (found["met"], found["episodes"], found["mean"]) == (None, 0, None)
     json.dumps(found, allow_nan=False)
+    # Unless the evaluation says enough.
+    assert judged(observed(0.1, []), VIOLATION, row(0.0, 0.1))["met"] is False
+    assert judged(observed(0.1, []), COST, row(0.0, 0.1))["met"] is None
 
 
 def test_the_best_keeps_its_limit_first():
@@ -166,7 +169,15 @@ def test_one_that_is_met_is_told_too():
     text = printed(evaluated(observed(1.5, [1] * 100), COST))
     assert "Limit: unsafe steps of an episode <= 1.5. Measured: 1 [1, 1] in the last 100" in text
     assert "NOT MET" not in text
-    assert "No measurement" in printed(evaluated(observed(1.5, []), COST))
+    text = printed(evaluated(observed(1.5, []), COST))
+    assert "Measured: nothing in the training, as not every env has ended" in text
+    assert "NOT MET" not in text
+
+
+def test_an_evaluation_alone_tells_that_a_limit_is_not_met():
+    text = printed(evaluated(observed(0.01, []), rate=(0.9, 0.98)))
+    assert "NOT MET: the limit P(any violation) <= 1 %. Measured: nothing in the training" in text
+    assert "5 % [2 %, 10 %] in the 200 episodes of the last evaluation" in text
 
 
 @pytest.mark.slow
@@ -214,6 +225,32 @@ def test_an_altered_constraint_is_refused(tmp_path):
     del state["constraint"]
     (checkpoint / "state.json").write_text(json.dumps(state))
     with pytest.raises(ConfigurationError, match="cannot be read"):
+        train(wanted, tmp_path / "run", resume=True)
+
+
+@pytest.mark.slow
+def test_an_altered_judgement_is_refused(tmp_path):
+    wanted = Training.of(SCALAR, "ppo-lag", **SMALL)
+    train(wanted, tmp_path / "run")
+    path = tmp_path / "run" / "evaluations.json"
+    rows = json.loads(path.read_text())
+    judgement = rows[-1]["constraint"]
+    assert judgement["episodes"]
+    for altered in (
+        None,
+        [],
+        {key: value for key, value in judgement.items() if key != "high"},
+        judgement | {"mean": "much"},
+        judgement | {"saturated": float("inf")},
+        judgement | {"met": 1},
+        judgement | {"kind": "speed"},
+    ):
+        path.write_text(json.dumps([*rows[:-1], rows[-1] | {"constraint": altered}]))
+        with pytest.raises(ConfigurationError, match=r"evaluations.json cannot be read"):
+            train(wanted, tmp_path / "run", resume=True)
+    # JSON as this project writes it has no such number.
+    path.write_text(json.dumps([*rows[:-1], rows[-1] | {"other": float("nan")}]))
+    with pytest.raises(ConfigurationError, match=r"evaluations.json cannot be read"):
         train(wanted, tmp_path / "run", resume=True)
 
 

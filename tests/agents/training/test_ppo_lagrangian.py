@@ -86,6 +86,13 @@ def test_without_a_multiplier_it_is_ppo_bit_for_bit(make, changes):
     assert others == same_others
 
 
+def test_a_cost_critic_without_a_multiplier_cannot_spoil_it():
+    model = limited(corridors(), **NO_GAINS)
+    model.cost_critic.value_net[-1].bias.data.fill_(float("nan"))
+    model.learn(256)
+    assert all(torch.isfinite(value).all() for value in parameters(model).values())
+
+
 def test_with_one_it_is_not():
     policies = [limited(corridors(), **gains).learn(512) for gains in (NO_GAINS, {})]
     assert policies[1].constraint.value > 0.0
@@ -197,6 +204,7 @@ def test_envs_without_costs_are_refused():
     [
         ({"cost_gamma": 1.5}, "cost_gamma"),
         ({"cost_gae_lambda": -0.1}, "cost_gae_lambda"),
+        ({"cost_gamma": None}, "cost_gamma = None"),
         ({"cost_limit": -1.0}, "limit"),
         ({"multiplier_ki": float("nan")}, "multiplier_ki"),
     ],

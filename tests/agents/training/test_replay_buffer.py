@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import pickle
+import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -211,6 +214,20 @@ def test_ppo_keeps_the_proposals_and_their_probabilities():
     np.testing.assert_allclose(
         np.array(nominal), center + half * np.clip(np.concatenate(actions), -1.0, 1.0), atol=1e-5
     )
+
+
+def test_a_file_of_plain_ppo_needs_nothing_of_this_package(tmp_path):
+    model = PPO("MlpPolicy", make(), n_steps=8, batch_size=8, device="cpu").learn(8)
+    model.save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        data = json.loads(archive.read("data"))
+    pickles = {
+        key: base64.b64decode(entry[":serialized:"])
+        for key, entry in data.items()
+        if isinstance(entry, dict) and ":serialized:" in entry
+    }
+    assert "action_space" in pickles
+    assert not [key for key, content in pickles.items() if b"safe_envs" in content]
 
 
 @pytest.mark.parametrize("action", ["executed", "both"])

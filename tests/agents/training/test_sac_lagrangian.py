@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from stable_baselines3 import SAC
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from safe_envs import ConfigurationError
@@ -178,7 +180,9 @@ def test_random_numbers_of_the_cost_critics_follow_from_the_seed():
     ("arguments", "message"),
     [
         ({"cost_gamma": 1.5}, "cost_gamma = 1.5"),
+        ({"cost_gamma": "0.9"}, "cost_gamma = '0.9'"),
         ({"cost_scale": 0.0}, "cost_scale = 0.0"),
+        ({"cost_scale": "1"}, "cost_scale = '1'"),
         ({"cost_limit": -1.0}, "limit of the cost"),
         ({"multiplier_ki": -1.0}, "ki = -1.0"),
         ({"n_steps": 3}, "n_steps=1"),
@@ -187,3 +191,37 @@ def test_random_numbers_of_the_cost_critics_follow_from_the_seed():
 def test_arguments_out_of_range_are_refused(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
         SACLagrangian("MlpPolicy", DummyVecEnv([IcyRoad]), **{**SETTINGS, **arguments})
+
+
+def test_observations_of_several_parts_are_refused():
+    env = gym.Env()
+    env.action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    env.observation_space = gym.spaces.Dict({"x": gym.spaces.Box(-1.0, 1.0, (1,))})
+    with pytest.raises(ConfigurationError, match="FlattenObservation"):
+        SACLagrangian("MultiInputPolicy", DummyVecEnv([lambda: env]), **SETTINGS)
+
+
+class Features(FlattenExtractor):
+    """Features that are learned."""
+
+    def __init__(self, observation_space):
+        super().__init__(observation_space)
+        self.scale = torch.nn.Parameter(torch.ones(self.features_dim))
+
+    def forward(self, observations):
+        return self.scale * super().forward(observations)
+
+
+def test_cost_critics_learn_features_of_their_own():
+    """Where SAC's critic takes the features that its actor learns, they would have fixed ones."""
+    kwargs = {
+        "net_arch": [8],
+        "features_extractor_class": Features,
+        "share_features_extractor": True,
+    }
+    model = learned(SACLagrangian, policy_kwargs=kwargs)
+    assert not torch.equal(model.cost_critic.features_extractor.scale, torch.ones(1))
+    assert_same(
+        learned(SAC, policy_kwargs=kwargs),
+        learned(SACLagrangian, policy_kwargs=kwargs, **NO_GAINS),
+    )

@@ -10,7 +10,7 @@ from scipy.stats import binom, trim_mean
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.training import seed_statistics
-from safe_envs.agents.training.seed_statistics import interquartile_mean, over_seeds
+from safe_envs.agents.training.seed_statistics import caution, interquartile_mean, over_seeds
 
 
 @pytest.mark.parametrize("count", range(1, 15))
@@ -110,9 +110,19 @@ def test_intervals_of_few_seeds_hold_less_often_than_they_say():
     assert three < five < 0.95
 
 
+def test_intervals_of_few_seeds_come_with_what_they_are_worth():
+    assert "no length" in caution(1)
+    assert over_seeds([[0.3]]).low == over_seeds([[0.3]]).high
+    assert "over 3 seeds holds the true value in 75 %" in caution(3)
+    assert caution(20) == ""
+
+
 @pytest.mark.oracle
-@pytest.mark.parametrize(("count", "rate"), [(3, 0.75), (5, 0.906), (8, 0.935)])
+@pytest.mark.parametrize(
+    ("count", "rate"), [(2, 0.5), (3, 0.75), (4, 0.877), (5, 0.906), (8, 0.935)]
+)
 def test_how_often_the_interval_holds(count, rate):
-    # The guide names the numbers for five seeds.
+    # The guide names the number for five seeds, and the notes of tables those up to five.
+    assert seed_statistics._HOLDS.get(count, round(100 * rate)) == round(100 * rate)
     found = coverage(normal, 0.0, count, 20_000, seed=1)
     assert found == pytest.approx(rate, abs=4 * np.sqrt(rate * (1 - rate) / 20_000) + 5e-4)

@@ -9,17 +9,23 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.jobs.executor import Backend
+from safe_envs.agents.training import study as study_module
 from safe_envs.agents.training import study_job
+from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.study import (
     Study,
+    StudyResult,
     Variant,
     evaluation_seed,
     run_study,
     training_seed,
 )
+from safe_envs.agents.training.study_job import Planned
 from safe_envs.agents.training.trainer import train
+from safe_envs.file_locks import locked
 
 SCALAR = "safe_envs/Scalar-v0"
 SMALL = {
@@ -62,6 +68,48 @@ def test_seeds_of_trainings_and_evaluations_are_all_different_and_of_one_seed():
         {episode_seed(evaluation_seed(0, ids[0], k), i) for i in range(200)} for k in (0, 1)
     ]
     assert not episodes[0] & episodes[1]
+
+
+def test_a_result_is_of_the_files_that_its_filter_and_its_policy_had(tmp_path):
+    table, policy = tmp_path / "table.npz", tmp_path / "policy.zip"
+    text = f"promise:p=0.9:table={table}"
+    given = {"env_id": SCALAR, "variant": "a", "k": 0, "options": {}, "knowledge": "plant"}
+    given |= {"episodes": 9, "seed": 0, "versions": {}}
+
+    def found():
+        training = Training.of(SCALAR, "ppo", filter=text)
+        parts = ((None, policy, "none"), (None, "nominal", text), (training, "nominal", "none"))
+        return [
+            Planned(training=training, policy=str(policy), filter=text, **given)
+            for training, policy, text in parts
+        ]
+
+    table.write_bytes(b"1")
+    policy.write_bytes(b"1")
+    first = found()
+    assert [each.key for each in found()] == [each.key for each in first]
+    agent = first[2].agent
+    table.write_bytes(b"2")
+    policy.write_bytes(b"2")
+    second = found()
+    assert not {each.key for each in first} & {each.key for each in second}
+    # An agent that learned behind another table is another agent.
+    assert second[2].agent != agent
+
+
+@pytest.mark.slow
+def test_an_agent_of_other_versions_is_neither_resumed_nor_taken_for_one_of_these(
+    tmp_path, monkeypatch
+):
+    few = replace(study(seeds=1), variants=VARIANTS[1:2])
+    run_study(few, tmp_path, ALONE)
+    newer = {**study_module.package_versions(), "torch": "99"}
+    monkeypatch.setattr(study_module, "package_versions", lambda: newer)
+    found = run_study(few, tmp_path, ALONE)
+    (reason,) = found.missing.values()
+    assert "was trained with torch 2" in reason
+    assert "in use is torch 99; remove that folder" in reason
+    assert not found.rows
 
 
 @pytest.mark.slow
@@ -128,14 +176,26 @@ def test_an_interrupted_study_ends_as_an_uninterrupted_one(tmp_path, monkeypatch
     ]
 
 
-@pytest.mark.slow
-def test_processes_give_what_one_process_gives(tmp_path):
-    few = replace(study(), variants=VARIANTS[:3])
-    alone = run_study(few, tmp_path / "one", ALONE)
-    together = run_study(few, tmp_path / "two", Backend(jobs=2))
+def require_same_in_processes(variants, folder):
+    """Check that two processes find what one finds."""
+    few = replace(study(), variants=variants)
+    alone = run_study(few, folder / "one", ALONE)
+    together = run_study(few, folder / "two", Backend(jobs=2))
     assert [replace(row, seconds=None) for row in alone.rows] == [
         replace(row, seconds=None) for row in together.rows
     ]
+    assert len(alone.rows) == 2 * len(variants)
+
+
+@pytest.mark.slow
+def test_processes_give_what_one_process_gives(tmp_path):
+    require_same_in_processes(VARIANTS[:1], tmp_path)
+
+
+@pytest.mark.oracle
+def test_trainings_in_processes_are_those_of_one_process(tmp_path):
+    # Every process imports torch, which takes longer than the trainings.
+    require_same_in_processes(VARIANTS[:3], tmp_path)
 
 
 @pytest.mark.slow
@@ -161,6 +221,38 @@ def test_a_damaged_result_is_an_error_that_names_the_file(tmp_path):
     (tmp_path / "results").write_text("a file")
     with pytest.raises(ConfigurationError, match="cannot be made"):
         run_study(few, tmp_path, ALONE)
+
+
+def test_two_studies_do_not_write_to_one_folder(tmp_path):
+    few = replace(study(), variants=VARIANTS[:1])
+    with (
+        locked(tmp_path / ".lock", ""),
+        pytest.raises(ConfigurationError, match="another study is writing"),
+    ):
+        run_study(few, tmp_path, ALONE)
+    assert len(run_study(few, tmp_path, ALONE).rows) == 2
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_a_failed_training_is_an_error_and_what_an_env_has_not_is_none():
+    StudyResult(study(), [], {(SCALAR, "ppo", None): "no backup"}).require_all()
+    with pytest.raises(
+        ConfigurationError, match=r"1 evaluation failed.*ppo, training 1: it diverg"
+    ):
+        StudyResult(study(), [], {(SCALAR, "ppo", 1): "it diverged"}).require_all()
+
+
+def test_a_return_that_is_no_number_stops_no_other_evaluation(tmp_path, monkeypatch):
+    def found(_, policy, *args, **kwargs):
+        result = evaluate("Scalar-v0", policy, *args, **kwargs)
+        row = replace(result.rows[0], return_mean=float("nan"))
+        return replace(result, rows=(row,)) if policy == "zero" else result
+
+    monkeypatch.setattr(study_job, "evaluate", found)
+    few = replace(study(seeds=1), variants=(Variant("a", policy="zero"), Variant("b")))
+    result = run_study(few, tmp_path, ALONE)
+    assert [row.variant for row in result.rows] == ["b"]
+    assert "mean return of the evaluation is nan" in result.missing[SCALAR, "a", 0]
 
 
 def test_wrong_numbers_and_equal_names_are_errors():

@@ -21,6 +21,10 @@ BOMB = "a0: &a0 [1, 1]\n" + "".join(
     f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 30)
 )
 
+MERGES = "a0: &a0 {name: a}\n" + "".join(
+    f"a{k}: &a{k}\n  <<: [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 30)
+)
+
 
 def written(path, *variants, **more):
     path.write_text(yaml.safe_dump({"variants": list(variants), **more}))
@@ -55,6 +59,18 @@ def test_a_file_of_ones_own(tmp_path):
     ("changes", "word"),
     [
         ({"name": 3}, "name = 3"),
+        ({"name": "two\nlines"}, "printable"),
+        ({"name": "red \x1b[31m"}, "printable"),
+        ({"name": "a | b"}, "printable"),
+        ({"name": "a" * 81}, "printable"),
+        ({"algorithm": None, "policy": "law.py:law"}, "runs none"),
+        ({"algorithm": None, "policy": "os:abort"}, "runs none"),
+        ({"filters": ["law.py:Condition"]}, "runs none"),
+        ({"filters": ["cbf+os:abort"]}, "runs none"),
+        ({"training": {"filter": "./a+b/law.py:Condition"}}, "runs none"),
+        ({"training": {"filter": ["scbf"]}}, "filter"),
+        ({"training": {"settings": [1]}}, "settings"),
+        ({"training": {"settings": "gamma"}}, "settings"),
         ({"algorithm": "pop"}, "ppo"),
         ({"algorithm": None, "training": {"filter": "scbf"}}, "no algorithm"),
         ({"policy": ["a"]}, "policy"),
@@ -83,6 +99,15 @@ def test_files_that_are_no_studies(tmp_path):
         ("variants: [{name: a}, {name: a}]", "one name"),
         ("runs: 3", "runs"),
         (BOMB, "values"),
+        (MERGES, "values"),
+        (f"{MERGES}? {{<<: *a29}}\n: 1", "values"),
+        (f"variants: &a [{'1, ' * 9000}*a]", "values"),
+        ("variants: [{name: a}]\nvariants: [{name: b}]", "'variants' twice"),
+        ("episodes: 2026-13-45", "YAML"),
+        (f"episodes: {'9' * 5000}", "YAML"),
+        (f"episodes: {'1:' * 300}1.0", "YAML"),
+        ("episodes: !!int many", "YAML"),
+        ("episodes: !!timestamp now", "YAML"),
         ("!!python/object/apply:os.getcwd []", "YAML"),
     ):
         (tmp_path / "s.yml").write_text(text)
@@ -141,3 +166,19 @@ def test_statistics_of_agents_and_of_their_differences(tmp_path):
     (less,) = differences(fewer, read.agents, SCALAR, "one")
     assert less.estimates["returns"].seeds == 4
     assert summaries(StudyResult(study, [], {}), read.agents, SCALAR) == []
+
+
+def test_agents_are_told_without_a_filter_that_their_env_has_not(tmp_path):
+    given = {**ONE, "filters": ["default", "promise:p=0.9", "none"]}
+    read = read_study(written(tmp_path / "s.yml", given))
+    rows = [row("one | default", 0, "scbf", violations=3), row("one | none", 0, "none")]
+    first, second = summaries(
+        StudyResult(Study([SCALAR], read.variants), rows, {}), read.agents, SCALAR
+    )
+    assert (first.filter, second.filter) == ("scbf", "promise:p=0.9")
+    assert second.estimates["safety"] is None
+    for each in (first, second):
+        # Those of the agents, whatever filter they are evaluated with.
+        assert each.estimates["violations"].value == 3.0
+        assert each.estimates["safety_alone"].value == 0.5
+    assert summaries(StudyResult(Study([SCALAR], read.variants), [], {}), read.agents, SCALAR) == []

@@ -215,6 +215,10 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
             resume=True,
         )
     config = json.loads((folder / "config.json").read_text())
+    # The times of evaluations follow from the length, which is what was changed.
+    longer = Training(**{**config["training"], "n_timesteps": 999_999, "eval_freq": 99_999})
+    with pytest.raises(ConfigurationError, match=r"has n_timesteps = \d+, not 999999"):
+        train(longer, folder, resume=True)
     del config["training"]["engine"]
     (tmp_path / "older").mkdir()
     (tmp_path / "older" / "config.json").write_text(json.dumps(config))

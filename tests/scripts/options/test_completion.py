@@ -9,22 +9,22 @@ from contextlib import redirect_stdout
 import pytest
 
 import safe_envs
+from safe_envs.agents.policies import registry
 from safe_envs.agents.policies.names import POLICIES
-from safe_envs.agents.training.hyperparameters import ALGORITHMS
 from safe_envs.scripts import cli
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 from safe_envs.wrappers import CONDITIONS
-from safe_envs.wrappers.conditions import LEARNED, Certified
-from safe_envs.wrappers.conditions.names import BY_THEMSELVES
+from safe_envs.wrappers.conditions import LEARNED, Certified, names
 
 pytestmark = pytest.mark.slow
 
 
-def test_the_words_are_those_that_are_known():
-    assert ("none", *CONDITIONS, *LEARNED, Certified.name, *BY_THEMSELVES) == completion.FILTERS
-    assert sorted(completion.POLICIES) == sorted(POLICIES)
-    assert sorted(completion.ALGORITHMS) == sorted(ALGORITHMS)
+def test_the_names_that_are_known_early_are_those_of_the_classes():
+    assert tuple(CONDITIONS) == names.OF_MODEL
+    assert tuple(LEARNED) == names.OF_DATA
+    assert Certified.name == names.CERTIFIED
+    assert tuple(registry._NAMED) == POLICIES
     assert sorted(completion.ARTEFACTS) == sorted(artefact.name for artefact in ARTEFACTS)
 
 

@@ -24,14 +24,14 @@ COMMANDS = {
     "render": ("--out", "film.gif"),
 }
 GIVEN = (
-    "--noise=-.1,0",
+    "--noise=.1,0",
     "--plant=v=.8",
-    "--plant=w=2",
-    "--barrier=kind=a b",
+    "--plant=sigma_1=2",
+    "--barrier=radius=a b",
     "--dt=0.05",
     "--substeps=2",
     "--box=-1,2",
-    "--start=-1,2",
+    "--start=-1,2,0",
 )
 
 
@@ -50,27 +50,30 @@ def read(*words: str) -> EnvOptions:
 
 
 def test_a_command_is_handed_the_env_that_its_options_ask_for():
-    env = read("Pendulum-v0", *GIVEN)
-    assert (env.env_id, env.system, env.full_id) == ("Pendulum-v0", None, "safe_envs/Pendulum-v0")
+    env = read("StochasticDubins-v0", *GIVEN)
+    assert (env.env_id, env.system, env.full_id) == (
+        "StochasticDubins-v0",
+        None,
+        "safe_envs/StochasticDubins-v0",
+    )
     assert env.arguments == {
-        "noise": [-0.1, 0.0],
-        "plant": {"v": 0.8, "w": 2},
-        "barrier": {"kind": "a b"},
+        "noise": [0.1, 0.0],
+        "plant": {"v": 0.8, "sigma_1": 2},
+        "barrier": {"radius": "a b"},
         "dt": 0.05,
         "substeps": 2,
         "box": [-1.0, 2.0],
-        "start": [-1.0, 2.0],
+        "start": [-1.0, 2.0, 0.0],
     }
-    assert read("Pendulum-v0").arguments == {}
-    # What is 0 was given, and is refused by the env.
-    assert read("Pendulum-v0", "--dt", "0", "--substeps", "0").arguments == {
-        "dt": 0.0,
-        "substeps": 0,
-    }
+    assert read("StochasticDubins-v0").arguments == {}
+    # What is 0 was given, and is refused.
+    assert read("StochasticDubins-v0", "--delay", "0").arguments == {"delay": 0}
+    with pytest.raises(ConfigurationError, match="dt = 0"):
+        read("StochasticDubins-v0", "--dt", "0")
 
 
 @pytest.mark.parametrize(
-    "which", [("safe_envs/Pendulum-v0",), ("--system", "my folder/own.py:problem")]
+    "which", [("safe_envs/StochasticDubins-v0",), ("--system", "my folder/own.py:problem")]
 )
 def test_its_command_line_asks_for_the_same_env(which):
     env = read(*which, *GIVEN)
@@ -96,7 +99,7 @@ def test_identify_has_no_episodes(safe_envs_command):
             "identify", "Scalar-v0", *COMMANDS["identify"], option, "1"
         )
         assert status == 2
-        assert f"No such option: {option}" in err
+        assert f"unknown option '{option}'" in err
 
 
 @pytest.mark.parametrize(

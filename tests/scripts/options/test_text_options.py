@@ -39,3 +39,9 @@ def test_the_files_that_a_simulation_reads():
     }
     assert not list(text_options.inputs_of(None, "nominal", ["none", "hocbf:p=1,2"]))
     assert not list(text_options.inputs_of("my.module:problem", filter_spec="my.module:view"))
+
+
+def test_matplotlib_writes_every_format_that_is_allowed():
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    assert set(text_options.PLOT_FORMATS) <= set(FigureCanvasBase.get_supported_filetypes())

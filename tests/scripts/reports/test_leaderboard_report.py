@@ -18,9 +18,8 @@ from safe_envs.scripts.reports.leaderboard_report import (
     leaderboard_notes,
     leaderboard_tables,
 )
+from safe_envs.scripts.reports.tables import print_columns
 from tests.agents.training.test_leaderboard import PENDULUM, SCALAR, result
-
-WIDEST = 100
 
 
 def report(**changes):
@@ -46,32 +45,41 @@ def report(**changes):
     )
 
 
-def test_tables_fit_a_terminal_of_100_columns():
+def test_tables_fit_a_terminal_of_80_columns():
     stream = io.StringIO()
-    console = Console(file=stream, width=WIDEST)
     headings = []
-    for heading, table in leaderboard_tables(report()):
+    for heading, columns in leaderboard_tables(report()):
         headings.append(heading)
-        assert console.measure(table, options=console.options.update(max_width=500)).maximum <= 100
-        console.print(table)
+        print_columns(Console(file=stream, width=80), columns[:1], columns[1:])
     assert headings == ["Scalar, filter scbf", "Pendulum, filter scbf", "All 2 envs"]
-    text = stream.getvalue()
-    assert "…" not in text
-    (line, *_) = [line for line in text.splitlines() if line.startswith("ppo + promise")]
-    assert line.split() == [
-        "ppo", "+", "promise", "filter", "100.0", "[100.0,", "100.0]", "100.0", "[98.5,", "100.0]",
+    lines = stream.getvalue().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    first, second, *_ = [line for line in lines if line.startswith("ppo + promise")]
+    cells = [*first.split()[4:], *second.split()[4:]]
+    assert cells == [
+        "100.0", "[100.0,", "100.0]", "100.0", "[98.5,", "100.0]",
         "500.0", "[500.0,", "500.0]", "200", "2.00",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0, "0"), (9999, "9,999"), (10_000, "10.0 k"), (99_940, "99.9 k"), (99_990, "100 k"),
-     (187_961, "188 k"), (999_600, "1000 k"), (12_340_000, "12.3 M")],
+    [(0, "0"), (1 / 3, "0.3"), (0.5, "0.5"), (2 / 3, "1"), (9999, "9,999"), (10_000, "10.0 k"),
+     (99_940, "99.9 k"), (99_990, "100 k"), (187_961, "188 k"),
+     (999_600, "1000 k"), (12_340_000, "12.3 M")],
 )  # fmt: skip
 def test_counts_are_short(value, text):
     assert _count(value) == text
     assert len(text) <= 6
+
+
+def test_a_variant_of_fewer_seeds_and_few_seeds_are_told():
+    found = result({(SCALAR, "ppo"): [50, 49, 48, 50], (SCALAR, "nominal"): [0] * 5})
+    entries = [entry_of(found, SCALAR, variant) for variant in ("ppo", "nominal")]
+    few = LeaderboardReport(found, tuple(e for e in entries if e), {}, {}, {})
+    assert "| ppo, 4 seeds | " in leaderboard_markdown(few, {})
+    assert "| nominal | " in leaderboard_markdown(few, {})
+    assert any("91 % of the cases" in note for note in leaderboard_notes(few))
 
 
 def test_what_is_missing_is_told_once_with_its_envs():
@@ -108,7 +116,28 @@ def test_only_the_part_of_a_page_between_its_lines_is_replaced(tmp_path):
     assert link_from(tmp_path / "docs" / "page.md", tmp_path / "a.png") == "../a.png"
 
 
-@pytest.mark.parametrize("text", ["", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n", BEGIN])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+@pytest.mark.parametrize("after", ["", "{}", "{}end{}"])
+def test_the_ends_of_lines_and_other_letters_are_kept(tmp_path, newline, after):
+    page, rest = tmp_path / "page.md", f"{END}{after.format(newline, newline)}"
+    page.write_bytes(f"é{newline}{BEGIN}{newline}{rest}".encode())
+    for _ in range(2):
+        put_into(page, "a\nb")
+        lines = ["é", BEGIN, "", "a", "b", "", rest]
+        assert page.read_bytes() == newline.join(lines).encode()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"a {BEGIN}\n{END}\n",
+        f"{BEGIN}\na {END}\n",
+        "",
+        f"{END}\n{BEGIN}\n",
+        f"{BEGIN}\n{BEGIN}\n{END}\n",
+        BEGIN,
+    ],
+)
 def test_a_page_without_its_lines_is_an_error(tmp_path, text):
     page = tmp_path / "page.md"
     page.write_text(text)

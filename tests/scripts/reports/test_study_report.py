@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
+
 import pytest
+from rich.console import Console
 
 from safe_envs.agents.training.seed_statistics import SeedEstimate
 from safe_envs.agents.training.study_summary import AgentSummary
-from safe_envs.scripts.reports.study_report import study_markdown
+from safe_envs.scripts.reports.study_report import study_columns, study_markdown
+from safe_envs.scripts.reports.tables import print_columns
 
 MOST_COLUMNS = 6
 
@@ -47,3 +51,26 @@ def test_tables_are_narrow_and_name_each_agent_without_a_filter_once():
 def test_differences_have_a_sign(which):
     for line in tables(study_markdown(ROWS, differences=True))[which][2:]:
         assert all(cell.startswith("+") for cell in line[2 - which :])
+
+
+def printed(rows):
+    console = Console(file=io.StringIO(), width=100)
+    columns = study_columns(rows)
+    print_columns(console, columns[:2], columns[2:])
+    return console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_names_are_printed_as_they_are():
+    rows = [summary("[/]", "promise:p=0.9:table=[red].npz", 0.5)]
+    assert {"[/]", "promise:p=0.9:table=[red].npz"} <= set(printed(rows).split())
+    filtered, _ = tables(study_markdown([summary("a", "promise:p=0.9:spec=a|b", 0.5)]))
+    assert filtered[2][1] == "`promise:p=0.9:spec=a\\|b`"
+
+
+def test_what_is_seldom_is_not_printed_as_never_nor_what_is_frequent_as_always():
+    row = summary("a", "scbf", 0.9997)
+    rare = {name: SeedEstimate(1 / 3, 0.0, 1.0, 5) for name in ("violations", "seconds")}
+    row = AgentSummary(row.env_id, row.name, row.filter, {**row.estimates, **rare})
+    for text in (printed([row]), study_markdown([row])):
+        assert "99.97 [99.97, 99.97]" in text
+        assert text.split().count("0.3") == 2

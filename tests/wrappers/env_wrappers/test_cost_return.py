@@ -210,3 +210,9 @@ def test_wrong_arguments_are_refused(arguments, word):
     silent.metadata = {}
     with pytest.raises(ConfigurationError, match="autoreset_mode"):
         CostReturnWrapper(silent)
+
+
+@pytest.mark.parametrize("kind", ["sync", None])
+def test_wrappers_of_gymnasium_are_referred_to_it(kind):
+    with pytest.raises(ConfigurationError, match="wrappers: leave it out"):
+        make_vec_with_cost(ENV_ID, 2, kind, wrappers=[])
