@@ -44,8 +44,8 @@ Engine = Annotated[
     ),
 ]
 PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "tif", "tiff", "webp")
-"""Suffixes of pictures, which Matplotlib writes: to ask it takes longer than all else. An svgz is left
-out, since it holds the time."""
+"""Suffixes of pictures, which Matplotlib writes: to ask it takes longer than all else. An svgz is
+left out, since it holds the time."""
 
 FORMATS = ".png, .pdf, .svg, .eps, .jpg, .tif or .webp."
 
