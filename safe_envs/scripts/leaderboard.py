@@ -10,7 +10,7 @@ import typer
 
 from safe_envs import ENV_IDS
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options import completion
+from safe_envs.scripts.options import completion, early_checks
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
@@ -38,9 +38,10 @@ def leaderboard(
     env_ids: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[ENV_ID]...",
+            metavar="ENV_ID",
             help=f"Envs; by default {', '.join(FEW)}, and with --quick {', '.join(QUICK)}.",
             autocompletion=completion.env_ids,
+            callback=early_checks.known_envs,
         ),
     ] = None,
     all_envs: Annotated[bool, typer.Option("--all", help="Every env.")] = False,
@@ -49,6 +50,7 @@ def leaderboard(
         typer.Option(
             metavar="NAME",
             autocompletion=completion.algorithms,
+            callback=early_checks.known_algorithm,
             help="ppo, a2c, sac, td3, ppo-lag or sac-lag.",
         ),
     ] = "ppo",

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.scripts.options import completion
+from safe_envs.scripts.options import completion, early_checks
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
@@ -36,7 +36,12 @@ def study(
     ],
     env_ids: Annotated[
         list[str],
-        typer.Argument(metavar="ENV_ID...", help="Envs.", autocompletion=completion.env_ids),
+        typer.Argument(
+            metavar="ENV_ID",
+            help="Envs.",
+            autocompletion=completion.env_ids,
+            callback=early_checks.known_envs,
+        ),
     ],
     out: Annotated[
         Path,

@@ -20,6 +20,7 @@ LONG = "x" * 100_000
         ((*SCALAR, "--seed", "1_0"), "--seed = '1_0'; give a whole number"),
         ((*SCALAR, "--seed", "٣"), "--seed = '٣'; give a whole number"),
         ((*SCALAR, "--seed", "9" * 5000), "give a whole number"),
+        (("render", "Scalar-v0", "--out", "r.png", "--seed", -1), "--seed = -1; give a whole"),
         ((*SCALAR, "--dt", "1_0"), "--dt = '1_0'; give a number"),
         (("demo", "--episodes", 0), "--episodes = 0; give a whole number from 1"),
         ((*SCALAR, "--noise", "1_0"), "'1_0' is no number"),

@@ -288,7 +288,6 @@ def test_a_film_has_the_start_and_the_end(every, expected):
         (("--out", "run.png", "--filter", "scbf", "--compare", "none"), "give one of them"),
         (("--out", "run.png", "--policy", "nominall"), "unknown policy"),
         (("--out", "run.png", "--knowledge", "oracle"), "knowledge = 'oracle'"),
-        (("--out", "run.png", "--seed", "-1"), "seed = -1"),
         (("--out", "run.gif", "--learned", "run.gif"), "would overwrite"),
     ],
 )

@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.agents.policies.names import POLICY_FILE as POLICY_FILE
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
 from safe_envs.errors import ConfigurationError, InvalidInputError, NotCompilableError

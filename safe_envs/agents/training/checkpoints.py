@@ -18,7 +18,7 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as serialized
 
 from safe_envs.agents.jobs.store import reading
-from safe_envs.agents.policies.base import POLICY_FILE
+from safe_envs.agents.policies.names import POLICY_FILE
 from safe_envs.agents.policies.network import save_policy
 from safe_envs.agents.training.learner_state import (
     Arrays,

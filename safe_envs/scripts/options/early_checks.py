@@ -61,6 +61,19 @@ def known_policies(names: list[str] | None) -> list[str] | None:
     return names
 
 
+def known_envs(env_ids: list[str] | None) -> list[str] | None:
+    """Return the ids of envs if there are all of them.
+
+    Raises:
+        ConfigurationError: There is no such one.
+    """
+    from safe_envs.registry import full_id
+
+    for env_id in env_ids or ():
+        full_id(env_id)
+    return env_ids
+
+
 def known_algorithm(name: str) -> str:
     """Return the value of --algo if there is such an algorithm.
 
