@@ -79,7 +79,12 @@ def haloed_surface(text: str, size: int, color: Color, halo: Color) -> pygame.Su
 
 
 def text_size(text: str, size: int) -> tuple[int, int]:
-    """Return the width and height in pixels of a line of text."""
+    """Return the width and height in pixels of a line of text.
+
+    Args:
+        text: the line.
+        size: of the letters.
+    """
     return _font(size, False).size(text)
 
 
