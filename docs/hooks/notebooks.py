@@ -10,7 +10,8 @@ from typing import Any
 
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 
-_TIMEOUT = 120
+_TIMEOUT = 600
+"""Of a cell in s, also on a busy machine."""
 
 
 def executed(path: Path) -> Any:

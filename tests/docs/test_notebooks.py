@@ -14,8 +14,8 @@ import pytest
 from matplotlib import pyplot as plt
 
 import safe_envs
-from safe_envs import agents, wrappers
-from safe_envs.scripts.figures.saving import Picture
+from safe_envs import agents, plotting, wrappers
+from safe_envs.scripts.figures.saving import StyledFigure
 
 pytestmark = pytest.mark.slow
 
@@ -70,7 +70,7 @@ def test_notebook_is_kept_without_outputs_and_runs_in_an_empty_folder(
     names: dict[str, Any] = {}
     for source in code_of(path):
         value = run_cell(source, names)
-        if isinstance(value, Picture):
+        if isinstance(value, StyledFigure):
             pictures.append(value)
     plt.close("all")
     assert pictures
@@ -106,6 +106,11 @@ def test_what_is_shown_to_users_imports_what_the_reference_documents():
                 if not {module, f"{module}.{name}", home} & documented:
                     undocumented.add(f"{where}: {module}.{name}")
     assert not undocumented
+
+
+def test_everything_that_plots_is_in_the_reference():
+    page = (DOCS / "reference" / "plotting.md").read_text()
+    assert all(f"safe_envs.plotting.{name}" in page for name in plotting.__all__)
 
 
 def test_what_is_shown_to_users_needs_no_module_of_the_command_line():

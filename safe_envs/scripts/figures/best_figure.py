@@ -18,7 +18,7 @@ from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.best_text import best_text
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.scripts.figures.labels import expression, labelled, mathematics, plain
-from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.saving import StyledFigure, finished
 from safe_envs.scripts.figures.style import (
     COLORS,
     QUIET,
@@ -46,7 +46,7 @@ def plot_attainable(
     *,
     title: str | None = None,
     size: str = DEFAULT_SIZE,
-) -> Picture:
+) -> StyledFigure:
     """Draw the best attainable safety over the starts.
 
     One coordinate gives a curve and two a plane. With more the plane of the first two is drawn,
@@ -71,7 +71,7 @@ def plot_attainable(
 
 def figure_of(
     found: AttainableSafety, policy: BestPolicy, named: str, size: str = DEFAULT_SIZE
-) -> Picture:
+) -> StyledFigure:
     """Return the figure of the value at the start of an episode.
 
     Args:
@@ -96,7 +96,7 @@ def figure_of(
     units = {state.symbol.name: state.unit for state in problem.states}
     names = [expression(coordinate, units) for coordinate in found.coordinates]
     with mpl.rc_context(STYLE):
-        figure = Picture(figsize=(width, 3.9 if size == "double" else 3.7))
+        figure = StyledFigure(figsize=(width, 3.9 if size == "double" else 3.7))
         panel = figure.subplots()
         if len(shape) == 1:
             handles = _draw_curve(panel, axes[0].edges, lower, upper)

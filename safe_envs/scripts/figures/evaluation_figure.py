@@ -18,7 +18,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.figures.evaluation_plane import draw_plane
 from safe_envs.scripts.figures.labels import labelled, mathematics, plain
 from safe_envs.scripts.figures.log_panels import LogColors, LogPanels
-from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.saving import StyledFigure, finished
 from safe_envs.scripts.figures.style import (
     QUIET,
     STYLE,
@@ -48,7 +48,7 @@ _Looks = dict[str, dict[str, Any]]
 
 def plot_evaluation(
     evaluation: Evaluation, out: Path | str | None = None, *, size: str = DEFAULT_SIZE
-) -> Picture:
+) -> StyledFigure:
     """Draw h and the safety rate over time, trajectories, and the first episodes.
 
     Args:
@@ -70,7 +70,7 @@ def plot_evaluation(
     return finished(figure_of(evaluation, size), out)
 
 
-def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Picture:
+def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> StyledFigure:
     """Return the figure of an evaluation that recorded trajectories.
 
     Args:
@@ -90,7 +90,7 @@ def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> Picture:
         heights = [_BARRIER_HEIGHT, _CURVE_HEIGHT]
         heights += [_PLANE_HEIGHT] if problem.plane and not aside else []
         above = _SIDE_HEIGHT if aside else sum(heights)
-        figure = Picture(figsize=(width, above + block))
+        figure = StyledFigure(figsize=(width, above + block))
         upper, lower = figure.add_gridspec(2, 1, height_ratios=(above, block))
         grid = upper.subgridspec(len(heights), 1 + aside, height_ratios=heights)
         barrier = figure.add_subplot(grid[0, 0])

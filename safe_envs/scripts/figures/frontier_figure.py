@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.scripts.figures.labels import mathematics, plain
-from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.saving import StyledFigure, finished
 from safe_envs.scripts.figures.style import (
     COLORS,
     QUIET,
@@ -33,7 +33,7 @@ def plot_frontier(
     *,
     title: str | None = None,
     size: str = DEFAULT_SIZE,
-) -> Picture:
+) -> StyledFigure:
     """Draw what safety costs: the largest return over the chance of a violation, and the points.
 
     Args:
@@ -51,7 +51,7 @@ def plot_frontier(
     return finished(figure_of(found, title or found.problem.name, size), out)
 
 
-def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> Picture:
+def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> StyledFigure:
     """Return the figure of the curve and the points.
 
     Args:
@@ -63,7 +63,7 @@ def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> Picture:
         ConfigurationError: there is no such size.
     """
     with mpl.rc_context(STYLE):
-        figure = Picture(figsize=(width_of(size), 4.0 if size == "double" else 3.4))
+        figure = StyledFigure(figsize=(width_of(size), 4.0 if size == "double" else 3.4))
         axes = figure.add_subplot()
         _draw_curve(axes, found)
         others, drawn = 0, dict[str, int]()

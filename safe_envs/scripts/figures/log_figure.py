@@ -10,7 +10,7 @@ import matplotlib as mpl
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.figures.labels import plain
 from safe_envs.scripts.figures.log_panels import LogPanels, note
-from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.saving import StyledFigure, finished
 from safe_envs.scripts.figures.style import (
     STYLE,
     add_legend,
@@ -34,7 +34,7 @@ def plot_log(
     end: float | None = None,
     title: str | None = None,
     size: str = DEFAULT_SIZE,
-) -> Picture:
+) -> StyledFigure:
     """Draw the nominal and the executed inputs, h and slacks of a log over time.
 
     Periods in which a constraint changed the input are shaded, infeasible ones hatched. The
@@ -64,7 +64,7 @@ def plot_log(
         )
     drawn, width = LogPanels(log), width_of(size)
     with mpl.rc_context(STYLE):
-        figure = Picture()
+        figure = StyledFigure()
         panels = list(figure.subplots(drawn.count, 1, sharex=True, squeeze=False)[:, 0])
         drawn.draw(panels)
         drawn.note_cuts(panels)

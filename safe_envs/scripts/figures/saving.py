@@ -31,7 +31,7 @@ _SCREEN_DPI = 150
 """Of a notebook."""
 
 
-class Picture(Figure):
+class StyledFigure(Figure):
     """A figure that a notebook shows, with or without pyplot, and that keeps its style."""
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
@@ -51,7 +51,7 @@ class Picture(Figure):
         return buffer.getvalue()
 
 
-def finished(figure: Picture, out: Path | str | None) -> Picture:
+def finished(figure: StyledFigure, out: Path | str | None) -> StyledFigure:
     """Return a figure, and write it if it has a file.
 
     Args:

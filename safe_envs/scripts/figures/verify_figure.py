@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.scripts.figures.contour_labels import write_levels
 from safe_envs.scripts.figures.labels import mathematics, plain
-from safe_envs.scripts.figures.saving import Picture, finished
+from safe_envs.scripts.figures.saving import StyledFigure, finished
 from safe_envs.scripts.figures.style import (
     COLORS,
     DASHES,
@@ -39,7 +39,7 @@ def plot_verification(
     starts: np.ndarray | None = None,
     title: str | None = None,
     size: str = DEFAULT_SIZE,
-) -> Picture:
+) -> StyledFigure:
     """Draw where no action meets the conditions, h, and the boundaries of the chain.
 
     A plane is drawn with the other states as at the worst state, and next to it with all values of
@@ -64,7 +64,7 @@ def plot_verification(
     return finished(figure_of(drawn, size), out)
 
 
-def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> Picture:
+def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> StyledFigure:
     """Return the figure of a verification.
 
     Args:
@@ -80,7 +80,7 @@ def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> Picture:
         aside = several and size == "double"
         # A single panel of two columns would be taller than wide panels need.
         height = 3.9 if aside else 6.8 if several else 4.2 if size == "double" else 3.6
-        figure = Picture(figsize=(width, height))
+        figure = StyledFigure(figsize=(width, height))
         shape = (1, 2) if aside else (2, 1) if several else (1, 1)
         panels = list(figure.subplots(*shape, squeeze=False).flat)
         lines = None

@@ -7,8 +7,8 @@ import itertools
 import re
 import subprocess
 import sys
-from functools import cache
-from typing import Any
+from collections.abc import Callable
+from functools import cache, partial
 from unittest import mock
 
 import matplotlib as mpl
@@ -45,26 +45,37 @@ COMMANDS = {
     "identification": "identify CubicSDE-v0 --method bayesian --set degree=3",
     "identification of ACC": "identify ACC-v0 --method bayesian",
 }
-MODULES = {"evaluate": "evaluation", "verify": "verify", "best": "best", "frontier": "frontier"}
+FUNCTIONS = {
+    "evaluate": "evaluation_figure:plot_evaluation",
+    "verify": "verify_figure:plot_verification",
+    "best": "best_figure:plot_attainable",
+    "frontier": "frontier_figure:plot_frontier",
+    "identify": "identify_figure:draw",
+}
 
 
 @cache
-def drawn_from(kind: str) -> tuple[Any, tuple[Any, ...]]:
-    """The module that draws the figure of a command, and what it draws it from."""
+def figure_maker(kind: str) -> Callable[[str], Figure]:
+    """What makes the figure of a command in a size, from what the command found."""
     words = COMMANDS[kind].split()
-    name = f"safe_envs.scripts.figures.{MODULES.get(words[0], 'identify')}_figure"
-    module = importlib.import_module(name)
+    name, function = FUNCTIONS[words[0]].split(":")
+    module = importlib.import_module(f"safe_envs.scripts.figures.{name}")
     more = ["--out", "learned.npz"] if words[0] == "identify" else []
     with (
-        mock.patch.object(module, "draw") as draw,
+        mock.patch.object(module, function) as called,
         mock.patch.object(sys, "argv", ["safe-envs", *words, *more, "--plot", "figure.pdf"]),
         pytest.raises(SystemExit) as ended,
     ):
         cli.main()
     assert not ended.value.code
-    *given, _, size = draw.call_args.args
-    assert size == "double"
-    return module, tuple(given)
+    given, settings = called.call_args
+    if function == "draw":
+        *given, _, size = given
+        assert size == "double"
+        return partial(module.figure_of, *given)
+    *given, _ = given
+    assert settings.pop("size") == "double"
+    return lambda size: getattr(module, function)(*given, size=size, **settings)
 
 
 def figure_of(kind: str, size: str) -> Figure:
@@ -74,8 +85,7 @@ def figure_of(kind: str, size: str) -> Figure:
         rows = test_sweep_figure.ROWS
         layout = sweep_figure.Layout.of(rows, test_sweep_figure.SWEPT)
         return sweep_figure.figure_of(rows, layout, size)[0]
-    module, given = drawn_from(kind)
-    return module.figure_of(*given, size)
+    return figure_maker(kind)(size)
 
 
 @pytest.mark.parametrize("size", list(WIDTHS))
