@@ -411,7 +411,7 @@ def test_the_help_names_every_setting_and_its_default(method):
 def test_the_help_shows_the_settings(identify):
     status, out, _ = identify("--help")
     assert status == 0
-    for text in ("label_dt=0.001", "diffusion_degree=0", "estimator=martingale", "another format"):
+    for text in ("label_dt=0.001", "diffusion_degree=0", "estimator=martingale", ".webp"):
         assert text in out
 
 
