@@ -72,11 +72,12 @@ assert not {"gymnasium", "numpy", "sympy", "importlib.metadata"} & set(sys.modul
     assert finished(code) == (0, "")
 
 
-def test_a_folder_on_the_path_will_do_without_an_installation():
-    # Without the packages of the environment there is no metadata of this one.
+def test_a_folder_on_the_path_will_do_without_an_installation(tmp_path):
+    # Without the packages of the environment and the checkout there is no metadata of this one.
+    (tmp_path / "safe_envs").symlink_to(ROOT / "safe_envs")
     code = f"""
 import sys
-sys.path[:0] = [{str(ROOT)!r}]
+sys.path[:0] = [{str(tmp_path)!r}]
 import safe_envs
 assert safe_envs.__version__ == "0+unknown", safe_envs.__version__
 assert safe_envs.ENV_IDS
