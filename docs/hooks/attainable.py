@@ -11,6 +11,7 @@ that no grid serves. Entries of other envs remain.
 from __future__ import annotations
 
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -66,8 +67,12 @@ def _line(name: str, entry: dict[str, Any]) -> str:
     elif entry["upper"] - entry["lower"] >= 1.0 - _NEAR:
         bounds = "0 (grid too coarse) | 1 (grid too coarse)"
     else:
-        bounds = " | ".join(f"{100.0 * entry[end]:.2f} %" for end in ("lower", "upper"))
+        bounds = " | ".join(_outwards(entry["lower"], entry["upper"]))
     return f"| {_link(name)} | {bounds} | {rate:.1f} % [{low:.1f}, {high:.1f}] | {by} |"
+
+
+def _outwards(lower: float, upper: float) -> tuple[str, str]:
+    return f"{math.floor(1e4 * lower) / 100:.2f} %", f"{math.ceil(1e4 * upper) / 100:.2f} %"
 
 
 def _grid_line(name: str, entry: dict[str, Any]) -> str:

@@ -272,6 +272,7 @@ def test_table_of_attainable_safety_says_what_commands_wrote(hook: Any, tmp_path
     best = {"lower": 0.9, "upper": 0.95, "simulated": 0.93, "simulated_interval": [0.91, 0.94]}
     best |= {"contradiction": None, "coordinates": ["x"], "cells": [40], "steps": 5}
     best |= {"seconds": 2.0, "memory": 3e6}
+    unround = best | {"lower": 0.99996, "upper": 0.999961}
     rows = [
         {"filter": "none", "safety_rate": 0.1, "ci_low": 0.0, "ci_high": 0.2},
         {"filter": "scbf", "safety_rate": 0.5, "ci_low": 0.4, "ci_high": 0.6},
@@ -281,6 +282,7 @@ def test_table_of_attainable_safety_says_what_commands_wrote(hook: Any, tmp_path
         "Coarse": best | {"lower": 0.0, "upper": 1.0},
         "Doubtful": best | {"contradiction": "too high", "lower": None, "upper": None},
         "Large": {"rows": rows},
+        "Outwards": unround,
     }
     for name, document in written.items():
         (folder / f"{name}.json").write_text(json.dumps(document))
@@ -290,10 +292,11 @@ def test_table_of_attainable_safety_says_what_commands_wrote(hook: Any, tmp_path
     assert "| 0 (grid too coarse) | 1 (grid too coarse) |" in values[1]
     assert "| withheld | withheld |" in values[2]
     assert "| no grid | no grid | 50.0 % [40.0, 60.0] | `scbf` |" in values[3]
+    assert "| 99.99 % | 100.00 % |" in values[4]
     assert {line.count("|") for line in values} == {6}
     assert [line.split("|")[2:] for line in grids] == [
         [" `x` ", " 40 ", " 5 ", " 2 s ", " 3 MB ", ""]
-    ] * 3
+    ] * 4
 
 
 def test_attainable_safety_is_that_of_envs_of_this_project(hook: Any):

@@ -45,6 +45,8 @@ def own_system(names: dict[str, Any]) -> None:
     assert not any(names["lie_derivative_g"](names["yacht"], names["h"]).subs(names["p"], 0))
     bounds = names["found"].guarantee.applicable_bounds(names["starts_of"](names["problem"]), 10.0)
     assert all(bound.value < 0.01 for bound in bounds)
+    assert names["lower"] <= 100 * names["best"].lower < names["lower"] + 0.01
+    assert names["upper"] - 0.01 < 100 * names["best"].upper <= names["upper"]
     assert names["certification"].mean > 0.9
     assert names["check"](names["certificate"]).word == "checked"
     assert names["nominal"].row(certified).continuous_word == "proved"
