@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
 import shlex
 import tempfile
@@ -22,6 +23,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 _COLUMNS = 96
 """Of code that fits the text of a page on a desktop."""
+_COLOURED = ("FORCE_COLOR", "TTY_COMPATIBLE")
+"""Environment variables that let Rich write as to a terminal."""
 
 _FENCE = re.compile(r"^```(python|console) run([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _ANY_FENCE = re.compile(r"^```(python|console)[^\n]*\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -102,6 +105,16 @@ def _folder() -> Iterator[None]:
             yield
 
 
+@contextlib.contextmanager
+def _without_colours() -> Iterator[None]:
+    """Print no control characters, also where the environment asks for colours in pipes."""
+    before = {name: os.environ.pop(name) for name in _COLOURED if name in os.environ}
+    try:
+        yield
+    finally:
+        os.environ.update(before)
+
+
 def _printed(kind: str, options: str, code: str, names: dict[str, Any]) -> list[str]:
     if kind == "console":
         fails = "fails" in _settings(options)
@@ -166,7 +179,7 @@ def _output(words: Sequence[str], fails: bool) -> str:
 
     command, out, err, status = typer.main.get_command(app), io.StringIO(), io.StringIO(), 0
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
-    with redirected[0], redirected[1], as_on_a_terminal():
+    with redirected[0], redirected[1], as_on_a_terminal(), _without_colours():
         try:
             run(lambda: command.main(list(words[1:]), prog_name="safe-envs", standalone_mode=False))
         except SystemExit as end:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 import tomllib
 from collections.abc import Iterator
@@ -249,6 +250,18 @@ def test_what_an_example_prints_follows_it(hook: Any):
     assert "\nError: " in shown
     with pytest.raises(RuntimeError, match="status 2"):
         runs.with_output(page.replace(" fails", ""))
+
+
+@pytest.mark.parametrize("variable", ["FORCE_COLOR", "TTY_COMPATIBLE"])
+def test_pages_have_no_colours_of_terminals(
+    hook: Any, monkeypatch: pytest.MonkeyPatch, variable: str
+):
+    runs, page = hook("runs"), "```console run\n$ safe-envs list\n```\n"
+    plain = runs.with_output(page)
+    monkeypatch.setenv(variable, "1")
+    assert runs.with_output(page) == plain
+    assert "\x1b" not in plain
+    assert os.environ[variable] == "1"
 
 
 def test_wide_commands_and_outputs_fit_a_page(hook: Any):
