@@ -28,7 +28,10 @@ UNFILTERED_DASHES = (0, (2.5, 1.0))
 
 UNSAFE = "#B9B9B9"
 QUIET = "#444444"
+_OF_MACHINE = ("backend", "backend_fallback", "interactive", "toolbar", "timezone", "date.epoch")
 STYLE: Any = {
+    # The user's own style, a dark one or one of TeX, would make lines and labels unreadable.
+    **{name: each for name, each in mpl.rcParamsDefault.items() if name not in _OF_MACHINE},
     "font.family": "DejaVu Sans",
     "mathtext.fontset": "dejavusans",
     "font.size": 8,
