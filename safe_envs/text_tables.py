@@ -143,9 +143,15 @@ def text_of(table: FittedTable) -> str:
 def markdown_of(table: FittedTable) -> str:
     """Return a table as Markdown."""
     marks = ["---:" if c.column.kind == "r" else ":---" for c in table]
-    titles = [_markdown(c.column.plain_title) for c in table]
-    rows = zip(*([_markdown(str(cell)) for cell in c.column.cells] for c in table), strict=True)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (titles, marks, *rows))
+    titles = [plain_markdown(c.column.plain_title) for c in table]
+    cells = ([plain_markdown(str(cell)) for cell in c.column.cells] for c in table)
+    rows = [titles, marks, *zip(*cells, strict=True)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def plain_markdown(text: str) -> str:
+    """Return a text in one line, as Markdown that shows the same characters."""
+    return re.sub(r"([\\`*_|<>\[\]&$~])", r"\\\1", " ".join(text.split()))
 
 
 def _fitted(column: Column) -> FittedColumn:
@@ -269,7 +275,3 @@ def _left(text: str, width: int) -> str:
 
 def _right(text: str, width: int) -> str:
     return " " * (width - text_width(text)) + text
-
-
-def _markdown(text: str) -> str:
-    return re.sub(r"([\\`*_|<>\[\]])", r"\\\1", " ".join(text.split()))

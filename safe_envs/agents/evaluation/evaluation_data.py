@@ -101,7 +101,14 @@ class EvaluationData:
     def about(self) -> str:
         """Policy, number of episodes, and seed."""
         seed, policy = self.config["seed"], self.config["policy"]["name"]
-        return f"policy {policy} | {self.spec.episodes} episodes | seed {seed}"
+        return f"policy {policy} | {self.counted} | seed {seed}"
+
+    @property
+    def counted(self) -> str:
+        """Number of episodes, and of identifications where there are several."""
+        repeats = max((row.learning.repeats for row in self.rows if row.learning), default=1)
+        often = f" x {repeats} identifications" if repeats > 1 else ""
+        return f"{self.config['episodes']} episodes{often}"
 
     @property
     def episodes(self) -> dict[str, list[EpisodeResults]]:

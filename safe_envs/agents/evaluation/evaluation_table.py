@@ -17,7 +17,7 @@ from safe_envs.text_tables import Column, FittedTable, arranged, without_empty
 _NONE = "-"
 _SAFETY, _BEHAVIOR, _TIMING = range(3)
 _SHORT = ("bound, held input", "safe", "violations", "bound, continuous", "intervened")
-_SHORT += ("infeasible", "return")
+_SHORT += ("infeasible", "return", "worst ident.", "bound, posterior")
 _LEAST_P = 1e-10
 
 
@@ -65,6 +65,8 @@ def evaluation_table(evaluation: EvaluationData, timing: bool = False) -> Evalua
     columns += _of_learning(rows)
     columns, empty = without_empty(columns, _NONE)
     facts = [f"attainable by any policy: {each}" for each in attainable_text(best)]
+    if best and best.contradiction:
+        facts.append("attainable by any policy: withheld")
     facts += [f"{title}: none of these has one" for title in empty]
     columns += _behavior(rows)
     if timing:

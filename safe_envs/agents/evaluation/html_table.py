@@ -13,6 +13,7 @@ from safe_envs.agents.evaluation.evaluation_table import (
     evaluation_table,
     interval_name,
 )
+from safe_envs.agents.evaluation.setting_text import setting_lines
 from safe_envs.text_tables import Column
 
 _WIDTH = 80
@@ -39,6 +40,7 @@ def html_table(evaluation: EvaluationData) -> str:
         lines.append(f"{heading} [{interval_name(evaluation)}]:")
         lines += map(describe, differences)
     heading = f"<b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}"
+    heading = "<br>".join([heading, *map(escape, setting_lines(evaluation))])
     parts = [_paragraph(heading), first, *map(_paragraph, map(escape, table.facts)), *others]
     if lines:
         parts.append(_paragraph("<br>".join(map(escape, lines))))

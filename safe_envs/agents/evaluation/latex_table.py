@@ -15,6 +15,7 @@ from safe_envs.agents.evaluation.evaluation_table import (
     interval_name,
     p_text,
 )
+from safe_envs.agents.evaluation.setting_text import setting_lines
 from safe_envs.text_lines import folded
 from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of
 
@@ -175,11 +176,10 @@ def _bottom(lines: Sequence[str], height: int) -> list[str]:
 
 
 def _caption(evaluation: EvaluationData) -> str:
-    config, problem = evaluation.config, evaluation.problem
+    config, settings = evaluation.config, setting_lines(evaluation)
     text = (
         f"Safety of the policy {config['policy']['name']} on {evaluation.title}:"
-        f" {config['episodes']} episodes from the seed {config['seed']}, dt = {problem.dt:g} s,"
-        f" horizon {problem.duration:g} s; filters know the {config['knowledge']}."
+        f" {evaluation.counted} from the seed {config['seed']}; {'. '.join(settings)}."
         f" Brackets: {interval_name(evaluation)}."
     )
     marks = "; ".join(marks_in(evaluation_table(evaluation).columns))

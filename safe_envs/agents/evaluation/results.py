@@ -10,7 +10,9 @@ from safe_envs.agents.evaluation.evaluation_table import evaluation_table
 from safe_envs.agents.evaluation.frames import frame_of, row_columns
 from safe_envs.agents.evaluation.html_table import html_table
 from safe_envs.agents.evaluation.latex_table import latex_table
-from safe_envs.text_tables import markdown_of, text_of
+from safe_envs.agents.evaluation.setting_text import setting_lines
+from safe_envs.text_lines import wrapped
+from safe_envs.text_tables import markdown_of, plain_markdown, text_of
 
 _WIDTH = 80
 """Of texts, in characters."""
@@ -37,15 +39,18 @@ class Evaluation(EvaluationData):
         return latex_table(self)
 
     def to_markdown(self) -> str:
-        """Return the table in Markdown, in parts that fit a page."""
+        """Return the setting and the table in Markdown, in parts that fit a page."""
         table = evaluation_table(self)
         tables = [markdown_of(each) for each in table.arranged(_WIDTH)]
-        return "\n\n".join([tables[0], *table.facts, *tables[1:]])
+        settings = map(plain_markdown, setting_lines(self))
+        return "\n\n".join([*settings, tables[0], *table.facts, *tables[1:]])
 
     def __str__(self) -> str:
         table = evaluation_table(self).short()
         tables = map(text_of, table.arranged(_WIDTH))
-        return "\n\n".join([f"{self.title} | {self.about}", *tables, *table.facts])
+        lines = [f"{self.title} | {self.about}"]
+        lines += [part for line in setting_lines(self) for part in wrapped(line, _WIDTH)]
+        return "\n\n".join(["\n".join(lines), *tables, *table.facts])
 
     __repr__ = __str__
 

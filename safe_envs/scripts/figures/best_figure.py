@@ -16,6 +16,7 @@ from matplotlib.ticker import FuncFormatter
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.best_text import best_text
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.scripts.figures.labels import expression, labelled, mathematics, plain
 from safe_envs.scripts.figures.saving import StyledFigure, finished
@@ -30,7 +31,6 @@ from safe_envs.scripts.figures.style import (
     wrapped,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
-from safe_envs.scripts.reports.evaluation_report import describe_system
 
 LEVEL = 0.99
 """Of the set that is marked."""

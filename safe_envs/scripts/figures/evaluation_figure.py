@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.policies.names import POLICY_FILE
 from safe_envs.errors import ConfigurationError
@@ -31,7 +32,6 @@ from safe_envs.scripts.figures.style import (
     wrapped,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
-from safe_envs.scripts.reports.evaluation_report import describe_system
 
 _MOST_EPISODES = {"single": 2, "double": 4}
 """Filters whose first episode is drawn, by the size of the figure."""

@@ -10,6 +10,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.scripts.figures.labels import mathematics, plain
 from safe_envs.scripts.figures.saving import StyledFigure, finished
 from safe_envs.scripts.figures.style import (
@@ -21,7 +22,6 @@ from safe_envs.scripts.figures.style import (
     add_title,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
-from safe_envs.scripts.reports.evaluation_report import describe_system
 
 _POLICIES, _FILTERS, _BEST = ("o", "v", "<", ">"), ("s", "D", "^", "P", "p", "h"), "*"
 """Marks by the kind of a point: none depends on its colour alone."""

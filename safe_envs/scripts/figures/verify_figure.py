@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from safe_envs.agents.evaluation.bound_check import starts_of
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.scripts.figures.contour_labels import write_levels
 from safe_envs.scripts.figures.labels import mathematics, plain
 from safe_envs.scripts.figures.saving import StyledFigure, finished
@@ -27,7 +28,6 @@ from safe_envs.scripts.figures.style import (
 from safe_envs.scripts.figures.verify_panel import INFEASIBLE, DrawnVerification, draw_line
 from safe_envs.scripts.figures.verify_plane import draw_shares, draw_slice
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
-from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.feasibility import Verification
 

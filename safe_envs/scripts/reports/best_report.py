@@ -11,10 +11,10 @@ from rich.text import Text
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.best_text import COMPUTED, outwards
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.tables import print_rows
 
 _COUNTED = {

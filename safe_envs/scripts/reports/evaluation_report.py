@@ -17,10 +17,11 @@ from safe_envs.agents.evaluation.evaluation_table import (
     interval_name,
     points,
 )
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.setting_text import NOTHING_RANDOM, setting_text, unsafe_starts
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.bound_notes import bound_notes
@@ -101,10 +102,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
 
 def heading(evaluation: Evaluation) -> Text:
     """Return what was evaluated, in two lines."""
-    config = evaluation.config
-    repeats = max((row.learning.repeats for row in evaluation.rows if row.learning), default=1)
-    often = f" x {repeats} identifications" if repeats > 1 else ""
-    return heading_of(config, evaluation.problem, f"{config['episodes']} episodes{often}")
+    return heading_of(evaluation.config, evaluation.problem, evaluation.counted)
 
 
 def heading_of(config: Mapping[str, Any], problem: SafetyProblem, what: str) -> Text:
@@ -119,42 +117,8 @@ def heading_of(config: Mapping[str, Any], problem: SafetyProblem, what: str) -> 
     title.append(
         f" | policy {config['policy']['name']} | {what} | seed {config['seed']}", style="not bold"
     )
-    seen = config["filter_spec"]
-    system = f"seen through {seen}, {_timing(problem)}" if seen else describe_system(problem)
-    goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
-    watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
-    title.append(f"\n{system}{watched}; filters know the {config['knowledge']}{goal}", "not bold")
+    title.append(f"\n{setting_text(config, problem)}", "not bold")
     return title
-
-
-def describe_system(problem: SafetyProblem) -> str:
-    """Return noise, mismatch and timing of a problem."""
-    return f"{describe_plant(problem)}, {_timing(problem)}"
-
-
-def _timing(problem: SafetyProblem) -> str:
-    return f"dt = {problem.dt:g} s, horizon {problem.duration:g} s"
-
-
-def describe_plant(problem: SafetyProblem) -> str:
-    """Return noise and mismatch of a problem."""
-    plant = {p.name: value for p, value in problem.plant.parameters.items()}
-    model = {p.name: value for p, value in problem.model.parameters.items()}
-    noise = ", ".join(f"{name} = {plant[name]:g}" for name in problem.noise)
-    differing = [
-        f"{name} = {plant[name]:g} (model {model[name]:g})"
-        for name in plant
-        if plant[name] != model[name]
-    ]
-    told = (
-        f"noise {noise}"
-        if any(plant[name] for name in problem.noise)
-        else "fixed noise"
-        if problem.plant.noisy
-        else "no noise"
-    )
-    mismatch = f"plant {', '.join(differing)}" if differing else "model = plant"
-    return f"{told}, {mismatch}"
 
 
 def _notes(evaluation: Evaluation, timing: bool) -> list[str]:
@@ -175,10 +139,7 @@ def _notes(evaluation: Evaluation, timing: bool) -> list[str]:
         speeds = evaluation.timing.rows
         notes += engine_notes([(row.filter, row.engine, row.jobs) for row in speeds])
     if evaluation.is_deterministic:
-        notes.append(
-            "nothing is random here (no noise, a fixed start, a deterministic policy), so that all"
-            " episodes are one and the same: the interval has no meaning."
-        )
+        notes.append(NOTHING_RANDOM)
     return notes
 
 
@@ -204,14 +165,6 @@ def _of_violations(row: EvaluationRow) -> list[str]:
         f"{some} of {row.filter} come no lower than h = 0 to rounding: they touch the edge, and"
         " safe is h > 0"
     ]
-
-
-def unsafe_starts(share: float) -> list[str]:
-    """Return a note on episodes that start where h <= 0, if there are some."""
-    if share == 0.0:
-        return []
-    some = "all episodes start" if share == 1.0 else f"{percent(share)} of the episodes start"
-    return [f"{some} where h <= 0: they count as violated whatever a filter does"]
 
 
 def early_end(name: str, which: str, length: float, steps: int) -> str:

@@ -9,8 +9,8 @@ from rich.text import Text
 
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.tables import print_rows
 
 _COUNTED = {

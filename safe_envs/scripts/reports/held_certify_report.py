@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.rate_text import percent
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.certify_report import say_written
-from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.synthesis.held_synthesis import HeldAttempt, HeldCertification
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.evaluation.setting_text import describe_plant, describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.reports.evaluation_report import describe_plant, describe_system
 from safe_envs.wrappers.learning import LearnedModel
 from safe_envs.wrappers.learning.data.collection import draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions

@@ -9,9 +9,9 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.bounds_report import print_bounds, print_chain, print_measurements
-from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.judge_report import print_statements
 from safe_envs.scripts.reports.quantities import number_text, share_text, state_text
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer

@@ -54,6 +54,8 @@ def test_the_short_table_keeps_what_makes_it_honest(evaluated):
         "safe [95 % interval]",
         "violations",
         "bound, continuous",
+        "worst ident.",
+        "bound, posterior",
         "intervened",
         "infeasible",
         "return",

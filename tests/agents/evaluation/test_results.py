@@ -16,6 +16,7 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import episodes_file
 from safe_envs.agents.evaluation.frames import row_columns
 from safe_envs.agents.evaluation.spec import RunSettings
+from tests.agents.evaluation.made_up import attainable, nasty_evaluation
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +31,41 @@ def measured(**how):
 
 
 def test_text_is_a_short_table(found):
-    heading, _, *lines = str(found).splitlines()
+    head, _, rest = str(found).partition("\n\n")
+    heading, setting = head.split("\n", 1)
+    lines = rest.splitlines()
     assert heading == f"{found.title} | policy random | 40 episodes | seed 0"
+    assert setting.startswith("noise sigma = 0.8, model = plant")
     assert "safe [95 %" in lines[0]
     assert [line.split()[0] for line in lines[3:5]] == ["none", "cbf:alpha=2"]
     assert len(lines) < 12
-    assert max(map(len, lines)) <= 80
+    assert max(map(len, str(found).splitlines())) <= 80
     assert repr(found) == str(found)
+
+
+def test_all_forms_tell_the_setting_and_what_makes_intervals_meaningless():
+    options = {"horizon": 0.1}
+    plain = evaluate("DubinsDisk-v0", filters=["none", "hocbf"], options=options, episodes=3)
+    fixed = replace(
+        plain,
+        config={**plain.config, "monitoring": "continuous"},
+        is_deterministic=True,
+        best=replace(attainable(0.9, 1.0), lower=None, upper=None, contradiction="it is"),
+    )
+    for text in (str(fixed), fixed.to_markdown(), fixed._repr_html_(), fixed.to_latex()):
+        words = " ".join(text.split())
+        assert "v = 0.8 (model 0.5)" in words
+        assert "monitored continuously" in words
+        assert "the interval has no meaning" in words
+        assert "ttainable by any policy: withheld" in words
+        assert "of the episodes start where h" not in words
+
+
+def test_the_short_table_has_the_worst_identification():
+    found = nasty_evaluation()
+    assert "worst" in str(found)
+    assert "20 episodes x 3 identifications" in str(found)
+    assert "20 episodes x 3 identifications" in found.to_latex()
 
 
 def test_results_of_episodes_are_those_of_the_rows(found):
