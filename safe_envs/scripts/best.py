@@ -59,7 +59,7 @@ def best(
             help=f"Draw the value over the coordinates of the grid: {text_options.FORMATS}",
         ),
     ] = None,
-    size: figure_options.Size = figure_options.DEFAULT_SIZE,
+    size: figure_options.Size = None,
 ) -> None:
     """Print how safe any policy can be from the env's starts, and how safe a greedy policy is.
 
@@ -81,7 +81,7 @@ def best(
     require_whole("seed", seed, 0)
     reads = [*text_options.inputs_of(env.system), *([("--table", table)] if table else [])]
     text_options.require_outputs(json, plot, inputs=reads)
-    figure_options.width_of(size)
+    size = figure_options.size_of(size, plot)
     if table is not None:
         require_writable(table)
     settings = ValueSettings(

@@ -47,7 +47,7 @@ def evaluate(
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
     timing: of.Timing = False,
-    size: figure_options.Size = figure_options.DEFAULT_SIZE,
+    size: figure_options.Size = None,
 ) -> None:
     """Print the safety rate of a policy under each filter, and compare the filters in pairs.
 
@@ -62,7 +62,7 @@ def evaluate(
     """
     reads = text_options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec)
     text_options.require_outputs(json, plot, episodes_out=episodes_out, latex=latex, inputs=reads)
-    figure_options.width_of(size)
+    size = figure_options.size_of(size, plot)
     common: dict[str, Any] = {
         "filters": list(dict.fromkeys(filters)) if filters else None,
         "trust": trust,

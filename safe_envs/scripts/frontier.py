@@ -90,7 +90,7 @@ def frontier(
         Path | None,
         typer.Option(metavar="FILE", help=f"Draw the curve and the points: {text_options.FORMATS}"),
     ] = None,
-    size: figure_options.Size = figure_options.DEFAULT_SIZE,
+    size: figure_options.Size = None,
 ) -> None:
     """Print the largest returns that can be had at each risk, next to those of filters.
 
@@ -112,7 +112,7 @@ def frontier(
     files = [file for policy in named for file in text_options.inputs_of(None, policy)]
     files += text_options.inputs_of(env.system, filters=given)
     text_options.require_outputs(json, plot, inputs=files)
-    figure_options.width_of(size)
+    size = figure_options.size_of(size, plot)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     settings = FrontierSettings(

@@ -73,7 +73,7 @@ def identify(
             metavar="FILE", help=f"Draw the truth against the estimate: {text_options.FORMATS}"
         ),
     ] = None,
-    size: figure_options.Size = figure_options.DEFAULT_SIZE,
+    size: figure_options.Size = None,
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
@@ -90,7 +90,7 @@ def identify(
     require_whole("seed", seed, 0)
     inputs = [*text_options.inputs_of(env.system), *([] if data is None else [("--data", data)])]
     text_options.require_outputs(json, plot, out=out, inputs=inputs)
-    figure_options.width_of(size)
+    size = figure_options.size_of(size, plot)
     arguments = env.arguments
     learner = learner_of(method)
     chosen = read_settings(method, learner, settings or ())

@@ -55,7 +55,7 @@ def sweep_report(
             show_default=False,
         ),
     ] = None,
-    size: figure_options.Size = figure_options.DEFAULT_SIZE,
+    size: figure_options.Size = None,
     json: Json = None,
 ) -> None:
     """Draw the safety rates of a sweep with 95 % bands, and list its worst and its failed cells.
@@ -71,7 +71,7 @@ def sweep_report(
     path = plot or folder / _PICTURE
     index, rows = read_index(folder), read(folder).to_pylist()
     text_options.require_outputs(json, path)
-    figure_options.width_of(size)
+    size = figure_options.size_of(size, path)
     swept = index["swept"]
     for option, name in (("--x", x), ("--lines", lines)):
         if name is not None and name not in swept:

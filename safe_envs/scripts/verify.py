@@ -65,7 +65,7 @@ def verify(
             ),
         ),
     ] = None,
-    size: figure_options.Size = figure_options.DEFAULT_SIZE,
+    size: figure_options.Size = None,
 ) -> None:
     """Print where a filter's conditions cannot be met, and its bounds next to a simulation.
 
@@ -90,7 +90,7 @@ def verify(
     require_engine(engine)
     inputs = text_options.inputs_of(env.system, policy, [filter_name or ""])
     text_options.require_outputs(json, plot, inputs=inputs)
-    figure_options.width_of(size)
+    size = figure_options.size_of(size, plot)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     # An unknown policy is an error before the search, and without a simulation too.

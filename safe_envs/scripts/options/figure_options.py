@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -17,14 +18,34 @@ Source: IEEE Author Center, "Resolution and size" of graphics: 3.5 in and 7.16 i
 DEFAULT_SIZE = "double"
 
 Size = Annotated[
-    str,
+    str | None,
     typer.Option(
         metavar="|".join(WIDTHS),
-        help="Width of the figure in columns of a paper: {single:g} or {double:g} inches.".format(
-            **WIDTHS
-        ),
+        help="Width of the figure in columns of a paper: {single:g} or {double:g} inches;"
+        " {default} by default.".format(**WIDTHS, default=DEFAULT_SIZE),
     ),
 ]
+
+
+def size_of(size: str | None, plot: Path | None) -> str:
+    """Return the size of the figure of a command.
+
+    Args:
+        size: as given; None where it is not.
+        plot: file of the figure; None where none is drawn.
+
+    Raises:
+        ConfigurationError: there is no such size, or no figure.
+    """
+    if size is None:
+        return DEFAULT_SIZE
+    width_of(size)
+    if plot is None:
+        raise ConfigurationError(
+            f"--size {size} is of a figure, and none is drawn: give --plot FILE too, or leave"
+            " --size out"
+        )
+    return size
 
 
 def width_of(size: str) -> float:

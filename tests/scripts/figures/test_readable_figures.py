@@ -182,3 +182,14 @@ def test_an_unknown_size_is_refused(command, monkeypatch, capsys):
     assert "did you mean 'single'" in " ".join(capsys.readouterr().err.split())
     with pytest.raises(ConfigurationError, match="single"):
         plot_log(test_log_figure.log_of(test_log_figure.SAFE), size="singel")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "verify", "best", "frontier", "identify"])
+def test_a_size_without_a_figure_is_refused(command, monkeypatch, capsys):
+    words = [command, "Scalar-v0", "--size", "single"]
+    words += ["--method", "bayesian", "--out", "out.npz"] if command == "identify" else []
+    monkeypatch.setattr(sys, "argv", ["safe-envs", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 2
+    assert "give --plot FILE too" in " ".join(capsys.readouterr().err.split())

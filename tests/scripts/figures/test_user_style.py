@@ -16,7 +16,8 @@ def test_neither_a_dark_style_nor_tex_changes_a_figure(tmp_path):
         "CubicSDE-v0", filters=["none"], episodes=2, options={"horizon": 0.1}, record=True
     )
     plain, styled, later = (tmp_path / f"{name}.png" for name in ("plain", "styled", "later"))
-    figure = plot_evaluation(found, plain, size="single")
+    plot_evaluation(found, plain, size="single")
+    figure = plot_evaluation(found, size="single")
     backend = dict.get(mpl.rcParams, "backend")
     with mpl.rc_context():
         mpl.style.use("dark_background")
