@@ -65,8 +65,6 @@ def evaluation_table(evaluation: EvaluationData, timing: bool = False) -> Evalua
     columns += _of_learning(rows)
     columns, empty = without_empty(columns, _NONE)
     facts = [f"attainable by any policy: {each}" for each in attainable_text(best)]
-    if best and best.contradiction:
-        facts.append("attainable by any policy: withheld")
     facts += [f"{title}: none of these has one" for title in empty]
     columns += _behavior(rows)
     if timing:

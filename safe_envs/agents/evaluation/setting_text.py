@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from safe_envs.agents.evaluation.best_text import best_line
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.problem.problem import SafetyProblem
@@ -17,8 +18,9 @@ NOTHING_RANDOM = (
 
 def setting_lines(evaluation: EvaluationData) -> list[str]:
     """Return the setting of an evaluation, and what its rates do not tell by themselves."""
-    lines = [setting_text(evaluation.config, evaluation.problem)]
+    lines, best = [setting_text(evaluation.config, evaluation.problem)], evaluation.best
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
+    notes += [best_line(best)] if best and best.contradiction else []
     notes += [NOTHING_RANDOM] if evaluation.is_deterministic else []
     return lines + [note[:1].upper() + note[1:].rstrip(".") for note in notes]
 

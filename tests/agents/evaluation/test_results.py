@@ -57,7 +57,7 @@ def test_all_forms_tell_the_setting_and_what_makes_intervals_meaningless():
         assert "v = 0.8 (model 0.5)" in words
         assert "monitored continuously" in words
         assert "the interval has no meaning" in words
-        assert "ttainable by any policy: withheld" in words
+        assert "est attainable safety: withheld" in words
         assert "of the episodes start where h" not in words
 
 
