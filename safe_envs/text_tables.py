@@ -130,7 +130,9 @@ def text_of(table: FittedTable) -> str:
     lines.append("-" * _total(table))
     for cells in zip(*(c.cells for c in table), strict=True):
         parts = [
-            wrapped(str(cell), c.width) if c.column.kind == "p" else str(cell).splitlines() or [""]
+            wrapped(visible(cell), c.width)
+            if c.column.kind == "p"
+            else visible(cell).splitlines() or [""]
             for c, cell in zip(table, cells, strict=True)
         ]
         lines += [
@@ -275,3 +277,8 @@ def _left(text: str, width: int) -> str:
 
 def _right(text: str, width: int) -> str:
     return " " * (width - text_width(text)) + text
+
+
+def visible(cell: Any) -> str:
+    """Return a cell without what would control a terminal or turn its text around."""
+    return "".join([c if c.isprintable() or c in "\n\u00a0" else " " for c in str(cell)])

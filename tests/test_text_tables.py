@@ -134,3 +134,10 @@ def test_a_table_without_rows_has_titles():
     for names, width in itertools.product(([], [Column("a", (), "l")]), (20, 80)):
         (fitted,) = arranged(names, [Column("b", ())], width)
         assert text_of(fitted).splitlines()[0].split() == [*["a"] * len(names), "b"]
+
+
+def test_text_controls_no_terminal():
+    names, columns = table(["a\x1b[31mb", "\u202ecd"])
+    (fitted,) = arranged([names], columns[:2], 80)
+    assert "a [31mb" in text_of(fitted)
+    assert "\u202e" not in text_of(fitted)
