@@ -1,4 +1,4 @@
-"""Files of figures: whole or not at all, and the same bytes for the same figure."""
+"""Files of figures: whole or not at all, and without a date."""
 
 from __future__ import annotations
 
