@@ -92,7 +92,10 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
         The nearest name, and the others: all where they are few, else the next two.
     """
     names = list(allowed)
-    close = difflib.get_close_matches(shortened(name), names, n=3, cutoff=0.4)
+    # Whoever writes a name in capitals means the name.
+    lower = {each.lower(): each for each in reversed(names)}
+    found = difflib.get_close_matches(shortened(name).lower(), lower, n=3, cutoff=0.4)
+    close = [lower[each] for each in found]
     if len(names) > _FEW:
         if close:
             others = f" (or {', '.join(close[1:])})" if close[1:] else ""

@@ -24,6 +24,8 @@ class _RegisteringLoader(Loader):
         self._own, self._finder = own, finder
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_own":  # A copy asks before it has one.
+            raise AttributeError(name)
         return getattr(self._own, name)
 
     def create_module(self, spec: ModuleSpec) -> ModuleType | None:
@@ -60,6 +62,8 @@ def register_with_gymnasium() -> None:
     if _GYMNASIUM in sys.modules:
         _register()
     else:
+        # One of an earlier import of the package would ask this one, and this one that.
+        sys.meta_path[:] = [f for f in sys.meta_path if type(f).__module__ != __name__]
         sys.meta_path.insert(0, _GymnasiumFinder())
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 
@@ -24,7 +25,7 @@ def lazy_attributes(
 
     def get(name: str) -> Any:
         if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            return _module_in(package, name)
         found = namespace[name] = getattr(import_module(modules[name]), name)
         return found
 
@@ -32,3 +33,16 @@ def lazy_attributes(
         return sorted({*namespace, *modules})
 
     return get, names
+
+
+def _module_in(package: str, name: str) -> ModuleType:
+    """Import a module of a package that is used as its attribute, as in `safe_envs.envs`."""
+    full = f"{package}.{name}"
+    try:
+        # What Python and its tools look for in any module, such as __wrapped__, is none.
+        if not name.startswith("_"):
+            return import_module(full)
+    except ModuleNotFoundError as error:
+        if error.name != full:
+            raise
+    raise AttributeError(f"module {package!r} has no attribute {name!r}")

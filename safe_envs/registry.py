@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +22,16 @@ def full_id(env_id: str) -> str:
     """
     if not isinstance(env_id, str):
         raise ConfigurationError(f"env_id = {shown(env_id)}; give the id of an env as text")
-    for candidate in (env_id, f"safe_envs/{env_id}"):
-        if candidate in ENV_IDS:
-            return candidate
-    # Gymnasium takes longer to import than all that a command needs up to here.
+    candidates = (env_id, f"safe_envs/{env_id}")
+    # Gymnasium takes longer to import than all that a command needs up to here, and before it is
+    # imported nobody has an env of their own under the short name.
+    if sys.modules.get("gymnasium") is None:
+        for candidate in candidates:
+            if candidate in ENV_IDS:
+                return candidate
     import gymnasium as gym
 
-    for candidate in (env_id, f"safe_envs/{env_id}"):
+    for candidate in candidates:
         if candidate in gym.registry:
             return candidate
     name = env_id if "/" in env_id else f"safe_envs/{env_id.removesuffix('-v0')}-v0"

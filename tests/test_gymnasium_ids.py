@@ -25,6 +25,14 @@ ORDERS = {
     ),
     "only what needs Gymnasium": "from safe_envs import SafeEnv; import gymnasium as gym",
     "a module of the envs": "import safe_envs.envs.spec; import gymnasium as gym",
+    "the package twice": (
+        "import importlib, safe_envs; importlib.reload(safe_envs); import gymnasium as gym"
+    ),
+    "the package, forgotten and imported anew": (
+        "import sys, safe_envs\n"
+        "for n in [n for n in sys.modules if n.startswith('safe_envs')]: del sys.modules[n]\n"
+        "import safe_envs; import gymnasium as gym"
+    ),
     "by Gymnasium itself": "import gymnasium as gym; gym.make('safe_envs:safe_envs/Scalar-v0')",
 }
 
@@ -97,6 +105,16 @@ except ImportError as error:
 sys.path.remove({str(tmp_path)!r})
 import gymnasium as gym
 assert "safe_envs/Scalar-v0" in gym.registry
+"""
+    assert finished(code) == (0, "")
+
+
+def test_what_finds_gymnasium_can_be_copied():
+    code = """
+import copy, importlib.util, pickle, safe_envs
+found = importlib.util.find_spec("gymnasium")
+assert copy.deepcopy(found).origin == found.origin
+assert pickle.loads(pickle.dumps(found)).origin == found.origin
 """
     assert finished(code) == (0, "")
 

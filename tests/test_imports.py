@@ -66,3 +66,13 @@ def test_nothing_is_imported_before_it_is_needed():
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.count("Usage: ") == 5
+
+
+def test_what_a_package_has_can_be_used_as_its_attribute():
+    code = """
+import safe_envs, safe_envs.wrappers
+safe_envs.envs, safe_envs.agents, safe_envs.wrappers.conditions
+for name in ("no_such", "__wrapped__"):
+    assert not hasattr(safe_envs, name)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import pytest
 
 from safe_envs import ConfigurationError
@@ -25,10 +26,21 @@ def test_unknown_ids_and_arguments_name_the_nearest():
         ),
     ):
         make_problem("safe_envs/StochasticDubin-v0")
+    with pytest.raises(ConfigurationError, match="did you mean 'safe_envs/Scalar-v0'"):
+        make_problem("SCALAR-V0")
     with pytest.raises(ConfigurationError, match="not one of this project's envs"):
         make_problem("CartPole-v1")
     with pytest.raises(ConfigurationError, match="did you mean 'horizon'"):
         make_problem("Scalar-v0", horizn=1.0)
+
+
+def test_an_env_of_ones_own_keeps_its_id(monkeypatch):
+    # Taken for an env of this project, it would be evaluated without a word.
+    own = gym.envs.registration.EnvSpec("ACC-v0", "gymnasium.envs.classic_control:PendulumEnv")
+    monkeypatch.setitem(gym.registry, "ACC-v0", own)
+    assert full_id("ACC-v0") == "ACC-v0"
+    with pytest.raises(ConfigurationError, match="not one of this project's envs"):
+        make_problem("ACC-v0")
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])

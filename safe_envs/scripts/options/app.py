@@ -79,7 +79,9 @@ class _Group(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """See `typer.core.TyperGroup.resolve_command`; the error of a command that there is not."""
-        if not args[0].startswith("-") and args[0] not in self.commands:
+        known = args[0].startswith("-") or args[0] in self.commands
+        # Completion, which is resilient, prints no error into the line that is being written.
+        if not known and not ctx.resilient_parsing:
             raise ConfigurationError(
                 f"unknown command {shown(args[0])}; {nearest(args[0], self.commands)};"
                 f" `{_NAME} --help` lists all"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import inspect
+import io
 import json
 import os
 import signal
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-_UsageError: Any = typer.BadParameter.__mro__[1]
+UsageError: Any = typer.BadParameter.__mro__[1]
 """The error of a command line that Typer cannot read, whichever Click it builds on."""
 
 _LONGEST = 2000
@@ -182,6 +183,8 @@ def run(command: Callable[[], object]) -> object:
 
     An error of the user ends the process with a message and the exit status 2.
     """
+    if sys.stdout is None:  # Whoever started the command has closed it.
+        sys.stdout = io.StringIO()
     try:
         with _terminable():
             try:
@@ -190,7 +193,7 @@ def run(command: Callable[[], object]) -> object:
                 sys.stdout.flush()
     except SafeEnvsError as error:
         _fail(str(error))
-    except _UsageError as error:
+    except UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             error.show()
             sys.exit(2)

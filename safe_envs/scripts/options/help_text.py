@@ -14,6 +14,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
+from safe_envs.scripts.options.console import UsageError
 from safe_envs.scripts.options.panels import EXAMPLES, PANELS, panel_of
 
 _LETTERS = {int: "INTEGER", float: "FLOAT", Path: "PATH"}
@@ -30,6 +31,14 @@ Entry = tuple[str, str]
 
 class GroupedCommand(TyperCommand):
     """A command whose help has its options in groups and examples at the end."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """See `typer.core.TyperCommand.parse_args`; errors know whose options are wrong."""
+        try:
+            return super().parse_args(ctx, args)
+        except UsageError as error:
+            error.ctx = error.ctx or ctx
+            raise
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """See `typer.core.TyperCommand.collect_usage_pieces`."""

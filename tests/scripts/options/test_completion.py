@@ -33,8 +33,9 @@ def offered(monkeypatch, *words):
     monkeypatch.setenv("COMP_WORDS", " ".join(words))
     monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
     monkeypatch.setattr(sys, "argv", ["safe-envs"])
-    with redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit):
+    with redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit) as end:
         cli.main()
+    assert end.value.code == 0
     return printed.getvalue().split()
 
 
@@ -42,6 +43,7 @@ def offered(monkeypatch, *words):
     ("words", "expected"),
     [
         (("safe-envs", "ver"), ["verify"]),
+        (("safe-envs", "nosuch", "--se"), []),
         (("safe-envs", "evaluate", "Pen"), ["Pendulum-v0"]),
         (("safe-envs", "evaluate", "safe_envs/Quadrotor-"), ["safe_envs/Quadrotor-v0"]),
         (("safe-envs", "verify", "--filter", "sz"), ["szcbf"]),

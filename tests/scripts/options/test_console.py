@@ -76,6 +76,11 @@ def test_a_request_to_terminate_is_like_ctrl_c():
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+def test_a_command_whose_output_is_closed_ends_well(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert run(lambda: sys.stdout.write("nowhere")) == len("nowhere")
+
+
 def test_errors_of_gymnasium_are_of_the_users_making(capsys):
     with pytest.raises(SystemExit) as ended:
         run(failing(DependencyNotInstalled("install it")))
@@ -184,6 +189,9 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
     [
         (("evalute",), "'evaluate'"),
         (("evaluate", "Scalar-v0", "--epsodes", "3"), "--episodes"),
+        (("evaluate", "Scalar-v0", "--episodes"), "`safe-envs evaluate --help` shows"),
+        (("evaluate", "Scalar-v0", "--filter", "CBF"), "did you mean 'cbf'"),
+        (("train", "Scalar-v0", "--algo", "PPO"), "did you mean 'ppo'"),
         (("evaluate", "Scaler-v0"), "did you mean 'safe_envs/Scalar-v0'"),
         (("evaluate", "Scalar-v0", "--filter", "scfb"), "did you mean 'scbf'"),
         (("evaluate", "Scalar-v0", "--policy", "nominel"), "did you mean 'nominal'"),

@@ -63,3 +63,11 @@ def test_processor_times_of_processes_are_measured(monkeypatch):
         "safe-envs evalute, s",
     }
     assert all(0 < seconds < 60 for seconds in found.values())
+
+
+def test_a_command_that_fails_otherwise_has_no_time(monkeypatch):
+    # Where the package is not found, every command would seem to be quick.
+    monkeypatch.setattr(command_times, "_ROUNDS", 1)
+    monkeypatch.setattr(command_times, "_WITHOUT_MISTAKE", (("no-such-command",),))
+    with pytest.raises(RuntimeError, match="ended with 2"):
+        command_times.measure()
