@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import make_problem
@@ -36,7 +37,7 @@ def test_unknown_ids_and_arguments_name_the_nearest():
 
 def test_an_env_of_ones_own_keeps_its_id(monkeypatch):
     # Taken for an env of this project, it would be evaluated without a word.
-    own = gym.envs.registration.EnvSpec("ACC-v0", "gymnasium.envs.classic_control:PendulumEnv")
+    own = EnvSpec("ACC-v0", "gymnasium.envs.classic_control:PendulumEnv")
     monkeypatch.setitem(gym.registry, "ACC-v0", own)
     assert full_id("ACC-v0") == "ACC-v0"
     with pytest.raises(ConfigurationError, match="not one of this project's envs"):

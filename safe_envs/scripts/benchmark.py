@@ -116,7 +116,7 @@ def _print_latency(console: Console, tails: Mapping[str, Sequence[float]]) -> No
 def _print_engines(console: Console, sides: Mapping[str, tuple[float, float]]) -> None:
     """Print the speeds of the engines side by side."""
     rows = [
-        (name, f"{numpy_engine:.3g}", f"{compiled:.3g}", f"{compiled / numpy_engine:.2f}")
+        (name, f"{numpy_engine:.3g}", f"{compiled:.3g}", f"{compiled / numpy_engine:.3g}")
         for name, (numpy_engine, compiled) in sides.items()
     ]
     print_rows(console, "pr", ("engines side by side", "numpy", "compiled", "ratio"), rows)

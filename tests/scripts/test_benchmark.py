@@ -111,7 +111,7 @@ def test_engines_stand_side_by_side(quick, monkeypatch, capsys):
     # The ratio is that of one core to one core.
     assert set(ran) == {("numpy", 1), ("compiled", 1), ("compiled", None)}
     for numpy_engine, compiled, ratio in rows.values():
-        assert float(ratio) == pytest.approx(float(compiled) / float(numpy_engine), rel=0.1)
+        assert float(ratio) == pytest.approx(float(compiled) / float(numpy_engine), rel=0.02)
 
 
 def test_the_hand_written_loop_does_the_work_of_the_env():

@@ -37,6 +37,8 @@ def require_policy(name: str) -> None:
         saved = saved_policy_file(Path(name))
         if saved is not None and not os.path.exists(saved):
             raise ConfigurationError(f"{saved} does not exist; `safe-envs train` writes such files")
+        if name.endswith(".py"):
+            raise ConfigurationError(f"policy {shown(name)} is a file of Python; give {_ALLOWED}")
         return
     if is_place(name):
         file = policy_file(name)

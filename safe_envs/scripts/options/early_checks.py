@@ -34,7 +34,8 @@ def known_filter(text: str | None) -> str | None:
     from safe_envs.wrappers.conditions.names import unfiltered_in_sum
     from safe_envs.wrappers.conditions.text_parts import require_known, require_parameters
 
-    if text and text != _UNFILTERED:
+    # An empty text, as of a shell's variable that is not set, is no filter.
+    if text is not None and text != _UNFILTERED:
         if _UNFILTERED in text.split("+"):
             raise unfiltered_in_sum(text)
         require_known(text, _UNFILTERED)

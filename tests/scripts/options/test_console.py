@@ -198,6 +198,8 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
         (("evaluate", "Scalar-v0", "--plant", "sigm=1"), "did you mean 'sigma'"),
         (("evaluate", "Scalar-v0", "--barrier", "limt=1"), "did you mean 'limit'"),
         (("evaluate", "Scalar-v0", "--knowledge", "plan"), "did you mean 'plant'"),
+        (("evaluate", "Scalar-v0", "--policy", __file__), "is a file of Python; give a policy"),
+        (("verify", "Scalar-v0", "--filter", ""), "unknown filter ''"),
         (("verify", "Scalar-v0", "--filter", "scfb"), "did you mean 'scbf'"),
         (("train", "Scalar-v0", "--algo", "pp", "--out", "x"), "did you mean 'ppo'"),
         (
