@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
 import pytest
+
+import safe_envs
 
 pytestmark = pytest.mark.slow
 
@@ -76,3 +80,24 @@ for name in ("no_such", "__wrapped__"):
     assert not hasattr(safe_envs, name)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_the_package_works_from_a_zip_file(tmp_path):
+    source = Path(safe_envs.__file__).parent
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        for path in (*source.rglob("*.py"), *source.rglob("*.json")):
+            archive.write(path, path.relative_to(source.parent))
+    code = f"""
+import sys
+sys.path.insert(0, {str(tmp_path / "all.zip")!r})
+import safe_envs
+assert "all.zip" in safe_envs.__file__
+sys.argv = ["safe-envs", "list"]
+from safe_envs.scripts.cli import main
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "safe_envs/Scalar-v0" in done.stdout

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from pkgutil import get_data
 from typing import Any
 
 from safe_envs.errors import unknown
@@ -104,7 +105,8 @@ class SystemSummary:
 @cache
 def summaries() -> dict[str, SystemSummary]:
     """Return the summary of each registered env, by its full id."""
-    found = json.loads(_FILE.read_text())
+    # A package in a zip file has no path of its own.
+    found = json.loads(get_data("safe_envs.systems", _FILE.name) or b"{}")
 
     def frozen(value: Any) -> Any:
         return tuple(value) if isinstance(value, list) else value
