@@ -6,25 +6,10 @@ What is named here is imported when it is first used.
 from typing import TYPE_CHECKING
 
 from safe_envs.lazy_attributes import lazy_attributes
+from safe_envs.wrappers import conditions
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.conditions.base import Condition
-    from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
-    from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
-    from safe_envs.wrappers.conditions.certified import Certified
-    from safe_envs.wrappers.conditions.class_k import ClassK, power
-    from safe_envs.wrappers.conditions.constraint import AffineConstraint
-    from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
-    from safe_envs.wrappers.conditions.names import condition_names
-    from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
-    from safe_envs.wrappers.conditions.registry import CONDITIONS, LEARNED
-    from safe_envs.wrappers.conditions.spec_text import (
-        parse_condition,
-        parse_conditions,
-        require_readable,
-        spec_of,
-    )
-    from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
+    from safe_envs.wrappers.conditions import *  # noqa: F403
     from safe_envs.wrappers.delayed_filter import DelayedFilter
     from safe_envs.wrappers.env_wrappers.cost_return import (
         CostReturnWrapper,
@@ -48,28 +33,11 @@ if TYPE_CHECKING:
     from safe_envs.wrappers.safety_filter import SafetyFilter
 
 __all__ = [
-    "CBF",
-    "CONDITIONS",
-    "DDSCBF",
-    "ECBF",
-    "HOCBF",
-    "LEARNED",
-    "RCBF",
-    "SCBF",
-    "SRCBF",
-    "SZCBF",
     "ActionMap",
-    "AffineConstraint",
-    "BayesianSCBF",
-    "Certified",
-    "ClassK",
-    "Condition",
     "CostReturnWrapper",
     "DelayedFilter",
     "FilterDecision",
     "FilterSpec",
-    "LearnedCondition",
-    "LearnedHOCBF",
     "RecordSafetyStatistics",
     "RecordSafetyStatisticsVector",
     "SafetyFilter",
@@ -79,41 +47,20 @@ __all__ = [
     "SafetyMonitorVector",
     "SpecificationMonitor",
     "SpecificationMonitorVector",
-    "condition_names",
     "make_vec_with_cost",
     "make_with_cost",
-    "parse_condition",
-    "parse_conditions",
-    "power",
-    "require_readable",
-    "spec_of",
 ]
+__all__ += conditions.__all__
 
 _MODULES = {
+    **dict.fromkeys(conditions.__all__, conditions.__name__),
     "ActionMap": "safe_envs.wrappers.env_wrappers.external_env",
-    "AffineConstraint": "safe_envs.wrappers.conditions.constraint",
-    "BayesianSCBF": "safe_envs.wrappers.conditions.bayesian",
-    "CBF": "safe_envs.wrappers.conditions.cbf",
-    "CONDITIONS": "safe_envs.wrappers.conditions.registry",
-    "Certified": "safe_envs.wrappers.conditions.certified",
-    "ClassK": "safe_envs.wrappers.conditions.class_k",
-    "Condition": "safe_envs.wrappers.conditions.base",
     "CostReturnWrapper": "safe_envs.wrappers.env_wrappers.cost_return",
-    "DDSCBF": "safe_envs.wrappers.conditions.learned",
     "DelayedFilter": "safe_envs.wrappers.delayed_filter",
-    "ECBF": "safe_envs.wrappers.conditions.cbf",
     "FilterDecision": "safe_envs.wrappers.filter_qp",
     "FilterSpec": "safe_envs.wrappers.env_wrappers.external_env",
-    "HOCBF": "safe_envs.wrappers.conditions.cbf",
-    "LEARNED": "safe_envs.wrappers.conditions.registry",
-    "LearnedCondition": "safe_envs.wrappers.conditions.learned",
-    "LearnedHOCBF": "safe_envs.wrappers.conditions.learned",
-    "RCBF": "safe_envs.wrappers.conditions.reciprocal",
     "RecordSafetyStatistics": "safe_envs.wrappers.env_wrappers.safety_statistics",
     "RecordSafetyStatisticsVector": "safe_envs.wrappers.env_wrappers.safety_statistics",
-    "SCBF": "safe_envs.wrappers.conditions.stochastic",
-    "SRCBF": "safe_envs.wrappers.conditions.reciprocal",
-    "SZCBF": "safe_envs.wrappers.conditions.stochastic",
     "SafetyFilter": "safe_envs.wrappers.safety_filter",
     "SafetyFilterVectorWrapper": "safe_envs.wrappers.env_wrappers.safety_filter_vector",
     "SafetyFilterWrapper": "safe_envs.wrappers.env_wrappers.safety_filter",
@@ -121,14 +68,8 @@ _MODULES = {
     "SafetyMonitorVector": "safe_envs.wrappers.env_wrappers.monitor_vector",
     "SpecificationMonitor": "safe_envs.wrappers.env_wrappers.specification_monitor",
     "SpecificationMonitorVector": "safe_envs.wrappers.env_wrappers.specification_monitor_vector",
-    "condition_names": "safe_envs.wrappers.conditions.names",
     "make_vec_with_cost": "safe_envs.wrappers.env_wrappers.cost_return",
     "make_with_cost": "safe_envs.wrappers.env_wrappers.cost_return",
-    "parse_condition": "safe_envs.wrappers.conditions.spec_text",
-    "parse_conditions": "safe_envs.wrappers.conditions.spec_text",
-    "power": "safe_envs.wrappers.conditions.class_k",
-    "require_readable": "safe_envs.wrappers.conditions.spec_text",
-    "spec_of": "safe_envs.wrappers.conditions.spec_text",
 }
 
 __getattr__, __dir__ = lazy_attributes(__name__, _MODULES, globals())
