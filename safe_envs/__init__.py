@@ -72,11 +72,15 @@ _MODULES = {
 }
 
 
-_find, __dir__ = lazy_attributes(__name__, _MODULES, globals())
+_find, _names = lazy_attributes(__name__, _MODULES, globals())
 
 
 def __getattr__(name: str) -> Any:
     return package_version() if name == "__version__" else _find(name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*_names(), "__version__"})
 
 
 register_with_gymnasium()

@@ -77,16 +77,26 @@ def unknown(what: str, name: Any, allowed: Iterable[str]) -> ConfigurationError:
     return ConfigurationError(f"unknown {what} {shown(name)}; {nearest(str(name), allowed)}")
 
 
+def install_extra(extra: str) -> str:
+    """Return how to install the packages of an extra; this package is on no index.
+
+    Args:
+        extra: of pyproject.toml.
+    """
+    return f'pip install --editable ".[{extra}]" in a checkout'
+
+
 _FEW = 6
 """So many allowed names are listed in full, of more of them the nearest three."""
 
 
-def nearest(name: str, allowed: Iterable[str]) -> str:
+def nearest(name: str, allowed: Iterable[str], more: str = "") -> str:
     """Return a phrase that helps to find the allowed name that was meant.
 
     Args:
         name: what was given.
         allowed: names.
+        more: what else may help, such as "or a number".
 
     Returns:
         The nearest name, and the others: all where they are few, else the next two.
@@ -98,11 +108,15 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     close = [lower[each] for each in found]
     if len(names) > _FEW:
         if close:
-            others = f" (or {', '.join(close[1:])})" if close[1:] else ""
-            return f"did you mean {close[0]!r}?{others}"
-        return f"allowed: {', '.join(names[:3])} and {len(names) - 3} more"
-    listing = ", ".join(names) if names else "none"
-    return f"did you mean {close[0]!r}? (allowed: {listing})" if close else f"allowed: {listing}"
+            others = [f"or {', '.join(close[1:])}"] if close[1:] else []
+        else:
+            others = [f"allowed: {', '.join(names[:3])} and {len(names) - 3} more"]
+    else:
+        others = [f"allowed: {', '.join(names) if names else 'none'}"]
+    rest = "; ".join([*others, more] if more else others)
+    if not close:
+        return rest
+    return f"did you mean {close[0]!r}?{f' ({rest})' if rest else ''}"
 
 
 def require_whole(name: str, value: Any, least: int) -> None:

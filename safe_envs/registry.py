@@ -36,7 +36,7 @@ def full_id(env_id: str) -> str:
             return candidate
     name = env_id if "/" in env_id else f"safe_envs/{env_id.removesuffix('-v0')}-v0"
     raise ConfigurationError(
-        f"unknown env {shown(env_id)}; {nearest(name, ENV_IDS)}; `safe-envs list` shows all"
+        f"unknown env {shown(env_id)}; {nearest(name, ENV_IDS, '`safe-envs list` shows all')}"
     )
 
 

@@ -82,6 +82,11 @@ for name in ("no_such", "__wrapped__"):
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
+def test_what_the_package_has_is_listed():
+    assert {"__version__", "SafetyFilter", "ENV_IDS"} <= set(dir(safe_envs))
+    assert all(hasattr(safe_envs, name) for name in dir(safe_envs))
+
+
 def test_the_package_works_from_a_zip_file(tmp_path):
     source = Path(safe_envs.__file__).parent
     with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:

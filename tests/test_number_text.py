@@ -71,3 +71,18 @@ def test_long_texts_lose_their_middle():
         == "a" * 60 + "...(1000 more characters)..." + "c" * 60
     )
     assert nearest("x" * 10**6, ["one"]) == "allowed: one"
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed", "phrase"),
+    [
+        ("on", ["one"], "did you mean 'one'? (allowed: one; or 7)"),
+        ("x", ["one"], "allowed: one; or 7"),
+        ("name_3", [f"name_{i}" for i in (3, 50, 60)] + list("abcd"), "did you mean 'name_3'? ("),
+        ("evalute", ["evaluate", *"abcdef"], "did you mean 'evaluate'? (or 7)"),
+        ("x", "abcdefg", "allowed: a, b, c and 4 more; or 7"),
+    ],
+)
+def test_what_else_helps_stands_after_the_names(name, allowed, phrase):
+    assert nearest(name, allowed, "or 7").startswith(phrase)
+    assert "?;" not in nearest(name, allowed, "or 7")

@@ -86,7 +86,7 @@ try:
     env.reset(seed=0)
     env.render()
 except gym.error.DependencyNotInstalled as error:
-    assert "safe-envs[render]" in str(error), error
+    assert ".[render]" in str(error), error
 else:
     raise AssertionError("a picture without pygame")
 END
@@ -129,9 +129,9 @@ refused() {
     fi
     grep -q -F "$expected" refused.txt || { cat refused.txt && exit 1; }
 }
-refused 'safe-envs[tensorboard]' safe-envs train Scalar-v0 --algo ppo --n-timesteps 512 --out other --tensorboard logs
-refused 'safe-envs[render]' safe-envs render Scalar-v0 --out film.mp4
-refused 'safe-envs[fast]' safe-envs evaluate Scalar-v0 --episodes 20 --engine compiled
+refused '.[tensorboard]' safe-envs train Scalar-v0 --algo ppo --n-timesteps 512 --out other --tensorboard logs
+refused '.[render]' safe-envs render Scalar-v0 --out film.mp4
+refused '.[fast]' safe-envs evaluate Scalar-v0 --episodes 20 --engine compiled
 refused "did you mean 'scbf'" safe-envs evaluate Scalar-v0 --filter scfb
 
 step "passed"

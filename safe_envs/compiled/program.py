@@ -20,10 +20,10 @@ from safe_envs.compiled import plain_natives
 from safe_envs.compiled.cache import DIGITS, FOLDER, forget_old_programs
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.linker import linked
-from safe_envs.errors import ConfigurationError, NotCompilableError, shortened
+from safe_envs.errors import ConfigurationError, NotCompilableError, install_extra, shortened
 from safe_envs.user_cache import cache_folder
 
-ADVICE = "install it with pip install 'safe-envs[fast]', or use the engine 'numpy'"
+ADVICE = f"{install_extra('fast')}, or use the engine 'numpy'"
 
 _LOG = logging.getLogger("safe_envs")
 _FILE = "program.py"

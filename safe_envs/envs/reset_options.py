@@ -152,10 +152,8 @@ class ResetOptions:
     def _named(self, start: Any) -> str:
         starts = self._problem.starts
         if not isinstance(start, str) or start not in starts:
-            raise ConfigurationError(
-                f"unknown start {shown(start)}; {nearest(str(start), starts)}; a state is given by"
-                " the option 'state'"
-            )
+            advice = nearest(str(start), starts, "a state is given by the option 'state'")
+            raise ConfigurationError(f"unknown start {shown(start)}; {advice}")
         return start
 
     def _steps(self, given: Any, wanted: np.ndarray | None) -> np.ndarray:

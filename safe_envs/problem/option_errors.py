@@ -61,9 +61,8 @@ def unknown_start(start: str, starts: Iterable[str], count: int) -> Configuratio
         starts: names of the distributions.
         count: of states.
     """
-    return ConfigurationError(
-        f"unknown start {shown(start)}; {nearest(start, starts)}, or {count} numbers"
-    )
+    state = "or a number" if count == 1 else f"or {count} numbers"
+    return ConfigurationError(f"unknown start {shown(start)}; {nearest(start, starts, state)}")
 
 
 def wrong_start(count: int, states: Sequence[str]) -> ConfigurationError:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, install_extra
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.snapshot import DrawnDecision, History
 
@@ -72,14 +72,14 @@ def require_pygame() -> None:
         import pygame
     except ImportError as error:
         raise gym.error.DependencyNotInstalled(
-            'drawing needs pygame-ce: pip install "safe-envs[render]"'
+            f"drawing needs pygame-ce: {install_extra('render')}"
         ) from error
     if not hasattr(pygame.draw, "aacircle"):
         # Two distributions share the name of the import, and each overwrites files of the other.
         raise gym.error.DependencyNotInstalled(
             "drawing needs pygame-ce 2.5 or newer, and what is imported is pygame"
-            f" {pygame.version.ver}: pip uninstall pygame pygame-ce, and then pip install"
-            ' "safe-envs[render]"'
+            f" {pygame.version.ver}: pip uninstall pygame pygame-ce, and then"
+            f" {install_extra('render')}"
         )
 
 

@@ -31,7 +31,7 @@ def check(
     arb: Annotated[
         bool,
         typer.Option(
-            "--arb", help="Check it by ball arithmetic too; needs safe-envs[proofs], takes longer."
+            "--arb", help="Check it by ball arithmetic too; needs python-flint, takes longer."
         ),
     ] = False,
     seconds: Annotated[float, typer.Option(help="Limit of time of each check.")] = 120.0,

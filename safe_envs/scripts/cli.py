@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from safe_envs.scripts.options.app import CommandEntry, make_app, run_app
+import sys
+
+_INTERRUPTED = 130
+"""Exit status of a command that Ctrl-C ends."""
+
+try:
+    from safe_envs.scripts.options.app import CommandEntry, make_app, run_app
+except KeyboardInterrupt:  # Whoever presses it at once waits for no traceback either.
+    sys.exit(_INTERRUPTED)
 
 _EVALUATE = "Evaluate and train"
 _PROVE = "Prove and bound"
@@ -125,7 +133,10 @@ app = make_app(COMMANDS)
 
 def main() -> None:
     """Run the command line."""
-    run_app(app)
+    try:
+        run_app(app)
+    except KeyboardInterrupt:
+        sys.exit(_INTERRUPTED)
 
 
 if __name__ == "__main__":

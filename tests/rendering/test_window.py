@@ -171,7 +171,7 @@ def test_missing_pygame_says_what_to_install(monkeypatch):
     env = stepped(SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), 1)
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(
-        gym.error.DependencyNotInstalled, match=r'pip install "safe-envs\[render\]"'
+        gym.error.DependencyNotInstalled, match=r'pip install --editable "\.\[render\]"'
     ):
         env.render()
 
@@ -183,6 +183,6 @@ def test_the_other_pygame_is_refused(monkeypatch):
     env = stepped(SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), 1)
     with pytest.raises(
         gym.error.DependencyNotInstalled,
-        match=r'pip uninstall pygame.*pip install "safe-envs\[render\]"',
+        match=r'pip uninstall pygame.*pip install --editable "\.\[render\]"',
     ):
         env.render()

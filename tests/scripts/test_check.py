@@ -81,7 +81,7 @@ def test_the_second_opinion(safe_envs_command, written, monkeypatch):
         without.setitem(sys.modules, "flint", None)
         status, _, err = safe_envs_command("check", name, "--arb")
     assert status == 2
-    assert "safe-envs[proofs]" in err
+    assert ".[proofs]" in err
     pytest.importorskip("flint")
     status, out, _ = safe_envs_command("check", name, "--arb", "--json", "found.json")
     assert status == 0

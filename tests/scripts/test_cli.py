@@ -121,6 +121,42 @@ def test_the_installed_command_is_this_one():
     assert Path(sys.executable).with_name("safe-envs").exists()
 
 
+INTERRUPTED = """
+import builtins, os, runpy, signal, sys
+imported = builtins.__import__
+# Jobs in the background of a shell ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def interrupted(name, *others, **named):
+    if name == {name!r}:
+        os.kill(os.getpid(), signal.SIGINT)
+    return imported(name, *others, **named)
+
+builtins.__import__ = interrupted
+sys.argv = ["safe-envs", "list"]
+runpy.run_module("safe_envs", run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("name", ["typer", "typer.core", "safe_envs.scripts.options.console"])
+def test_ctrl_c_during_the_imports_ends_quietly(name):
+    code = INTERRUPTED.format(name=name)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def test_ctrl_c_before_a_command_begins_ends_quietly(monkeypatch, capsys):
+    def interrupted(app):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run_app", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert (ended.value.code, capsys.readouterr()) == (130, ("", ""))
+
+
 def test_errors_of_the_script_end_with_status_2(monkeypatch, capsys):
     path = ROOT / "scripts" / "evaluate.py"
     monkeypatch.setattr(sys, "argv", [str(path), DUBINS, "--filter", "hocb"])

@@ -124,7 +124,7 @@ def test_what_is_missing_says_how_to_install_it(monkeypatch):
     assert (found["torch"].ok, found["torch"].advice) == (False, 'pip install "torch"')
     assert (found["tensorboard"].ok, found["tensorboard"].advice) == (
         None,
-        'pip install "safe-envs[tensorboard]"',
+        'pip install --editable ".[tensorboard]" in a checkout',
     )
     assert found["numpy"].ok
     assert found["numpy"].found == "1.0"

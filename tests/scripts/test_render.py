@@ -305,13 +305,13 @@ def test_missing_moviepy_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "moviepy", None)
     # Before any work: what else is wrong comes up later.
     result = render("safe_envs/Scalar-v0", "--start", "1e9", "--out", str(tmp_path / "a.mp4"))
-    assert 'pip install "safe-envs[render]"' in str(result.exception)
+    assert 'pip install --editable ".[render]"' in str(result.exception)
 
 
 def test_missing_pygame_is_said_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     result = render("safe_envs/Scalar-v0", "--start", "1e9", "--out", str(tmp_path / "a.png"))
-    assert 'drawing needs pygame-ce: pip install "safe-envs[render]"' in str(result.exception)
+    assert 'drawing needs pygame-ce: pip install --editable ".[render]"' in str(result.exception)
     # The doctor reads the metadata, which have pygame-ce.
     assert next(check for check in packages() if check.name == "pygame-ce").ok
 

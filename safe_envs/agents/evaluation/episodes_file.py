@@ -11,7 +11,7 @@ from typing import Any
 from safe_envs.agents.evaluation.kept_episodes import EpisodeSink
 from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.atomic_io import replaced_at_the_end, require_writable, writing
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, install_extra
 
 _GROUP = 65_536
 """Rows that are written at a time, so that the file does not depend on the size of batches."""
@@ -44,7 +44,7 @@ def require_parquet(path: Path, option: str) -> None:
     """
     if find_spec("pyarrow") is None:
         raise ConfigurationError(
-            'pyarrow is not installed, which writes Parquet; pip install "safe-envs[sweep]"'
+            f"pyarrow is not installed, which writes Parquet; {install_extra('sweep')}"
         )
     if path.suffix != ".parquet":
         raise ConfigurationError(f"{option} {path} is no name of a Parquet file; give FILE.parquet")

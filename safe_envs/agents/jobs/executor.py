@@ -16,6 +16,7 @@ from safe_envs.errors import (
     ConfigurationError,
     SafeEnvsError,
     WorkersLostError,
+    install_extra,
     nearest,
     require_whole,
 )
@@ -78,10 +79,7 @@ class Backend:
             raise ConfigurationError(f"backend {self.backend} {wrong}")
         package = {"dask": "distributed", "ray": "ray"}.get(self.backend)
         if package is not None and find_spec(package) is None:
-            raise ConfigurationError(
-                f"{package} is not installed; install it with pip install"
-                f' "safe-envs[{self.backend}]"'
-            )
+            raise ConfigurationError(f"{package} is not installed; {install_extra(self.backend)}")
 
 
 def run(

@@ -54,7 +54,9 @@ def require_policy(name: str) -> None:
             f" {', '.join(POLICIES)}"
         )
     known = (*POLICIES, *plugin_names(POLICY_PLUGINS))
-    raise ConfigurationError(f"unknown policy {shown(name)}; {nearest(name, known)}, or {_ALLOWED}")
+    raise ConfigurationError(
+        f"unknown policy {shown(name)}; {nearest(name, known, f'or {_ALLOWED}')}"
+    )
 
 
 def is_place(name: str) -> bool:

@@ -14,7 +14,7 @@ from safe_envs.agents.sweeps.cell import Cell, Sweep
 from safe_envs.agents.sweeps.settings import text_of
 from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.errors import ConfigurationError, install_extra, shortened
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -185,9 +185,7 @@ def _keys_before(folder: Path) -> list[str]:
 
 def _require_pyarrow() -> None:
     if find_spec("pyarrow") is None:
-        raise ConfigurationError(
-            'pyarrow is not installed; install it with pip install "safe-envs[sweep]"'
-        )
+        raise ConfigurationError(f"pyarrow is not installed; {install_extra('sweep')}")
 
 
 def _kinds() -> dict[str, pa.DataType]:

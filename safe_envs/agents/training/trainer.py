@@ -51,7 +51,7 @@ from safe_envs.agents.training.run_folder import (
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.atomic_io import write_json
 from safe_envs.compiled.engine import engine_for
-from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.errors import ConfigurationError, SafeEnvsError, install_extra
 from safe_envs.file_locks import locked
 from safe_envs.registry import make_problem
 
@@ -96,8 +96,7 @@ def train(
     folder = Path(folder)
     if tensorboard is not None and find_spec("tensorboard") is None:
         raise ConfigurationError(
-            "--tensorboard: tensorboard is not installed; install it with pip install"
-            " safe-envs[tensorboard]"
+            f"--tensorboard: tensorboard is not installed; {install_extra('tensorboard')}"
         )
     require_folder(folder, training, resume)
     # Before a folder is made: the arguments may be refused.

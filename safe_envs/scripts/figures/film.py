@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.atomic_io import require_writable, write_atomically
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, install_extra
 
 SUFFIXES = (".mp4", ".gif", ".png")
 """What can be written."""
@@ -96,7 +96,7 @@ def _video_writer() -> Any:
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
     except ImportError as error:
         raise gym.error.DependencyNotInstalled(
-            'a .mp4 needs moviepy: pip install "safe-envs[render]"; or write a .gif'
+            f"a .mp4 needs moviepy: {install_extra('render')}; or write a .gif"
         ) from error
     return FFMPEG_VideoWriter
 

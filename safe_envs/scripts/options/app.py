@@ -83,8 +83,8 @@ class _Group(TyperGroup):
         # Completion, which is resilient, prints no error into the line that is being written.
         if not known and not ctx.resilient_parsing:
             raise ConfigurationError(
-                f"unknown command {shown(args[0])}; {nearest(args[0], self.commands)};"
-                f" `{_NAME} --help` lists all"
+                f"unknown command {shown(args[0])};"
+                f" {nearest(args[0], self.commands, f'`{_NAME} --help` lists all')}"
             )
         return super().resolve_command(ctx, args)
 

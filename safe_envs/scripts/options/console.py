@@ -266,12 +266,13 @@ def _usage_text(error: Any) -> str:
         if kind != "MissingParameter":
             return f"{name} {text}"
         text = f"{name} is missing"
-    elif kind == "NoSuchOption":
+    command = error.ctx.command_path if error.ctx is not None else "safe-envs"
+    help_text = f"`{command} --help` shows the options"
+    if kind == "NoSuchOption":
         given = str(error.option_name)
         options = [name for each in error.ctx.command.params for name in each.opts]
-        text = f"unknown option {shown(given)}; {nearest(given, options)}"
-    command = error.ctx.command_path if error.ctx is not None else "safe-envs"
-    return f"{' '.join(text.split()).rstrip('.')}; `{command} --help` shows the options"
+        return f"unknown option {shown(given)}; {nearest(given, options, help_text)}"
+    return f"{' '.join(text.split()).rstrip('.')}; {help_text}"
 
 
 def _fail(message: str) -> NoReturn:

@@ -15,6 +15,7 @@ from importlib.util import find_spec
 import gymnasium as gym
 import numpy as np
 
+from safe_envs.errors import install_extra
 from safe_envs.rendering.viewer import require_pygame
 from safe_envs.scripts.reports.known_qps import KNOWN_QPS, KnownQP
 from safe_envs.systems import ENV_IDS
@@ -54,9 +55,10 @@ def packages() -> Iterator[Check]:
         try:
             yield Check(package, True, version(package))
         except PackageNotFoundError:
-            target = package if extra == _NEEDED else f"safe-envs[{extra}]"
-            ok = False if extra == _NEEDED else None
-            yield Check(package, ok, "missing", f'pip install "{target}"')
+            if extra == _NEEDED:
+                yield Check(package, False, "missing", f'pip install "{package}"')
+            else:
+                yield Check(package, None, "missing", install_extra(extra))
 
 
 def _other_pygame() -> Check | None:

@@ -12,7 +12,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, install_extra
 
 
 def require_flint() -> Any:
@@ -25,8 +25,8 @@ def require_flint() -> Any:
         import flint  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ConfigurationError(
-            "the check by ball arithmetic needs python-flint; install it with pip install"
-            ' "safe-envs[proofs]", or check without it'
+            f"the check by ball arithmetic needs python-flint; {install_extra('proofs')}, or check"
+            " without it"
         ) from error
     return flint
 

@@ -94,5 +94,6 @@ def _unknown(text: str, key: str, keys: Sequence[str], example: str) -> Configur
             f"filter {shown(text)} gives {key} no value; settings are key=value, as in {example}"
         )
     return ConfigurationError(
-        f"filter {shown(text)} has no setting {shown(key)}; {nearest(key, keys)}, as in {example}"
+        f"filter {shown(text)} has no setting {shown(key)};"
+        f" {nearest(key, keys, f'as in {example}')}"
     )

@@ -72,8 +72,8 @@ def unknown_filter(name: str, *more: str) -> ConfigurationError:
             f" {' '.join(f'--filter {head}' for head in heads)} (in Python: a list)"
         )
     return ConfigurationError(
-        f"unknown filter {shown(name)}; {nearest(name, allowed)}, or a condition of your own as"
-        " FILE.py:NAME"
+        f"unknown filter {shown(name)};"
+        f" {nearest(name, allowed, 'or a condition of your own as FILE.py:NAME')}"
     )
 
 

@@ -251,10 +251,8 @@ def _hint(key: str, names: Sequence[str], given: Mapping[str, Any]) -> str:
             " as file=FILE"
         )
     if "file" in given:
-        return (
-            f"{nearest(key, names)}; a file whose name holds a colon is given by --learned, or read"
-            " by load_learned"
-        )
+        more = "a file whose name holds a colon is given by --learned, or read by load_learned"
+        return nearest(key, names, more)
     return nearest(key, names)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.bounded_reading import MOST_BYTES, read_bytes
-from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.errors import ConfigurationError, install_extra, shortened, shown
 from safe_envs.wrappers.decision_log.columns import LogColumns
 
 _ADVICE = "give what `DecisionLog.to_csv` or `to_parquet` wrote"
@@ -166,6 +166,5 @@ def path_of(given: Path | str, allowed: str) -> Path:
 def _require_pyarrow() -> None:
     if find_spec("pyarrow") is None:
         raise ConfigurationError(
-            'pyarrow is not installed, which Parquet needs; pip install "safe-envs[sweep]", or use'
-            " CSV"
+            f"pyarrow is not installed, which Parquet needs; {install_extra('sweep')}, or use CSV"
         )

@@ -256,7 +256,7 @@ def test_what_numba_cannot_compile_is_done_by_numpy(monkeypatch):
 
 def test_without_numba_the_compiled_engine_says_what_to_install(monkeypatch):
     monkeypatch.setattr(program_module, "is_available", lambda: False)
-    with pytest.raises(ConfigurationError, match=r"pip install 'safe-envs\[fast\]'"):
+    with pytest.raises(ConfigurationError, match=r'pip install --editable "\.\[fast\]"'):
         evaluate("Scalar-v0", filters=["none"], episodes=2, engine="compiled")
     assert evaluate("Scalar-v0", filters=["none"], episodes=2).timing.rows[0].engine == "numpy"
 

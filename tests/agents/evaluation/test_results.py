@@ -127,7 +127,7 @@ def test_the_file_is_the_same_for_every_num_envs_and_jobs(found, tmp_path):
 
 def test_without_pyarrow_or_pandas_errors_say_what_to_install(found, monkeypatch, tmp_path):
     monkeypatch.setattr(episodes_file, "find_spec", lambda _: None)
-    with pytest.raises(ConfigurationError, match=r"pip install \"safe-envs\[sweep\]\""):
+    with pytest.raises(ConfigurationError, match=r"pip install --editable \"\.\[sweep\]\""):
         RunSettings(episodes_out=tmp_path / "out.parquet")
     assert not (tmp_path / "out.parquet").exists()
     monkeypatch.setitem(sys.modules, "pandas", None)

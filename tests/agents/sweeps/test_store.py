@@ -195,5 +195,5 @@ def test_without_pyarrow_the_extra_is_named(
     tmp_path: Path, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr("safe_envs.agents.sweeps.store.find_spec", lambda name: None)
-    with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\]"):
+    with pytest.raises(ConfigurationError, match=r"\.\[sweep\]"):
         Store(tmp_path, sweep)

@@ -187,7 +187,7 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("arguments", "suggestion"),
     [
-        (("evalute",), "'evaluate'"),
+        (("evalute",), "did you mean 'evaluate'? (`safe-envs --help` lists all)"),
         (("evaluate", "Scalar-v0", "--epsodes", "3"), "--episodes"),
         (("evaluate", "Scalar-v0", "--episodes"), "`safe-envs evaluate --help` shows"),
         (("evaluate", "Scalar-v0", "--filter", "CBF"), "did you mean 'cbf'"),

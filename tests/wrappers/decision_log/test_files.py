@@ -98,9 +98,9 @@ def test_without_pyarrow_the_message_names_the_extra(tmp_path, monkeypatch):
     log = DecisionLog(LogColumns.read(HEADINGS))
     monkeypatch.setattr(files, "find_spec", lambda name: None)
     (tmp_path / "there.parquet").write_bytes(b"")
-    with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\].*CSV"):
+    with pytest.raises(ConfigurationError, match=r"\.\[sweep\].*CSV"):
         log.to_parquet(tmp_path / "log.parquet")
-    with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\]"):
+    with pytest.raises(ConfigurationError, match=r"\.\[sweep\]"):
         DecisionLog.read(tmp_path / "there.parquet")
 
 
