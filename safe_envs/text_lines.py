@@ -83,6 +83,18 @@ def break_points(text: str, width: int, indent: int = 0) -> list[int]:
     return points
 
 
+def visible(text: str, keep: str = "\n\u00a0\u00ad") -> str:
+    """Return a text with what controls a terminal, or turns a text around, as Python writes it.
+
+    Args:
+        text: of any characters, such as the name of a file.
+        keep: what is no sign and stays: ends of lines, non-breaking blanks and soft hyphens.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else repr(c)[1:-1] for c in text)
+
+
 def text_width(text: str) -> int:
     """Return how many characters of a terminal a text takes."""
     return sum(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Literal
 
-from safe_envs.text_lines import folded, text_width, wrapped
+from safe_envs.text_lines import folded, text_width, visible, wrapped
 
 SOFT_HYPHEN = "\u00ad"
 _FIXED_BLANK = "\u00a0"
@@ -30,7 +30,8 @@ class Column:
     Attributes:
         title: of the column; it is broken at blanks, line ends and soft hyphens, and not at
             non-breaking blanks.
-        cells: texts, one for each row; what is not a str counts as the text that `str` makes of it.
+        cells: texts, one for each row, in which control characters are made visible; what is not a
+            str counts as the text that `str` makes of it.
         kind: "l" for a name, at the left; "r" for a number, at the right; "p" for a text that may
             take several lines.
         part: columns of the same part stay in one table, where they fit in one.
@@ -40,6 +41,10 @@ class Column:
     cells: tuple[Any, ...]
     kind: Literal["l", "r", "p"] = "r"
     part: int = 0
+
+    def __post_init__(self) -> None:
+        cells = (visible(cell) if isinstance(cell, str) else cell for cell in self.cells)
+        object.__setattr__(self, "cells", tuple(cells))
 
     @property
     def plain_title(self) -> str:
@@ -130,9 +135,7 @@ def text_of(table: FittedTable) -> str:
     lines.append("-" * _total(table))
     for cells in zip(*(c.cells for c in table), strict=True):
         parts = [
-            wrapped(visible(cell), c.width)
-            if c.column.kind == "p"
-            else visible(cell).splitlines() or [""]
+            wrapped(str(cell), c.width) if c.column.kind == "p" else str(cell).splitlines() or [""]
             for c, cell in zip(table, cells, strict=True)
         ]
         lines += [
@@ -153,7 +156,7 @@ def markdown_of(table: FittedTable) -> str:
 
 def plain_markdown(text: str) -> str:
     """Return a text in one line, as Markdown that shows the same characters."""
-    return re.sub(r"([\\`*_|<>\[\]&$~])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*_|<>\[\]&$~])", r"\\\1", " ".join(visible(text).split()))
 
 
 def _fitted(column: Column) -> FittedColumn:
@@ -277,8 +280,3 @@ def _left(text: str, width: int) -> str:
 
 def _right(text: str, width: int) -> str:
     return " " * (width - text_width(text)) + text
-
-
-def visible(cell: Any) -> str:
-    """Return a cell without what would control a terminal or turn its text around."""
-    return "".join([c if c.isprintable() or c in "\n\u00a0" else " " for c in str(cell)])

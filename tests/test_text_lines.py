@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.text_lines import folded, text_width, wrapped
+from safe_envs.text_lines import folded, text_width, visible, wrapped
 
 COMPARED = (
     "  promise:p=0.9 - scbf: +21.0 points [15.6, 27.2], McNemar p < 1e-10 (safe with one only:"
@@ -55,3 +55,10 @@ def test_wide_characters_take_two_places():
     assert text_width("安全") == 4
     assert text_width("e\u0301") == 1
     assert [text_width(line) for line in folded("安全安全安", 4).split("\n")] == [4, 4, 2]
+
+
+def test_what_controls_a_terminal_is_written_as_python_writes_it():
+    assert visible("a\x1b[31m\u202eb\udcff\x9b\t\u2028") == r"a\x1b[31m\u202eb\udcff\x9b\t\u2028"
+    for whole in ("C:\\a b.json", "\u03c3 = \u96fb", "two\nlines\u00a0of\u00ad text"):
+        assert visible(whole) == whole
+    assert visible("two\nlines", keep="") == r"two\nlines"

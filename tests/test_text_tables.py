@@ -139,5 +139,7 @@ def test_a_table_without_rows_has_titles():
 def test_text_controls_no_terminal():
     names, columns = table(["a\x1b[31mb", "\u202ecd"])
     (fitted,) = arranged([names], columns[:2], 80)
-    assert "a [31mb" in text_of(fitted)
-    assert "\u202e" not in text_of(fitted)
+    assert "a\\x1b[31mb" in text_of(fitted)
+    assert "\\u202ecd" in text_of(fitted)
+    assert r"a\\x1b\[31mb" in markdown_of(fitted)
+    assert not set("\x1b\u202e") & set(text_of(fitted) + markdown_of(fitted))

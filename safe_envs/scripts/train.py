@@ -16,6 +16,7 @@ from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
+from safe_envs.text_lines import visible
 
 
 @with_env
@@ -185,7 +186,7 @@ def train(
             train_agent(training, out, resume=resume, tensorboard=tensorboard, progress=tell)
         except KeyboardInterrupt:
             advice = "The same command with --resume goes on after the last checkpoint in"
-            print(f"Stopped. {advice} {out}.", file=sys.stderr)
+            print(f"Stopped. {advice} {visible(str(out))}.", file=sys.stderr)
             raise
     if finished:
         say(stdout(), f"The training in {out} was finished already: nothing was left to do.")

@@ -12,6 +12,7 @@ from safe_envs.agents.evaluation.evaluation_data import EvaluationData, FilterTi
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.text_lines import visible
 from safe_envs.text_tables import Column, FittedTable, arranged, without_empty
 
 _NONE = "-"
@@ -69,7 +70,9 @@ def evaluation_table(evaluation: EvaluationData, timing: bool = False) -> Evalua
     columns += _behavior(rows)
     if timing:
         columns += _timing(evaluation.timing.rows)
-    return EvaluationTable(Column("filter", tuple(row.filter for row in rows), "l"), columns, facts)
+    # The end of a line in the name of a file is no end of a line of the table.
+    names = Column("filter", tuple(visible(row.filter, keep="") for row in rows), "l")
+    return EvaluationTable(names, columns, facts)
 
 
 def interval_name(evaluation: EvaluationData) -> str:

@@ -14,6 +14,7 @@ from safe_envs.agents.evaluation.evaluation_table import (
     interval_name,
 )
 from safe_envs.agents.evaluation.setting_text import setting_lines
+from safe_envs.text_lines import visible
 from safe_envs.text_tables import Column
 
 _WIDTH = 80
@@ -39,12 +40,17 @@ def html_table(evaluation: EvaluationData) -> str:
         heading = "Difference of the safety rates on the same episodes"
         lines.append(f"{heading} [{interval_name(evaluation)}]:")
         lines += map(describe, differences)
-    heading = f"<b>{escape(evaluation.title)}</b> | {escape(evaluation.about)}"
-    heading = "<br>".join([heading, *map(escape, setting_lines(evaluation))])
-    parts = [_paragraph(heading), first, *map(_paragraph, map(escape, table.facts)), *others]
+    heading = f"<b>{_shown(evaluation.title)}</b> | {_shown(evaluation.about)}"
+    heading = "<br>".join([heading, *map(_shown, setting_lines(evaluation))])
+    parts = [_paragraph(heading), first, *map(_paragraph, map(_shown, table.facts)), *others]
     if lines:
-        parts.append(_paragraph("<br>".join(map(escape, lines))))
+        parts.append(_paragraph("<br>".join(map(_shown, lines))))
     return f"<div>{''.join(parts)}</div>"
+
+
+def _shown(text: str) -> str:
+    """Return a text as HTML that shows the same characters, and control characters as escapes."""
+    return escape(visible(text))
 
 
 def _paragraph(html: str) -> str:
@@ -68,13 +74,13 @@ def _table(columns: Sequence[Column]) -> str:
 
 def _title(column: Column) -> str:
     style = f"{_align(column)}{_CELL}{_RULE}"
-    return f'<th scope="col" style="{style}">{escape(column.plain_title)}</th>'
+    return f'<th scope="col" style="{style}">{_shown(column.plain_title)}</th>'
 
 
 def _cell(column: Column, text: str) -> str:
     # A number stays on one line with its interval; titles and long names take several.
     breaks = "white-space:nowrap;" if column.kind == "r" else "overflow-wrap:anywhere;"
-    return f'<td style="{_align(column)}{_CELL}{breaks}">{escape(text)}</td>'
+    return f'<td style="{_align(column)}{_CELL}{breaks}">{_shown(text)}</td>'
 
 
 def _align(column: Column) -> str:

@@ -16,7 +16,7 @@ from safe_envs.agents.evaluation.evaluation_table import (
     p_text,
 )
 from safe_envs.agents.evaluation.setting_text import setting_lines
-from safe_envs.text_lines import folded
+from safe_envs.text_lines import folded, visible
 from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of
 
 _WIDTH = 80
@@ -96,7 +96,7 @@ def escape(text: str) -> str:
     Args:
         text: with any characters.
     """
-    return "".join(map(_sign, _SIGNS.findall(_MINUS.sub("\u2212", text))))
+    return "".join(map(_sign, _SIGNS.findall(_MINUS.sub("\u2212", visible(text)))))
 
 
 def _sign(sign: str) -> str:

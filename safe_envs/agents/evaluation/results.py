@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation.frames import frame_of, row_columns
 from safe_envs.agents.evaluation.html_table import html_table
 from safe_envs.agents.evaluation.latex_table import latex_table
 from safe_envs.agents.evaluation.setting_text import setting_lines
-from safe_envs.text_lines import wrapped
+from safe_envs.text_lines import visible, wrapped
 from safe_envs.text_tables import markdown_of, plain_markdown, text_of
 
 _WIDTH = 80
@@ -48,7 +48,7 @@ class Evaluation(EvaluationData):
     def __str__(self) -> str:
         table = evaluation_table(self).short()
         tables = map(text_of, table.arranged(_WIDTH))
-        lines = [f"{self.title} | {self.about}"]
+        lines = [visible(f"{self.title} | {self.about}", keep="")]
         lines += [part for line in setting_lines(self) for part in wrapped(line, _WIDTH)]
         return "\n\n".join(["\n".join(lines), *tables, *table.facts])
 

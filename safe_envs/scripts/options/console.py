@@ -21,6 +21,7 @@ import typer
 from safe_envs.atomic_io import require_writable, write_json
 from safe_envs.errors import SafeEnvsError, nearest, shortened, shown
 from safe_envs.scripts.options.number_options import strict
+from safe_envs.text_lines import visible
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -143,9 +144,10 @@ def say(console: Console, text: str | Text, wrap: bool = True) -> None:
         text: to print; markup in a str is not interpreted.
         wrap: whether the lines may be wrapped; a command that is to be copied may not.
     """
-    if wrap:
-        from safe_envs.scripts.options.wrapping import wrapped_for
+    from safe_envs.scripts.options.wrapping import visible_text, wrapped_for
 
+    text = visible_text(text)
+    if wrap:
         text = wrapped_for(console, text)
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
@@ -278,7 +280,7 @@ def _usage_text(error: Any) -> str:
 def _fail(message: str) -> NoReturn:
     colour = False if os.environ.get("NO_COLOR") else None
     title = typer.style("Error:", fg="red", bold=True)
-    text = typer.style(shortened(message, _LONGEST), fg="red")
+    text = typer.style(visible(shortened(message.strip(), _LONGEST), keep="\u00a0"), fg="red")
     typer.echo(f"{title} {text}", err=True, color=colour)
     sys.exit(2)
 

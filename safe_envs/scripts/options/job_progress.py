@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from safe_envs.scripts.options.console import progress_bar
+from safe_envs.text_lines import visible
 
 if TYPE_CHECKING:
     from safe_envs.agents.jobs.executor import Backend
@@ -47,6 +48,7 @@ def run_jobs(
         try:
             run(jobs, backend, note, lambda text: print(text, file=sys.stderr, flush=True))
         except KeyboardInterrupt:
-            print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
+            where = visible(str(out))
+            print(f"Stopped. The same command goes on after what is in {where}.", file=sys.stderr)
             raise
     return [outcome for outcome in ended if outcome.error is not None]

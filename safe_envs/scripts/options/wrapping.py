@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.text import Text
 
-from safe_envs.text_lines import break_points
+from safe_envs.text_lines import break_points, visible
 
 _INDENT = 4
 """Blanks before the further lines of a text that is wrapped."""
@@ -28,6 +28,21 @@ def as_on_a_terminal() -> Iterator[None]:
         yield
     finally:
         _Page.shown = before
+
+
+def visible_text(text: str | Text) -> str | Text:
+    """Return a text of several lines in which control characters are made visible.
+
+    Args:
+        text: which may have a style.
+    """
+    if isinstance(text, str):
+        return visible(text)
+    if visible(text.plain) == text.plain:
+        return text
+    # Rich has no other way to the parts with one style than to draw them.
+    parts = text.render(Console(), end="")
+    return Text.assemble(*((visible(part.text), part.style or "") for part in parts))
 
 
 def wrapped_for(console: Console, text: str | Text) -> str | Text:

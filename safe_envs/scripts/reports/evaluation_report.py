@@ -28,6 +28,7 @@ from safe_envs.scripts.reports.bound_notes import bound_notes
 from safe_envs.scripts.reports.engine_notes import engine_notes
 from safe_envs.scripts.reports.learned_notes import learned_notes
 from safe_envs.scripts.reports.tables import print_columns, print_rows
+from safe_envs.text_lines import visible
 
 _VERDICTS = {
     "converged": "converged, {}",
@@ -113,7 +114,7 @@ def heading_of(config: Mapping[str, Any], problem: SafetyProblem, what: str) -> 
         problem: that was evaluated.
         what: number of the episodes.
     """
-    title = Text(config["title"], style="bold")
+    title = Text(visible(config["title"], keep=""), style="bold")
     title.append(
         f" | policy {config['policy']['name']} | {what} | seed {config['seed']}", style="not bold"
     )

@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table, print_whole
+from safe_envs.text_lines import visible
 from safe_envs.wrappers.export import CComparison, PromiseComparison
 from safe_envs.wrappers.export.interface import Interface
 
@@ -59,7 +60,9 @@ def print_export(console: Console, answer: ExportAnswer) -> None:
         answer: what was exported.
     """
     interface, name = answer.interface, answer.interface.name
-    console.print(f"[bold]{escape(answer.title)}[/]: {escape(interface.title)}", highlight=False)
+    console.print(
+        f"[bold]{escape(visible(answer.title))}[/]: {escape(interface.title)}", highlight=False
+    )
     say(
         console,
         f"C99 in {interface.precision.type} precision is in {answer.folder}: {name}_decide takes"

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs.text_lines import wrapped
-from safe_envs.text_tables import Column, FittedTable, arranged, columns_of, visible
+from safe_envs.text_tables import Column, FittedTable, arranged, columns_of
 
 _WIDEST = 1000
 
@@ -121,5 +121,5 @@ def _drawn(fitted: FittedTable) -> Table:
         drawn.width, drawn.overflow, drawn.vertical = column.width, "fold", "top"
         drawn.no_wrap = False
     for cells in zip(*(column.cells for column in fitted), strict=True):
-        table.add_row(*(each if isinstance(each, Text) else Text(visible(each)) for each in cells))
+        table.add_row(*(each if isinstance(each, Text) else Text(str(each)) for each in cells))
     return table

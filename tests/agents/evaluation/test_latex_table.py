@@ -89,7 +89,7 @@ def test_all_signs_are_escaped():
     assert plain(escape(SIGNS)) == shown
     assert "--" not in escape("a--b---c")
     assert escape("-0.5 [-1, -.2] a-1 -") == "$-$0.5 [$-$1, $-$.2] a-1 -"
-    assert escape("a\tb\x00") == "a b "
+    assert plain(escape("a\tb\x00\n")) == r"a\tb\x00 "
 
 
 def test_cells_are_those_of_the_evaluation(evaluated):

@@ -12,10 +12,13 @@ from pathlib import Path
 import pytest
 import typer
 from gymnasium.error import DependencyNotInstalled
+from rich.text import Text
 
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import cli
 from safe_envs.scripts.options import console
 from safe_envs.scripts.options.console import run
+from safe_envs.scripts.options.wrapping import visible_text
 from tests.wrappers.verification.verified import verify_once
 
 pytestmark = pytest.mark.slow
@@ -68,6 +71,27 @@ def test_sizes_beyond_the_memory_end_with_status_2(capsys, error):
 def test_faults_of_the_program_are_not_hidden(error):
     with pytest.raises(type(error)):
         run(failing(error))
+
+
+def test_control_characters_in_an_error_are_written_out_in_one_line(capsys):
+    with pytest.raises(SystemExit):
+        run(failing(ConfigurationError("a\x1b[31mb\nc\u202ed.json cannot be read\n")))
+    assert capsys.readouterr().err == "Error: a\\x1b[31mb\\nc\\u202ed.json cannot be read\n"
+
+
+@pytest.mark.parametrize("wrap", [False, True])
+@pytest.mark.parametrize("kind", [str, Text])
+def test_control_characters_in_what_is_said_are_written_out(capsys, kind, wrap):
+    console.say(console.stdout(), kind("of a\x1b[31mb\u202ec\nand more"), wrap)
+    assert capsys.readouterr().out == "of a\\x1b[31mb\\u202ec\nand more\n"
+
+
+def test_what_is_written_out_keeps_its_style():
+    text = visible_text(Text.assemble(("a\x1bb", "bold"), " c"))
+    assert (text.plain, [(s.start, s.end, str(s.style)) for s in text.spans][:1]) == (
+        "a\\x1bb c",
+        [(0, 6, "bold")],
+    )
 
 
 def test_a_request_to_terminate_is_like_ctrl_c():
