@@ -108,7 +108,8 @@ class EvaluationData:
         """Number of episodes, and of identifications where there are several."""
         repeats = max((row.learning.repeats for row in self.rows if row.learning), default=1)
         often = f" x {repeats} identifications" if repeats > 1 else ""
-        return f"{self.config['episodes']} episodes{often}"
+        count = self.config["episodes"]
+        return f"{count} episode{'s' * (count != 1)}{often}"
 
     @property
     def episodes(self) -> dict[str, list[EpisodeResults]]:

@@ -9,7 +9,7 @@ from safe_envs.agents.evaluation.best_text import attainable_text, times_column
 from safe_envs.agents.evaluation.bound_text import bound_text, continuous_text, held_text
 from safe_envs.agents.evaluation.comparison import Comparison
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData, FilterTiming
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.rate_text import percent, percent_in, points_in
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.text_lines import visible
@@ -87,17 +87,6 @@ def compared(evaluation: EvaluationData) -> list[Comparison]:
     return [c for c in evaluation.comparisons if UNFILTERED not in (c.first, c.second)]
 
 
-def points(difference: float, low: float, high: float) -> str:
-    """Return a difference of rates with its interval, in points.
-
-    Args:
-        difference: of two rates from 0 to 1.
-        low: lower end of its interval.
-        high: upper end.
-    """
-    return f"{100 * difference:+.1f} points [{100 * low:.1f}, {100 * high:.1f}]"
-
-
 def p_text(p: float) -> str:
     """Return a p value with its sign of relation."""
     return f"< {_LEAST_P:g}" if p < _LEAST_P else f"= {p:.2g}"
@@ -106,7 +95,7 @@ def p_text(p: float) -> str:
 def describe(comparison: Comparison) -> str:
     """Return a comparison as a line."""
     first, second, p = comparison.first, comparison.second, comparison.mcnemar_p
-    difference = points(comparison.difference, comparison.ci_low, comparison.ci_high)
+    difference = points_in(comparison.difference, comparison.ci_low, comparison.ci_high)
     if p is None:
         return f"{first} - {second}: {difference}, over identifications and episodes"
     return (

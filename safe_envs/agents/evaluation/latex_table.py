@@ -15,6 +15,7 @@ from safe_envs.agents.evaluation.evaluation_table import (
     interval_name,
     p_text,
 )
+from safe_envs.agents.evaluation.rate_text import points_in
 from safe_envs.agents.evaluation.setting_text import setting_lines
 from safe_envs.text_lines import folded, visible
 from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of
@@ -129,7 +130,7 @@ def _compared(evaluation: EvaluationData) -> str:
     rows = [
         (
             folded(f"{c.first} - {c.second}", _WIDTH // 2),
-            f"{100 * c.difference:+.1f} [{100 * c.ci_low:.1f}, {100 * c.ci_high:.1f}]",
+            points_in(c.difference, c.ci_low, c.ci_high, unit=""),
             "-" if c.mcnemar_p is None else p_text(c.mcnemar_p).removeprefix("= "),
             f"{c.only_first} / {c.only_second}",
         )

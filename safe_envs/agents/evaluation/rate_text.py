@@ -25,6 +25,28 @@ def percent_in(rate: float, low: float, high: float) -> str:
     return f"{rate_text} % [{low_text}, {high_text}]"
 
 
+def points_in(difference: float, low: float, high: float, unit: str = " points") -> str:
+    """Return a difference of rates with its interval, in points, as text.
+
+    It has one digit, or as many as tell it from 0 where its interval does.
+
+    Args:
+        difference: of two rates from 0 to 1.
+        low: lower end of its interval.
+        high: upper end.
+        unit: after the difference.
+    """
+    telling = (difference, low, high) if low * high > 0.0 else (max(abs(low), abs(high)),)
+    # What rounding has left of 0 is the same.
+    nonzero = [100 * each for each in telling if abs(each) > 1e-12]
+    digits = next(
+        (d for d in range(1, _MOST_DIGITS) if all(round(each, d) for each in nonzero)), _MOST_DIGITS
+    )
+    # What rounds to 0 has no minus sign.
+    first, lower, upper = (round(100 * each, digits) + 0.0 for each in (difference, low, high))
+    return f"{first:+.{digits}f}{unit} [{lower:.{digits}f}, {upper:.{digits}f}]"
+
+
 def rate_of(row: Mapping[str, Any]) -> str:
     """Return the safety rate of a row with its interval, in per cent."""
     return percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])

@@ -48,8 +48,14 @@ def draw_plane(axes: Axes, evaluation: Evaluation, looks: dict[str, dict[str, An
     axes.set(
         xlabel=quantity(names[across], units[across]),
         ylabel=quantity(names[up], units[up]),
-        title=f"First {len(starts)} episodes, dots at their starts{_when(problem)}",
+        title=f"{_first(len(starts))}{_when(problem)}",
     )
+
+
+def _first(episodes: int) -> str:
+    if episodes == 1:
+        return "First episode, a dot at its start"
+    return f"First {episodes} episodes, dots at their starts"
 
 
 def _when(problem: SafetyProblem) -> str:

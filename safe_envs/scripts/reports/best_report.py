@@ -72,8 +72,8 @@ def print_best(console: Console, answer: BestAnswer) -> None:
     s = found.simulated
     if s is not None:
         rate = percent_in(s.rate, s.low, s.high)
-        told = f"greedy policy, {s.episodes} episodes, seed {s.seed}, {100 * s.confidence:g} %"
-        rows.append(("simulated", rate, f"{told} interval"))
+        told = f"greedy policy, {s.episodes} episode{'s' * (s.episodes != 1)}, seed {s.seed}"
+        rows.append(("simulated", rate, f"{told}, {100 * s.confidence:g} % interval"))
     rows.append(("upper", ends[1], word[2]))
     if s is not None:
         told = f"of the greedy policy, while still {word[0]}"

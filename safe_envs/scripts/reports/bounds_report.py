@@ -85,7 +85,9 @@ def print_measurements(console: Console, answer: VerifyAnswer) -> None:
     numbers = {bound.name: str(i) for i, bound in enumerate(answer.bounds, start=1)}
     for found in answer.measurements:
         at = "" if found.state is None else f", {state_text(answer.problem, found.state)}"
-        episodes = f"{found.episodes} episodes of the policy {answer.policy}"
+        episodes = (
+            f"{found.episodes} episode{'s' * (found.episodes != 1)} of the policy {answer.policy}"
+        )
         heading = f" from {found.start}{at}: {episodes}"
         say(console, Text.assemble(("\nMeasured", "bold"), heading))
         names = [bound.name for bound in found.horizons[0].bounds]

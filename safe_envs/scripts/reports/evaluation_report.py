@@ -15,9 +15,8 @@ from safe_envs.agents.evaluation.evaluation_table import (
     describe,
     evaluation_table,
     interval_name,
-    points,
 )
-from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.agents.evaluation.rate_text import percent_in, points_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
@@ -91,7 +90,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         say(console, "Nothing is random here: what changes with the period, changes for sure.")
         return
     for row in refinement.rows:
-        change = points(row.change, row.change_low, row.change_high)
+        change = points_in(row.change, row.change_low, row.change_high)
         say(console, f"  {row.filter}: {_VERDICTS[row.verdict].format(change, row.withheld)}")
     reach = f"{100 * TOLERANCE:g} points"
     say(

@@ -1,6 +1,6 @@
 import pytest
 
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.rate_text import percent, percent_in, points_in
 from safe_envs.agents.evaluation.statistics import rate_interval
 
 
@@ -33,3 +33,23 @@ def test_a_share_that_is_small_is_not_none():
 
 def test_roundings_are_no_digits():
     assert percent_in(1.0, 1.0 - 1e-16, 1.0) == "100.0 % [100.0, 100.0]"
+
+
+@pytest.mark.parametrize(
+    ("difference", "text"),
+    [
+        ((0.158, 0.136, 0.182), "+15.8 points [13.6, 18.2]"),
+        ((0.004, -0.001, 0.011), "+0.4 points [-0.1, 1.1]"),
+        # What is significant is not shown as 0, and neither is the end of its interval.
+        ((0.0002, 0.0001, 0.0003), "+0.02 points [0.01, 0.03]"),
+        ((-0.0002, -0.0004, -0.000004), "-0.0200 points [-0.0400, -0.0004]"),
+        # What is not may be, but its interval has an end.
+        ((0.00001, -0.0001, 0.01), "+0.0 points [0.0, 1.0]"),
+        ((0.0, -0.0002, 0.0002), "+0.00 points [-0.02, 0.02]"),
+        ((0.0, 0.0, 0.0), "+0.0 points [0.0, 0.0]"),
+        ((1e-17, -1e-17, 1e-17), "+0.0 points [0.0, 0.0]"),
+    ],
+)
+def test_a_difference_is_told_from_0_where_its_interval_is(difference, text):
+    assert points_in(*difference) == text
+    assert points_in(*difference, unit="") == text.replace(" points", "")
