@@ -7,6 +7,7 @@ from html import escape
 
 from safe_envs.agents.evaluation.bound_marks import marks_in
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData
+from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
 from safe_envs.agents.evaluation.evaluation_table import (
     compared,
     describe,
@@ -25,7 +26,7 @@ _RULE = "border-bottom:1px solid currentColor;"
 
 
 def html_table(evaluation: EvaluationData) -> str:
-    """Return a heading, a table with a row for each filter, and comparisons, as HTML.
+    """Return a heading, a table with a row for each filter, comparisons and notes, as HTML.
 
     Colors are those of the page, so that it can be read on a dark one too.
 
@@ -45,6 +46,9 @@ def html_table(evaluation: EvaluationData) -> str:
     parts = [_paragraph(heading), first, *map(_paragraph, map(_shown, table.facts)), *others]
     if lines:
         parts.append(_paragraph("<br>".join(map(_shown, lines))))
+    notes = [f"Note: {_shown(note)}" for note in evaluation_notes(evaluation)]
+    if notes:
+        parts.append(_paragraph(f"<small>{'<br>'.join(notes)}</small>"))
     return f"<div>{''.join(parts)}</div>"
 
 

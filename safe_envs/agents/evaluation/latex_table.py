@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from safe_envs.agents.evaluation.bound_marks import marks_in
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData
+from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
 from safe_envs.agents.evaluation.evaluation_table import (
     compared,
     evaluation_table,
@@ -60,7 +61,7 @@ _GREEK = re.compile(
 
 
 def latex_table(evaluation: EvaluationData) -> str:
-    """Return a floating table with a row for each filter, and the comparisons of filters.
+    """Return a floating table with a row for each filter, the comparisons of filters, and notes.
 
     Args:
         evaluation: to show.
@@ -85,6 +86,7 @@ def latex_table(evaluation: EvaluationData) -> str:
         f"\\caption{{{_caption(evaluation)}{facts}}}\n"
         f"\\label{{{_label(evaluation)}}}\n"
         f"{body}\n"
+        f"{_notes(evaluation)}"
         "\\end{table}"
     )
 
@@ -170,6 +172,17 @@ def _row(cells: Sequence[str]) -> str:
 def _cell(text: str) -> str:
     lines = [escape(line) for line in text.split("\n")]
     return lines[0] if len(lines) == 1 else "\\raggedright " + "\\newline ".join(lines)
+
+
+def _notes(evaluation: EvaluationData) -> str:
+    notes = [f"Note: {escape(note)}\\par\n" for note in evaluation_notes(evaluation)]
+    if not notes:
+        return ""
+    # In a box, or else each would be centered.
+    return (
+        "\n\\medskip\n\\begin{minipage}{\\linewidth}\n\\raggedright\n"
+        f"{''.join(notes)}\\end{{minipage}}\n"
+    )
 
 
 def _bottom(lines: Sequence[str], height: int) -> list[str]:

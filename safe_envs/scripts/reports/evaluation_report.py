@@ -8,8 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from safe_envs.agents.evaluation.best_text import best_line, best_notes
-from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
+from safe_envs.agents.evaluation.best_text import best_line
+from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
 from safe_envs.agents.evaluation.evaluation_table import (
     compared,
     describe,
@@ -19,13 +19,10 @@ from safe_envs.agents.evaluation.evaluation_table import (
 from safe_envs.agents.evaluation.rate_text import percent_in, points_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
-from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.setting_text import NOTHING_RANDOM, setting_text, unsafe_starts
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.bound_notes import bound_notes
 from safe_envs.scripts.reports.engine_notes import engine_notes
-from safe_envs.scripts.reports.learned_notes import learned_notes
 from safe_envs.scripts.reports.tables import print_columns, print_rows
 from safe_envs.text_lines import visible
 
@@ -123,60 +120,10 @@ def heading_of(config: Mapping[str, Any], problem: SafetyProblem, what: str) -> 
 
 def _notes(evaluation: Evaluation, timing: bool) -> list[str]:
     """Return what has to be known to read the table."""
-    steps = evaluation.problem.steps
-    notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
-    notes += [note for row in evaluation.rows for note in (*_of_starts(row), *_of_violations(row))]
-    notes += bound_notes(evaluation.rows)
-    notes += best_notes(evaluation.best)
-    notes += learned_notes(evaluation.rows, evaluation.problem)
-    for row, speed in zip(evaluation.rows, evaluation.timing.rows, strict=True):
-        length = speed.steps / row.episodes  # With repeats both are of all identifications.
-        if length < 0.99 * steps:
-            notes.append(early_end(row.filter, "mean episode", length, steps))
-    if evaluation.config["monitoring"] == "continuous":
-        notes += bridge_notes(evaluation.problem)
+    notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0]) + evaluation_notes(evaluation)
     if timing:
         speeds = evaluation.timing.rows
         notes += engine_notes([(row.filter, row.engine, row.jobs) for row in speeds])
     if evaluation.is_deterministic:
         notes.append(NOTHING_RANDOM)
     return notes
-
-
-def _of_starts(row: EvaluationRow) -> list[str]:
-    """Return from which of its starts a row has no bound for continuous control."""
-    if not row.outside_rate:
-        return []
-    return [
-        f"{100 * row.outside_rate:.3g} % of the starts lie outside the sets C_j = {{b_j >="
-        f" 0}}, j >= 1, that {row.filter} keeps: no bound holds from there"
-    ]
-
-
-def _of_violations(row: EvaluationRow) -> list[str]:
-    """Return how many violations are no more than rounding."""
-    touching, violations = row.touching, row.violations
-    if not touching:
-        return []
-    some = (
-        "all violations" if touching == violations else f"{touching} of the {violations} violations"
-    )
-    return [
-        f"{some} of {row.filter} come no lower than h = 0 to rounding: they touch the edge, and"
-        " safe is h > 0"
-    ]
-
-
-def early_end(name: str, which: str, length: float, steps: int) -> str:
-    """Return a note on episodes that do not last as long as they might.
-
-    Args:
-        name: of the filter.
-        which: episodes they are.
-        length: their mean length in control periods.
-        steps: of a whole episode.
-    """
-    return (
-        f"with {name} the {which} ends after {length:.1f} of {steps} steps, at the goal or outside"
-        " the workspace; its safety is that of the instants until then."
-    )

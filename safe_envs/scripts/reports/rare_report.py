@@ -7,12 +7,13 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
+from safe_envs.agents.evaluation.evaluation_notes import early_end
 from safe_envs.agents.evaluation.setting_text import unsafe_starts
 from safe_envs.agents.rare_events.estimate import RareEvaluation
 from safe_envs.agents.rare_events.rows import RareRow
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.engine_notes import engine_notes
-from safe_envs.scripts.reports.evaluation_report import early_end, heading_of
+from safe_envs.scripts.reports.evaluation_report import heading_of
 from safe_envs.scripts.reports.tables import print_rows
 
 _COLUMNS = (

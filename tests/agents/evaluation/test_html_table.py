@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
+from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
 from tests.agents.evaluation.made_up import LONG_NAME, nasty_evaluation
 
 ATTACK = '<script>alert("x")</script> & <b onclick="f()">'
@@ -74,10 +75,19 @@ def test_it_has_a_row_for_each_filter_with_its_intervals_and_words(read):
         assert text in reader.text
 
 
+def test_notes_stand_below_the_tables(read):
+    reader, rows = read
+    notes = evaluation_notes(replace(nasty_evaluation(), rows=rows))
+    assert len(notes) > 3
+    places = [reader.text.rindex(f"Note: {note}") for note in notes]
+    assert places == sorted(places)
+    assert places[0] > reader.text.rindex("McNemar p")
+
+
 def test_it_is_escaped_and_has_neither_scripts_nor_colors(read):
     reader, _ = read
     assert reader.tags == {
-        *("div", "p", "b", "br"),
+        *("div", "p", "b", "br", "small"),
         *("table", "thead", "tbody", "tr", "th", "td"),
     }
     assert {name for name, _ in reader.attributes} <= {"style", "scope", "class"}

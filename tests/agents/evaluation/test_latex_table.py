@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 
+from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
 from safe_envs.agents.evaluation.latex_table import escape, latex_table
 from tests.agents.evaluation.made_up import nasty_evaluation
 
@@ -120,6 +121,19 @@ def test_caption_and_label_say_what_it_is(evaluated):
     (label,) = re.findall(r"^\\label\{(.*)\}$", latex, re.MULTILINE)
     assert re.fullmatch(r"tab:[a-z0-9-]+", label)
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
+
+
+def test_notes_stand_below_the_tables(evaluated):
+    speeds = [replace(each, steps=each.steps // 2) for each in evaluated.timing.rows]
+    evaluated = replace(evaluated, timing=replace(evaluated.timing, rows=speeds))
+    notes = evaluation_notes(evaluated)
+    assert any("the mean episode ends after" in note for note in notes)
+    assert any(note.startswith("no bound, ") for note in notes)
+    box = latex_table(evaluated).partition("\\begin{minipage}{\\linewidth}\n\\raggedright\n")[2]
+    *lines, end, closed = box.splitlines()
+    assert (end, closed) == ("\\end{minipage}", "\\end{table}")
+    assert lines == [f"Note: {escape(note)}\\par" for note in notes]
+    assert "tabular" not in box
 
 
 @pytest.mark.slow

@@ -15,12 +15,12 @@ from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.evaluate import evaluate, run_evaluation
 from safe_envs.agents.evaluation.promise_bound import COMPUTED
+from safe_envs.agents.evaluation.promise_notes import computed_notes
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.errors import NotCompilableError
-from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.wrappers.value.promise_tables import (
     _IN_USE,
     promise_filter_for,

@@ -11,10 +11,10 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.evaluation.promise_bound import PromiseBound
+from safe_envs.agents.evaluation.promise_notes import computed_notes
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.render import split_filters
-from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SpecificationMonitorVector
 from safe_envs.wrappers.conditions.text_parts import files_of, with_absolute_paths
 from safe_envs.wrappers.value.look_ahead import LookAhead

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from safe_envs.agents.evaluation.held_input import NO_FILTER
+from safe_envs.agents.evaluation.promise_notes import computed_notes
 from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.scripts.reports.promise_notes import computed_notes
 from safe_envs.wrappers.conditions.text_parts import name_by_itself, names_promise
 
 CHAIN = "bound, held input <= safe <= attainable is a chain: all three are of the env's own steps."
