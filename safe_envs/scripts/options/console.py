@@ -268,7 +268,7 @@ def _usage_text(error: Any) -> str:
         if kind != "MissingParameter":
             return f"{name} {text}"
         text = f"{name} is missing"
-    command = error.ctx.command_path if error.ctx is not None else "safe-envs"
+    command = getattr(error.ctx, "command_path", "safe-envs")
     help_text = f"`{command} --help` shows the options"
     if kind == "NoSuchOption":
         given = str(error.option_name)
