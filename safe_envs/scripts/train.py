@@ -33,7 +33,9 @@ def train(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint."
+            metavar="DIR",
+            callback=early_checks.folder_to_write,
+            help="New folder for the policy, its evaluations and the checkpoint.",
         ),
     ],
     env: EnvOptions,

@@ -150,7 +150,7 @@ def measure(
     Raises:
         ConfigurationError: as `evaluate`.
     """
-    problem = verification.formulas.problem
+    problem = verification.problem
     best = verification.guarantee.best_start(seed)
     worlds = [(f"the start {problem.start!r}", problem)]
     if best is not None:

@@ -58,7 +58,7 @@ def plot_verification(
     Raises:
         ConfigurationError: The file cannot be written, or there is no such size.
     """
-    problem = found.formulas.problem
+    problem = found.problem
     marked = starts_of(problem) if starts is None else starts
     drawn = DrawnVerification(found, marked, title or problem.name)
     return finished(figure_of(drawn, size), out)
@@ -74,7 +74,7 @@ def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> StyledFigu
     Raises:
         ConfigurationError: there is no such size.
     """
-    problem, width = answer.problem, width_of(size)
+    problem, width = answer.verification.problem, width_of(size)
     several = problem.plant.n > 2
     with mpl.rc_context(STYLE):
         aside = several and size == "double"
@@ -102,7 +102,7 @@ def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> StyledFigu
 def _legend(answer: DrawnVerification, lines: ContourSet | None) -> list[Patch | Line2D]:
     found = answer.verification
     handles: list[Patch | Line2D] = []
-    if found.safe_set.shortfall > 0.0 or answer.part.shortfall > 0.0:
+    if found.safe_set.shortfall > 0.0 or found.part.shortfall > 0.0:
         handles.append(Patch(color=INFEASIBLE, alpha=0.6, label="no action meets the condition"))
     handles.append(Patch(color=UNSAFE, alpha=0.5, label="unsafe"))
     handles.append(Line2D([], [], color="black", linewidth=1.1, label="$h = 0$"))
@@ -115,9 +115,9 @@ def _legend(answer: DrawnVerification, lines: ContourSet | None) -> list[Patch |
         for j in range(1, degree)
     ]
     marker: Any = {"linestyle": "", "color": INFEASIBLE, "marker": "X", "markeredgecolor": "black"}
-    cross = "worst state" if answer.part.shortfall else "least to spare"
+    cross = "worst state" if found.part.shortfall else "least to spare"
     handles.append(Line2D([], [], **marker, markersize=6, label=cross))
-    starts = "starts, projected" if answer.problem.plant.n > 2 else "starts"
+    starts = "starts, projected" if found.problem.plant.n > 2 else "starts"
     marker = {"linestyle": "", "color": COLORS[0], "marker": "o"}
     handles.append(Line2D([], [], **marker, markersize=3, label=starts))
     return handles

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.figures.labels import quantity
 from safe_envs.scripts.figures.style import COLORS, DASHES, UNSAFE
-from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
+from safe_envs.wrappers.verification.feasibility import Verification
 from safe_envs.wrappers.verification.formulas import Formulas
 
 INFEASIBLE = "#D55E00"
@@ -33,16 +33,6 @@ class DrawnVerification:
     starts: np.ndarray
     title: str
 
-    @property
-    def problem(self) -> SafetyProblem:
-        """The problem that was looked at."""
-        return self.verification.formulas.problem
-
-    @property
-    def part(self) -> SetFeasibility:
-        """The feasibility in the set whose worst state is shown."""
-        return self.verification.part
-
 
 def window(answer: DrawnVerification, indices: Sequence[int]) -> np.ndarray:
     """Return limits that show C within the workspace, or what happens in it if it has no end.
@@ -62,7 +52,7 @@ def window(answer: DrawnVerification, indices: Sequence[int]) -> np.ndarray:
         return np.stack([region.low, region.high], axis=1)[list(indices)]
     if found.beyond:
         nearest = points[np.argsort(abs(level(points)))[: len(points) // _NEAREST]]
-        inside = np.concatenate([answer.starts, answer.part.worst[None], nearest])
+        inside = np.concatenate([answer.starts, found.part.worst[None], nearest])
     low, high = inside.min(axis=0), inside.max(axis=0)
     room = 0.12 * (high - low) + 1e-3 * (region.high - region.low)
     low, high = np.maximum(region.low, low - room), np.minimum(region.high, high + room)
@@ -147,6 +137,6 @@ def draw_line(axes: Axes, answer: DrawnVerification) -> None:
         )
     axes.set_xlim(low, high)
     heights = formulas.chain(starts)[:, 0]
-    mark_states(axes, (starts[:, 0], heights), (answer.part.worst[0], 0.0))
+    mark_states(axes, (starts[:, 0], heights), (answer.verification.part.worst[0], 0.0))
     title = "$h$" + ", and where no action meets the condition" * bool(violated.any())
-    axes.set(xlabel=axis_label(answer.problem, 0), ylabel="$h$", title=title)
+    axes.set(xlabel=axis_label(answer.verification.problem, 0), ylabel="$h$", title=title)

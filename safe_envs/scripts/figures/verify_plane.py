@@ -40,7 +40,8 @@ def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
         The contours of h inside the safe set, for `write_levels`; None without any.
     """
     lines = None
-    found, problem, worst = answer.verification, answer.problem, answer.part.worst
+    found = answer.verification
+    problem, worst = found.problem, found.part.worst
     formulas, plane = found.formulas, _plane(problem)
     grid, x = _states_over(answer, plane, worst, _GRID)
     chain = formulas.chain(x)
@@ -84,12 +85,13 @@ def draw_shares(figure: Figure, axes: Axes, answer: DrawnVerification) -> None:
         axes: to draw on.
         answer: to draw.
     """
-    found, problem = answer.verification, answer.problem
+    found = answer.verification
+    problem = found.problem
     formulas, plane = found.formulas, _plane(problem)
     # Several conditions take a solver: a coarser picture of a tenth of the states.
     coarser = len(formulas.stages) > 1
     count = _COARSE // 2 if coarser else _COARSE
-    grid, states = _states_over(answer, plane, answer.part.worst, count)
+    grid, states = _states_over(answer, plane, found.part.worst, count)
     inside, violated = np.zeros(len(states)), np.zeros(len(states))
     for values in _others(found, 2 ** (_OTHERS_LOG2 - 2 * coarser)):
         x = np.tile(values, (len(states), 1))
@@ -134,7 +136,7 @@ def _others(found: Verification, count: int) -> np.ndarray:
     They are evenly spread, or in the invariant set where such states would rarely be in it.
     """
     rng = np.random.default_rng(0)
-    if found.formulas.problem.plant.n == 3 or found.invariant_set is None:
+    if found.problem.plant.n == 3 or found.invariant_set is None:
         return found.region.draw(count.bit_length() - 1, rng)
     points = sample(
         "the intersection of the C_j", found.formulas.invariant_level, found.region, count, rng

@@ -104,6 +104,17 @@ def file_that_is_there(advice: str) -> Callable[[Any], Any]:
     return check
 
 
+def folder_to_write(path: Path) -> Path:
+    """Return the value of --out if it is a folder, or nothing yet.
+
+    Raises:
+        ConfigurationError: It is a file.
+    """
+    if os.path.lexists(path) and not os.path.isdir(path):
+        raise ConfigurationError(f"--out {shortened(path)} is a file; give a new folder")
+    return path
+
+
 def known_method(name: str) -> str:
     """Return the value of --method if there is such a method.
 

@@ -50,7 +50,7 @@ def print_bounds(console: Console, answer: VerifyAnswer) -> None:
         console: to print on.
         answer: with the bounds.
     """
-    problem, starts, bounds = answer.problem, answer.starts, answer.bounds
+    problem, starts, bounds = answer.verification.problem, answer.starts, answer.bounds
     where = (
         f"at {state_text(problem, starts[0])}"
         if len(starts) == 1
@@ -83,8 +83,9 @@ def print_measurements(console: Console, answer: VerifyAnswer) -> None:
         answer: with bounds and measurements.
     """
     numbers = {bound.name: str(i) for i, bound in enumerate(answer.bounds, start=1)}
+    problem = answer.verification.problem
     for found in answer.measurements:
-        at = "" if found.state is None else f", {state_text(answer.problem, found.state)}"
+        at = "" if found.state is None else f", {state_text(problem, found.state)}"
         episodes = (
             f"{found.episodes} episode{'s' * (found.episodes != 1)} of the policy {answer.policy}"
         )
@@ -110,7 +111,7 @@ def print_chain(console: Console, answer: VerifyAnswer) -> None:
         console: to print on.
         answer: with the chain.
     """
-    chain, problem = answer.chain, answer.problem
+    chain, problem = answer.chain, answer.verification.problem
     heading = f"from the start {problem.start!r}, up to {problem.duration:g} s"
     say(console, Text.assemble(("\nThe env's own steps", "bold"), f" {heading}"))
     attainable = attainable_text(chain.best)

@@ -32,7 +32,7 @@ def print_statements(console: Console, answer: VerifyAnswer) -> None:
             text,
             Text(verdict.word, style=_COLORS[verdict.word]),
             f"{verdict.boxes:,}",
-            _why(answer.problem, verdict),
+            _why(answer.verification.problem, verdict),
         )
         for text, verdict in statements
     ]

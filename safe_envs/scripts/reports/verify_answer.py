@@ -11,10 +11,9 @@ import numpy as np
 
 from safe_envs.agents.evaluation.bound_check import Measurement
 from safe_envs.agents.evaluation.safety_chain import SafetyChain
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
-from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
+from safe_envs.wrappers.verification.feasibility import Verification
 from safe_envs.wrappers.verification.judge import JudgeResult
 from safe_envs.wrappers.verification.results import Bound
 
@@ -60,16 +59,6 @@ class VerifyAnswer:
         return f"G is where {positive} positive, in the workspace"
 
     @property
-    def problem(self) -> SafetyProblem:
-        """The problem that was looked at."""
-        return self.verification.formulas.problem
-
-    @property
-    def part(self) -> SetFeasibility:
-        """The feasibility in the set that becomes invariant; in C if there is none."""
-        return self.verification.part
-
-    @property
     def filter_text(self) -> str:
         """The conditions of the filter."""
         return spec_of(self.verification.formulas.conditions)
@@ -83,9 +72,9 @@ class VerifyAnswer:
                     **self.config,
                     "filter": self.filter_text,
                     "knowledge": found.formulas.knowledge,
-                    "horizon": self.problem.duration,
+                    "horizon": found.problem.duration,
                 },
-                "states": [s.symbol.name for s in self.problem.states],
+                "states": [s.symbol.name for s in found.problem.states],
                 "drawn": found.analysis.safe.drawn,
                 "notes": found.region.notes,
                 "beyond_workspace": found.beyond,

@@ -30,7 +30,8 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
         console: to print on.
         answer: to print.
     """
-    found, problem = answer.verification, answer.problem
+    found = answer.verification
+    problem = found.problem
     told = (
         f" | filter {answer.filter_text} | start {problem.start}"
         f"\n{describe_system(problem)}; the conditions know the {found.formulas.knowledge}"
@@ -117,7 +118,7 @@ def _outside(found: Verification, starts: np.ndarray) -> float:
 
 
 def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
-    problem = found.formulas.problem
+    problem = found.problem
     size = f"{number_text(b.typical)} in the median"
     if b.vanishes:
         infeasible = f"; no action meets the condition on {share_text(b.small_infeasible)} of it"
@@ -157,7 +158,7 @@ def _parts(found: Verification) -> list[str]:
 
 
 def _describe_part(found: Verification, part: SetFeasibility) -> str:
-    at = state_text(found.formulas.problem, part.worst)
+    at = state_text(found.problem, part.worst)
     if not part.shortfall:
         return f"nowhere; the smallest margin is at {at}"
     share = (

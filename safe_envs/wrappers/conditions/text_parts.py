@@ -76,10 +76,14 @@ def require_parameters(text: str) -> None:
     """
     for part in parts_of(text):
         allowed = PARAMETERS.get(part.name, ())
-        for key in (setting.partition("=")[0] for setting in part.settings if allowed):
+        for key, _, value in (setting.partition("=") for setting in part.settings if allowed):
             if key not in allowed:
                 raise ConfigurationError(
                     f"filter {part.name} has no parameter {shown(key)}; {nearest(key, allowed)}"
+                )
+            if not value:
+                raise ConfigurationError(
+                    f"filter {part.name} gives {key} no value; give it as {key}=VALUE"
                 )
 
 

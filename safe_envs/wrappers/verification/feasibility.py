@@ -127,6 +127,11 @@ class Verification:
         return self.analysis.formulas
 
     @property
+    def problem(self) -> SafetyProblem:
+        """The problem that was looked at."""
+        return self.formulas.problem
+
+    @property
     def region(self) -> Region:
         """The states that were searched."""
         return self.analysis.region

@@ -88,6 +88,7 @@ def test_control_characters_in_what_is_said_are_written_out(capsys, kind, wrap):
 
 def test_what_is_written_out_keeps_its_style():
     text = visible_text(Text.assemble(("a\x1bb", "bold"), " c"))
+    assert isinstance(text, Text)
     assert (text.plain, [(s.start, s.end, str(s.style)) for s in text.spans][:1]) == (
         "a\\x1bb c",
         [(0, 6, "bold")],
@@ -224,6 +225,14 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
         (("evaluate", "Scalar-v0", "--knowledge", "plan"), "did you mean 'plant'"),
         (("evaluate", "Scalar-v0", "--policy", __file__), "is a file of Python; give a policy"),
         (("verify", "Scalar-v0", "--filter", ""), "unknown filter ''"),
+        (
+            ("verify", "Scalar-v0", "--filter", "cbf:alpha"),
+            "gives alpha no value; give it as alpha=",
+        ),
+        (
+            ("train", "Scalar-v0", "--algo", "ppo", "--out", __file__),
+            "is a file; give a new folder",
+        ),
         (("verify", "Scalar-v0", "--filter", "scfb"), "did you mean 'scbf'"),
         (("train", "Scalar-v0", "--algo", "pp", "--out", "x"), "did you mean 'ppo'"),
         (
