@@ -53,7 +53,7 @@ def test_a_tall_legend_makes_the_figure_taller_and_leaves_the_panel_its_height()
             add_legend(
                 figure, [Line2D([], [], label="a long name " * 3 + f"{i}") for i in range(count)]
             )
-            figure.canvas.draw()
+            figure.draw_without_rendering()
         heights.append(axes.get_position().height * figure.get_figheight())
     assert heights[1] == pytest.approx(heights[0], abs=0.15)
 
