@@ -21,7 +21,8 @@ from safe_envs.scripts.figures.style import STYLE, add_legend, look, mark_of
                 "bayesian-scbf:simultaneous=0.9: 88.0 % safe",
                 "bayesian-scbf:confidence=0.95: 85.0 % safe",
             ],
-            2,
+            # Two take 5.65 inches in print.
+            1,
         ),
         ([f"ddscbf:margin=0.{i}: 88.0 % safe" for i in range(4)], 2),
         (["none: 83.0 % safe", f"bayesian-scbf:file={'long/' * 30}x.npz: 88.0 % safe"], 1),
