@@ -98,7 +98,12 @@ def look(i: int) -> dict[str, Any]:
 
 
 def mark_of(i: int, marks: Sequence[str] = MARKERS) -> str:
-    """Return the mark of the i-th line or point, another one where its colour comes again."""
+    """Return the mark of the i-th line or point, another one where its colour comes again.
+
+    Args:
+        i: place among the lines or points.
+        marks: to choose from.
+    """
     return marks[(i + i // len(COLORS)) % len(marks)]
 
 
