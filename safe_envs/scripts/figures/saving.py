@@ -52,7 +52,9 @@ class StyledFigure(Figure):
             **kwargs: as there.
         """
         kind = kwargs.get("format") or Path(str(fname)).suffix.removeprefix(".")
-        kwargs["metadata"] = {**_UNDATED.get(kind.lower(), {}), **(kwargs.get("metadata") or {})}
+        undated = _UNDATED.get(kind.lower())
+        if undated is not None:  # of the other formats some refuse any metadata
+            kwargs["metadata"] = {**undated, **(kwargs.get("metadata") or {})}
         # The formats of fonts are read when a figure is written.
         with mpl.rc_context(STYLE), _laid_out(self):
             super().savefig(fname, **kwargs)
