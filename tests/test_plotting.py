@@ -14,6 +14,7 @@ from safe_envs.plotting import plot_attainable, plot_evaluation, plot_verificati
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.verification.feasibility import verify
+from tests.readable import figure_texts, unreadable
 
 SCALAR = "safe_envs/Scalar-v0"
 
@@ -40,6 +41,16 @@ def test_an_evaluation_is_a_figure_that_a_notebook_shows(evaluation):
 def test_a_figure_is_written_in_the_format_of_the_suffix(evaluation, tmp_path, name, start):
     plot_evaluation(evaluation, tmp_path / name)
     assert (tmp_path / name).read_bytes().startswith(start)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["single", "double"])
+def test_eight_filters_of_long_names_can_be_read(size):
+    names = [f"hocbf:p=1.2345*s**3+0.5*tanh(s)+0.25*s**5+{k}*s" for k in range(1, 8)]
+    found = evaluate(
+        SCALAR, filters=["none", *names], episodes=4, bounds=False, record=True, best=False
+    )
+    assert unreadable(*figure_texts(plot_evaluation(found, size=size))) == []
 
 
 def test_text_of_a_figure_that_is_saved_later_is_embedded_as_truetype(evaluation, tmp_path):

@@ -181,12 +181,18 @@ def _looks(evaluation: Evaluation) -> _Looks:
     return {UNFILTERED: unfiltered} | {name: look(i) for i, name in enumerate(others)}
 
 
+def _faintness(evaluation: Evaluation) -> float:
+    """Return the opacity of a band; many bands over each other must leave the lines seen."""
+    return min(0.2, 0.6 / len(evaluation.rows))
+
+
 def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     """Draw median and 5 to 95 % band of h, as long as half of the episodes are under way.
 
     Later quantiles would be of the survivors, and jump when one ends.
     """
     lowest = highest = last = 0.0
+    faint = _faintness(evaluation)
     for row in evaluation.rows:
         name = row.filter
         h = evaluation.trajectories[name].barrier
@@ -194,7 +200,7 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
         time = np.arange(len(h)) * evaluation.problem.dt
         low, median, high = np.nanquantile(h, (0.05, 0.5, 0.95), axis=1)
         color = looks[name]["color"]
-        axes.fill_between(time, low, high, color=color, alpha=0.09, linewidth=0)
+        axes.fill_between(time, low, high, color=color, alpha=faint / 2, linewidth=0)
         axes.plot(time, np.stack([low, high], axis=1), color=color, linewidth=0.4, alpha=0.6)
         label = f"{plain(name, 200)}: {percent(row.safety_rate)} safe"
         axes.plot(time, median, **looks[name], linewidth=1.5, label=label)
@@ -216,11 +222,12 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
 
 def _draw_curve(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     """Draw the rate of episodes that are safe so far, with its band, up to the last violation."""
+    faint = _faintness(evaluation)
     for row in evaluation.rows:
         curve = row.curve
         look_of = looks[row.filter]
         low, rate, high = (100 * np.array(v) for v in (curve.ci_low, curve.rate, curve.ci_high))
-        axes.fill_between(curve.time, low, high, color=look_of["color"], alpha=0.2, linewidth=0)
+        axes.fill_between(curve.time, low, high, color=look_of["color"], alpha=faint, linewidth=0)
         axes.plot(curve.time, rate, **look_of, linewidth=1.4)
         axes.set_xlim(right=max(axes.get_xlim()[1], curve.time[curve.safe.index(curve.safe[-1])]))
     lowest = min(row.curve.ci_low[-1] for row in evaluation.rows)

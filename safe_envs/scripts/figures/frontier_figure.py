@@ -20,6 +20,7 @@ from safe_envs.scripts.figures.style import (
     WARM,
     add_legend,
     add_title,
+    mark_of,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 
@@ -73,7 +74,7 @@ def figure_of(found: Frontier, title: str, size: str = DEFAULT_SIZE) -> StyledFi
             others += not nominal
             marks = {"filter": _FILTERS, "best": _BEST}.get(point.kind, _POLICIES)
             turn = drawn[point.kind] = drawn.get(point.kind, -1) + 1
-            _draw_point(axes, point, color, marks[turn % len(marks)], point.name)
+            _draw_point(axes, point, color, mark_of(turn, marks), point.name)
         for i, point in enumerate(found.attained):
             label = None if i else "policies of the curve, simulated"
             _draw_point(axes, point, QUIET, ".", label)

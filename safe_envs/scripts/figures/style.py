@@ -34,6 +34,9 @@ STYLE: Any = {
     **{name: each for name, each in mpl.rcParamsDefault.items() if name not in _OF_MACHINE},
     "font.family": "DejaVu Sans",
     "mathtext.fontset": "dejavusans",
+    # Hinted letters are up to 8 % narrower or wider at a screen's resolution, at which texts are
+    # measured, than in print.
+    "text.hinting": "no_hinting",
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.labelsize": 8,
@@ -81,6 +84,9 @@ SMALL = 7.0
 """Size of the smallest letters, in points."""
 
 _MOST_COLUMNS = 4
+_LEGEND_HEIGHT = 0.6
+"""In inches, of a legend with three lines: the figure grows by what a taller one needs."""
+
 _MARGIN = 0.1
 """In inches, at both sides of the titles and legends together."""
 
@@ -89,6 +95,16 @@ def look(i: int) -> dict[str, Any]:
     """Return colour and dashes of the i-th line; no two of the first 36 are alike."""
     turn, place = divmod(i, len(COLORS))
     return {"color": COLORS[place], "linestyle": DASHES[(place + turn) % len(DASHES)]}
+
+
+def mark_of(i: int, marks: Sequence[str] = MARKERS) -> str:
+    """Return the mark of the i-th line or point, another one where its colour comes again.
+
+    Args:
+        i: place among the lines or points.
+        marks: to choose from.
+    """
+    return marks[(i + i // len(COLORS)) % len(marks)]
 
 
 def wrapped(figure: Figure, text: str, size: float, room: float | None = None) -> str:
@@ -142,7 +158,7 @@ def add_title(figure: Figure, text: str) -> None:
 
 
 def add_legend(figure: Figure, handles: Sequence[Any], most: int = _MOST_COLUMNS) -> None:
-    """Add a legend below the panels, in as many columns as fit.
+    """Add a legend below the panels, in as many columns as fit; a tall one makes the figure taller.
 
     Args:
         figure: with the panels.
@@ -152,14 +168,17 @@ def add_legend(figure: Figure, handles: Sequence[Any], most: int = _MOST_COLUMNS
     size = mpl.rcParams["legend.fontsize"]
     for columns in range(min(len(handles), most), 0, -1):
         legend = _legend(figure, handles, columns)
-        if legend.get_window_extent().width <= figure.bbox.width:
-            return
+        if legend.get_window_extent().width <= figure.bbox.width - _MARGIN * figure.dpi:
+            break
         legend.remove()
-    # The handle and the borders take room, too.
-    room = figure.get_figwidth() - (mpl.rcParams["legend.handlelength"] + 3.0) * size / 72.0
-    for handle in handles:
-        handle.set_label(wrapped(figure, handle.get_label(), size, room))
-    _legend(figure, handles, 1)
+    else:
+        # The handle and the borders take room, too.
+        room = figure.get_figwidth() - (mpl.rcParams["legend.handlelength"] + 4.0) * size / 72.0
+        for handle in handles:
+            handle.set_label(wrapped(figure, handle.get_label(), size, room))
+        legend = _legend(figure, handles, 1)
+    more = legend.get_window_extent().height / figure.dpi - _LEGEND_HEIGHT
+    figure.set_figheight(figure.get_figheight() + max(more, 0.0))
 
 
 def _legend(figure: Figure, handles: Sequence[Any], columns: int) -> Any:

@@ -21,13 +21,13 @@ from safe_envs.scripts.figures.labels import labelled, plain, symbol
 from safe_envs.scripts.figures.saving import save
 from safe_envs.scripts.figures.style import (
     COLORS,
-    DASHES,
-    MARKERS,
     STYLE,
     UNFILTERED_DASHES,
     WARM,
     add_legend,
     add_title,
+    look,
+    mark_of,
     wrapped,
 )
 from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
@@ -35,6 +35,12 @@ from safe_envs.scripts.options.figure_options import DEFAULT_SIZE, width_of
 _SEED = "seed"
 _MOST_PANELS = 12
 _COLUMNS = {"single": 1, "double": 3}
+
+_SHARE_OF_PANEL = 0.75
+"""Of its width, without the labels at its side and some room between values."""
+
+_LONGEST_LABEL = 2.0
+"""In inches."""
 
 Row = dict[str, Any]
 Rate = tuple[float, float, float]
@@ -141,6 +147,8 @@ def figure_of(rows: Sequence[Row], layout: Layout, size: str = DEFAULT_SIZE) -> 
             room = 0.85 * width / columns
             axes.set_title(wrapped(figure, title, mpl.rcParams["axes.titlesize"], room))
             axes.set_ylabel(labelled("safe", "%") if k % columns == 0 else "")
+        if layout.x is not None and not _is_numeric(rows, layout.x):
+            _turn_labels(figure, grid, width / columns)
         handles, labels = grid.flat[0].get_legend_handles_labels()
         if labels:
             add_legend(figure, handles)
@@ -170,8 +178,8 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
         unfiltered = kind == UNFILTERED
         style = {
             "color": WARM if unfiltered else colors[k % len(colors)],
-            "linestyle": UNFILTERED_DASHES if unfiltered else DASHES[k % len(DASHES)],
-            "marker": MARKERS[k % len(MARKERS)],
+            "linestyle": UNFILTERED_DASHES if unfiltered else look(k)["linestyle"],
+            "marker": mark_of(k),
         }
         label = None if layout.lines is None else _text(kind)
         if layout.lines not in (None, "filter"):
@@ -187,6 +195,27 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
             list(position.values()), ["" if layout.x is None else _text(place) for place in places]
         )
     axes.set_ylim(-3, 103)
+
+
+def _turn_labels(figure: Figure, grid: np.ndarray, room: float) -> None:
+    """Write the values across upwards where they do not fit next to each other.
+
+    Args:
+        figure: of the panels, which grows by the length of the values.
+        grid: of the panels.
+        room: width in inches of a panel, with the labels at its side.
+    """
+    shown = [axes for axes in grid.flat if axes.get_visible()]
+    labels = [label for axes in shown for label in axes.get_xticklabels()]
+    widest = max(label.get_window_extent().width for label in labels) / figure.dpi
+    if widest <= _SHARE_OF_PANEL * room / max(len(axes.get_xticks()) for axes in shown):
+        return
+    size = mpl.rcParams["xtick.labelsize"]
+    for axes in shown:
+        texts = [label.get_text() for label in axes.get_xticklabels()]
+        texts = [wrapped(figure, text, size, _LONGEST_LABEL) for text in texts]
+        axes.set_xticks(axes.get_xticks(), texts, rotation=90)
+    figure.set_figheight(figure.get_figheight() + len(grid) * min(widest, _LONGEST_LABEL))
 
 
 def _shades(count: int) -> list[Any]:

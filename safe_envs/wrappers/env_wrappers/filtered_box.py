@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer
 
 _POINTS = 9
@@ -25,7 +26,15 @@ def filtered_box(space: Any, inner: Any) -> Any:
     Args:
         space: of one env below the filter; where no straight line fits, it is returned as it is.
         inner: layer below the filter that shows the state.
+
+    Raises:
+        ConfigurationError: the space is no Box: a wrapper below changed the actions.
     """
+    if not isinstance(space, gym.spaces.Box):
+        raise ConfigurationError(
+            f"the env below the filter takes actions of {space}, and a filter decides on those of a"
+            " Box; put wrappers that change actions around the filter"
+        )
     if not isinstance(inner, MonitorLayer):
         return _with_ends(space, *np.array(inner.problem.box).T)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)

@@ -156,11 +156,19 @@ class FilterLayer(IndependentCopies):
             Observation, reward, terminated, truncated and info.
 
         Raises:
-            ConfigurationError: A wrapper below changed the action.
+            ConfigurationError: A wrapper below changed the action, or made another number of steps
+                than one.
         """
         if directly:
             return self._inner.step_physical(decided)
+        episode = self._episodes
+        before = episode.steps
         found = env.step(self._inner.normalized_action(decided))
+        if isinstance(episode, Episode) and episode.steps != before + 1:
+            raise ConfigurationError(
+                f"a wrapper below the filter repeats steps, or starts episodes by itself: {self}."
+                " Put it around the filter"
+            )
         direct = self._inner.problem.direct
         arrived = self._inner.executed if direct else self._inner.sent
         for u, v, t in zip(decided, arrived, self._tolerance, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,18 +12,12 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function, stacked
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
-from safe_envs.errors import InvalidInputError, NumericalError, SystemDefinitionWarning
+from safe_envs.errors import InvalidInputError, NumericalError
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-
-_CHANGE_SIGHT = (
-    gym.ObservationWrapper,
-    gym.wrappers.NormalizeObservation,
-    gym.wrappers.FrameStackObservation,
-)
-"""Wrappers that change observations."""
+from safe_envs.wrappers.env_wrappers.layers_below import doubt_layers
 
 
 class MonitorLayer(IndependentCopies):
@@ -173,27 +166,6 @@ class SafetyMonitor(
         if not math.isfinite(h):
             raise _undefined(self.problem.name, self._x)
         return self._episode.count(barrier, h)
-
-
-def doubt_layers(env: gym.Env[Any, Any]) -> None:
-    """Warn of wrappers between a filter and its env that change what it sees or does."""
-    layer = env
-    while isinstance(layer, gym.Wrapper):
-        sees = (
-            isinstance(layer, _CHANGE_SIGHT)
-            or layer.observation_space != layer.env.observation_space
-        )
-        acts = isinstance(layer, gym.ActionWrapper) or layer.action_space != layer.env.action_space
-        if sees or acts:
-            part = "state_fn" if sees else "action_map"
-            warnings.warn(
-                f"{type(layer).__name__} lies between the filter and the env and changes"
-                f" {'observations' if sees else 'actions'}: unless {part} undoes that, the filter"
-                " keeps something else safe. Put wrappers around the filter",
-                SystemDefinitionWarning,
-                stacklevel=4,
-            )
-        layer = layer.env
 
 
 def _undefined(name: str, x: Sequence[float]) -> NumericalError:

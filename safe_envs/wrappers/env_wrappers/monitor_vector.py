@@ -16,7 +16,8 @@ from safe_envs.errors import InvalidInputError
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.autoreset import autoreset_mode
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer, barrier_table, doubt_layers
+from safe_envs.wrappers.env_wrappers.layers_below import doubt_layers
+from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer, barrier_table
 
 
 class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
@@ -41,8 +42,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
     def __init__(self, env: gym.vector.VectorEnv, spec: FilterSpec | str) -> None:
         gym.vector.VectorWrapper.__init__(self, env)
         spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
-        for layer in getattr(env.unwrapped, "envs", [])[:1]:
-            doubt_layers(layer)
+        doubt_layers(env)
         self.watch(spec, _one_of(env), env.single_action_space, "arrays", self.num_envs)
         self._mode = autoreset_mode(env)
         self.executed: Components = ()

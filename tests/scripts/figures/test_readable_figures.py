@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache, partial
+from pathlib import Path
 from unittest import mock
 
 import matplotlib as mpl
@@ -129,6 +130,26 @@ def test_equal_figures_are_equal_files_with_truetype_fonts(tmp_path):
     for suffix in ("ps", "eps"):
         assert b"/FontType 42" in found[suffix]
         assert b"/FontType 3" not in found[suffix]
+
+
+@pytest.mark.parametrize("kind", ["evaluation", "verification", "best", "frontier", "log"])
+def test_a_figure_that_is_written_twice_is_the_same_file(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    figure = figure_of(kind, "double")
+    engine = figure.get_layout_engine()
+    # The layout of one format must not be where that of the next begins.
+    first = [written(figure, tmp_path / f"first.{suffix}") for suffix in ("png", "svg", "pdf")]
+    again = [written(figure, tmp_path / f"again.{suffix}") for suffix in ("png", "svg", "pdf")]
+    assert first == again
+    figure.savefig(tmp_path / "own.svg")
+    assert (tmp_path / "own.svg").read_bytes() == first[1]
+    assert figure.get_layout_engine() is engine
+    assert all(axes.get_in_layout() for axes in figure.axes)
+
+
+def written(figure: Figure, path: Path) -> bytes:
+    saving.save(figure, path)
+    return path.read_bytes()
 
 
 def test_a_pdf_of_a_command_embeds_truetype_fonts(tmp_path, monkeypatch):

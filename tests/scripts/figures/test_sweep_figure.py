@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,9 @@ import pytest
 
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.scripts.figures import sweep_figure
-from safe_envs.scripts.figures.sweep_figure import Layout, _rate, draw
+from safe_envs.scripts.figures.sweep_figure import Layout, _rate, draw, figure_of
+from safe_envs.scripts.options.figure_options import WIDTHS
+from tests.readable import figure_texts, unreadable
 
 pytestmark = pytest.mark.slow
 
@@ -106,3 +109,38 @@ def test_panels_without_room_are_counted(tmp_path: Path, monkeypatch: pytest.Mon
     assert draw(ROWS, layout, tmp_path / "rates.svg") == 5
     assert "filter = none, seed = 2" in (text := (tmp_path / "rates.svg").read_text())
     assert "seed = 3" not in text
+
+
+MANY = {
+    "short": ["none", "scbf", "cbf", "rcbf", "srcbf", "hocbf:p=1", "hocbf:p=22", "promise:p=0.99"],
+    "long": ["none", *(f"hocbf:p={k},8,sampling_margin=true,a_long_name={k}" for k in range(7))],
+}
+
+
+@pytest.mark.parametrize("size", list(WIDTHS))
+@pytest.mark.parametrize("names", list(MANY))
+@pytest.mark.parametrize("swept", [("filter",), ("filter", "noise"), ("filter", "noise", "dt")])
+def test_eight_filters_can_be_read_and_told_apart(names: str, swept: tuple[str, ...], size: str):
+    values = {"filter": MANY[names], "noise": [0.1, 0.2, 0.3], "dt": [0.1, 0.2]}
+    rows = rows_of(**{name: values[name] for name in swept})
+    figure, _ = figure_of(rows, Layout.of(rows, swept), size)
+    assert unreadable(*figure_texts(figure)) == []
+    heights = [axes.get_position().height * figure.get_figheight() for axes in figure.axes]
+    assert min(heights) > 0.8
+    if len(swept) > 1:
+        looks = {
+            (line.get_color(), str(line.get_linestyle()), line.get_marker())
+            for line in figure.axes[0].get_lines()
+        }
+        assert len(looks) == len(MANY[names])
+
+
+@pytest.mark.parametrize("size", list(WIDTHS))
+def test_cells_without_a_rate_leave_a_gap(size: str):
+    rows = rows_of(filter=MANY["short"], noise=[0.1, 0.2, 0.3])
+    for row in rows:
+        if row["filter"] == "cbf" or row["noise"] == 0.2:
+            row |= dict.fromkeys(("safety_rate", "ci_low", "ci_high"), math.nan)
+    rows = [row for row in rows if row["filter"] != "scbf" or row["noise"] == 0.1]
+    figure, _ = figure_of(rows, Layout.of(rows, ("filter", "noise")), size)
+    assert unreadable(*figure_texts(figure)) == []

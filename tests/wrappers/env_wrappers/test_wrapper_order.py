@@ -83,9 +83,17 @@ ACTIONS: dict[str, Wrap] = {
     "RescaleAction": rescaled,
     "ClipAction": wrappers.ClipAction,
     "StickyAction": lambda env: wrappers.StickyAction(env, 0.5),
-    "MaxAndSkipObservation": lambda env: wrappers.MaxAndSkipObservation(env, 2),
+    "DiscretizeAction": lambda env: wrappers.DiscretizeAction(env, 5),
 }
-"""Wrappers that change actions, or how long they act."""
+"""Wrappers that change actions."""
+
+REPEATS: dict[str, Wrap] = {
+    "MaxAndSkipObservation": lambda env: wrappers.MaxAndSkipObservation(env, 2),
+    "RepeatAction": lambda env: wrappers.RepeatAction(env, 2),
+}
+"""Wrappers that change how long actions act."""
+
+RESET = "Autoreset"
 
 VECTORS: dict[str, Wrap] = {
     "VecNormalize": VecNormalize,
@@ -109,8 +117,27 @@ def test_sticky_actions_above_the_filter_are_filtered_in_every_period(made: Any)
 
 
 @pytest.mark.parametrize("made", [own, third_party])
-def test_skipped_frames_above_the_filter_are_filtered_in_every_period(made: Any):
-    env = ACTIONS["MaxAndSkipObservation"](made())
+def test_discrete_actions_above_the_filter_are_filtered(made: Any):
+    env = ACTIONS["DiscretizeAction"](made())
+    env.reset(seed=0)
+    found = [env.step(env.action_space.n - 1)[-1]["safe_action"] for _ in range(STEPS)]
+    # The last of five equal parts of the range is represented by its middle.
+    np.testing.assert_array_equal(found, executed(made(), share=0.8))
+
+
+@pytest.mark.parametrize("made", [own, third_party])
+def test_an_env_that_resets_itself_above_the_filter_begins_new_episodes(made: Any):
+    env = wrappers.Autoreset(wrappers.TimeLimit(made(), 3))
+    kept = [info.get("episode_cost") for info in steps(env, count=3)]
+    *_, info = env.step(env_high(env))
+    assert len(kept) == 3
+    assert info["episode_interventions"] == 0
+
+
+@pytest.mark.parametrize("name", REPEATS)
+@pytest.mark.parametrize("made", [own, third_party])
+def test_skipped_frames_above_the_filter_are_filtered_in_every_period(name: str, made: Any):
+    env = REPEATS[name](made())
     *_, last = steps(env, count=STEPS // 2)
     *_, expected = steps(made())
     assert last["episode_interventions"] == expected["episode_interventions"]
@@ -127,6 +154,31 @@ def test_below_the_filter_of_an_env_of_this_project_observations_do_not_matter(n
 def test_below_the_filter_of_an_env_of_this_project_changed_actions_are_an_error(name: str):
     with pytest.raises(ConfigurationError, match="changed the safe action"):
         executed(own(ACTIONS[name]))
+
+
+@pytest.mark.parametrize("name", REPEATS)
+def test_below_the_filter_of_an_env_of_this_project_repeated_actions_are_an_error(name: str):
+    with pytest.raises(ConfigurationError, match="below the filter repeats steps"):
+        executed(own(REPEATS[name]))
+
+
+def test_below_the_filter_an_env_that_resets_itself_is_an_error():
+    env = own(lambda env: wrappers.Autoreset(wrappers.TimeLimit(env, 3)))
+    *_, _ = steps(env, count=3)
+    with pytest.raises(ConfigurationError, match="starts episodes by itself"):
+        env.step(np.zeros(1))
+    with pytest.raises(ConfigurationError, match="starts episodes of which the filter"):
+        third_party(wrappers.Autoreset)
+
+
+def test_below_the_filter_discrete_actions_are_refused():
+    with pytest.raises(ConfigurationError, match="those of a Box"):
+        own(ACTIONS["DiscretizeAction"])
+    with (
+        pytest.warns(SystemDefinitionWarning, match="unless action_map undoes that"),
+        pytest.raises(ConfigurationError, match="bounded Box"),
+    ):
+        third_party(ACTIONS["DiscretizeAction"])
 
 
 def test_below_the_filter_clipping_does_nothing_or_is_refused():
@@ -166,7 +218,13 @@ def test_below_the_filter_of_a_third_party_env_changed_actions_are_executed_unfi
     with pytest.warns(SystemDefinitionWarning, match="unless action_map undoes that"):
         sticky = third_party(ACTIONS["StickyAction"])
     assert not np.array_equal(executed(sticky), executed(third_party()))
-    h_min = min(info["h_min"] for info in steps(third_party(ACTIONS["MaxAndSkipObservation"])))
+
+
+@pytest.mark.parametrize(("name", "periods"), [("MaxAndSkipObservation", 2), ("RepeatAction", 15)])
+def test_below_the_filter_of_a_third_party_env_repeated_actions_are_unsafe(name: str, periods: int):
+    with pytest.warns(SystemDefinitionWarning, match="dt is the time of all repetitions"):
+        repeats = third_party(lambda env: getattr(wrappers, name)(env, periods))
+    h_min = min(info["h_min"] for info in steps(repeats))
     assert h_min < 0.0 <= min(info["h_min"] for info in steps(third_party()))
 
 
@@ -200,4 +258,4 @@ def test_videos_show_the_filtered_episode_from_both_sides(above: bool, tmp_path:
 def test_the_guide_has_these_wrappers_and_no_other():
     table = GUIDE.read_text().split("## Order of wrappers")[1].split("\n## ")[0]
     named = set(re.findall(r"`([A-Za-z]+)`", "".join(re.findall(r"^\| (.*?) \|", table, re.M))))
-    assert named == {*SAME, *SIGHT, *ACTIONS, *VECTORS, VIDEO}
+    assert named == {*SAME, *SIGHT, *ACTIONS, *REPEATS, RESET, *VECTORS, VIDEO}

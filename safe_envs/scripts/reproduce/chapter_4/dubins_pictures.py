@@ -42,7 +42,8 @@ def draw_noises(figure: Figure, outcome: Findings) -> None:
             curve = data["curves"][kind][name]
             ends = [curve[key] for key in ("low", "rate", "high")]
             draw_interval(right, curve["time"], ends, color, 0.15, dashes)
-        left.plot([], [], dashes, color="black", label=kind)
+        label = kind.replace("A h > 0", r"$\mathcal{A} h > 0$")
+        left.plot([], [], dashes, color="black", label=label)
     further = np.array(data["further"]).T
     draw_interval(left, data["beyond"], further, _COLOR["SCBF"], 0.15, **dots)
     cross: dict[str, Any] = {"marker": "x", "markersize": 4}
