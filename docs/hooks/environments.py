@@ -17,7 +17,7 @@ from PIL import Image
 from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.agents import NominalController
 from safe_envs.dynamics.lie import relative_degree
-from safe_envs.rendering.style import PANEL, SCENE
+from safe_envs.rendering.style import SCENE
 from safe_envs.wrappers import SafetyFilterWrapper
 
 _SHOWN, _MOST_STEPS = 0.4, 400
@@ -215,12 +215,12 @@ def _picture(env: Any) -> tuple[np.ndarray, str]:
 
 
 def _stacked(frame: np.ndarray) -> np.ndarray:
-    """Return a frame with its panel below the scene, for narrow screens."""
+    """Return a frame with its panel below the scene, as wide, for narrow screens."""
     width = round(SCENE[2])
-    scene, panel = frame[:, :width], frame[:, width:]
-    rest = np.full((len(panel), width - panel.shape[1], 3), PANEL, dtype=np.uint8)
-    half = rest.shape[1] // 2
-    return np.vstack([scene, np.hstack([rest[:, :half], panel, rest[:, half:]])])
+    scene, panel = frame[:, :width], Image.fromarray(frame[:, width:])
+    # Letters of the panel are as large on a phone as on a desktop.
+    size = width, round(panel.height * width / panel.width)
+    return np.vstack([scene, np.asarray(panel.resize(size, Image.Resampling.LANCZOS))])
 
 
 def _written(frame: np.ndarray) -> bytes:

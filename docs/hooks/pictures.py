@@ -30,7 +30,7 @@ WIDE, NARROW = (1, 2), (2, 1)
 """Parts of a picture from top to bottom and from left to right, on a desktop and on a phone."""
 
 _GRID = 241
-_EPISODES = 1000
+_EPISODES = 500
 _HORIZON = 10.0
 """In s, of the picture of the bounds: long enough for a bound to decrease to zero."""
 
