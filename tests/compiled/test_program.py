@@ -212,7 +212,7 @@ def test_engines_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigurationError, match="did you mean 'numpy'"):
         require_engine("nmpy")
     monkeypatch.setattr(program.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigurationError, match=r"needs Numba.*safe-envs\[fast\]"):
+    with pytest.raises(ConfigurationError, match=r'needs Numba.*editable "\.\[fast\]"'):
         small().compiled()
 
 

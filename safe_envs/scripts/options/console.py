@@ -278,10 +278,10 @@ def _usage_text(error: Any) -> str:
 
 
 def _fail(message: str) -> NoReturn:
-    colour = False if os.environ.get("NO_COLOR") else None
-    title = typer.style("Error:", fg="red", bold=True)
-    text = typer.style(visible(shortened(message.strip(), _LONGEST), keep="\u00a0"), fg="red")
-    typer.echo(f"{title} {text}", err=True, color=colour)
+    parts = shortened(message.strip(), _LONGEST).split("\n  ")  # a list of failures
+    text = "\n  ".join(visible(part, keep="\u00a0") for part in parts)
+    title, text = typer.style("Error:", fg="red", bold=True), typer.style(text, fg="red")
+    typer.echo(f"{title} {text}", err=True, color=False if os.environ.get("NO_COLOR") else None)
     sys.exit(2)
 
 

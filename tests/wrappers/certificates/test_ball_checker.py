@@ -13,7 +13,7 @@ from tests.wrappers.certificates.examples import FALSE, TRUE, UNDECIDED
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "flint", None)
-    with pytest.raises(ConfigurationError, match=r"safe-envs\[proofs\]"):
+    with pytest.raises(ConfigurationError, match=r'editable "\.\[proofs\]"'):
         check_with_balls(TRUE["a line"])
 
 
