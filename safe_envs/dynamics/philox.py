@@ -24,6 +24,7 @@ EPISODE = 4
 PILOTS = 5
 SPLIT = 6
 DRIFTING = 7
+SENSOR = 8
 
 Key = tuple[int, int]
 """The two words of a key, each below 2**64."""
@@ -73,7 +74,7 @@ class StreamReader:
         Args:
             key: of the seed, see `key_of`.
             episode: its number, from 0.
-            purpose: `NOISE`, `START`, `BRIDGE`, `POLICY` or `EPISODE`.
+            purpose: `NOISE`, `START`, `BRIDGE`, `POLICY`, `EPISODE` or `SENSOR`.
             word: index of the word that is read next, from 0.
         """
         block, lane = divmod(word, _LANES)

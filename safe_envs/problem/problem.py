@@ -22,6 +22,7 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.problem.option_errors import require_bounds, require_period, unknown_start
 from safe_envs.problem.options import ProblemOptions, noise_levels
 from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
@@ -71,6 +72,9 @@ class SafetyProblem:
         rates: bounds of the rates of inputs that have become states, see
             `safe_envs.problem.rate_limits`; () without.
         backup: laws that bring the system to a set that is safe for good, if any; see `Backup`.
+        sensors: channels of a realistic sensor; () for one derived from the features.
+        measurement: what is measured of the state, which is the observation then; None for an
+            observation of the features without any error.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -105,6 +109,8 @@ class SafetyProblem:
     slew_limit: Limits = ()
     rates: Limits = ()
     backup: BackupSource | None = None
+    sensors: tuple[Channel, ...] = ()
+    measurement: Measurement | None = None
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -156,6 +162,8 @@ class SafetyProblem:
         if self.frame is not None:
             self.frame.require_known(plant)
         require_backup(self.backup, plant)
+        if self.measurement is not None:
+            self.measurement.require_known(plant)
         for i in self.inputs:
             require_bounds(i.symbol.name, i.low, i.high)
         self._check_timing()
