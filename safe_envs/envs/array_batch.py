@@ -14,6 +14,7 @@ from safe_envs.envs.info import VectorStep
 from safe_envs.envs.noise import NoiseStreams
 from safe_envs.envs.reset_options import StartingPoints
 from safe_envs.envs.seeding import EpisodeStreams
+from safe_envs.envs.sensor import batch_sensor_of
 from safe_envs.envs.simulation import Simulation, require_sound
 from safe_envs.envs.spaces import BatchActions, observation_box
 from safe_envs.problem.problem import SafetyProblem
@@ -28,6 +29,7 @@ class ArrayBatch:
         executed: components of those that were executed in it; see `SafeEnv`.
         actuators: between the two; None where they are the same.
         noise: that drives the states.
+        sensor: what measures the states; None where the observation is of the true ones.
 
     Args:
         problem: what to simulate.
@@ -50,21 +52,24 @@ class ArrayBatch:
             limit,
         )
         self._shape = (streams.num_envs,)
-        self._bounds = observation_box(problem)
+        self._bounds = observation_box(problem.unmeasured)
         self._simulation = Simulation(problem, "arrays")
         self._actions = BatchActions(problem, streams.num_envs)
         self.noise = NoiseStreams(streams, self._simulation.integrator.channels, limit)
+        self.sensor = batch_sensor_of(problem, streams, limit)
         observed = {f.expression for f in problem.features}
         self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return what a batch remembers besides states and counters, in arrays."""
-        return {} if self.actuators is None else self.actuators.snapshot()
+        parts = [part for part in (self.actuators, self.sensor) if part is not None]
+        return {name: value for part in parts for name, value in part.snapshot().items()}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Take it from a snapshot."""
-        if self.actuators is not None:
-            self.actuators.restore(snapshot)
+        for part in (self.actuators, self.sensor):
+            if part is not None:
+                part.restore(snapshot)
 
     def place(self, states: np.ndarray, seeded: Sequence[int]) -> None:
         """Put the envs into states, where their episodes are.
@@ -75,6 +80,9 @@ class ArrayBatch:
         """
         self.components = tuple(np.array(states, dtype=float).T.copy())
         self.noise.seek(seeded, self._episodes.steps[seeded])
+        if self.sensor is not None:
+            # The sample of the present instant has been taken.
+            self.sensor.noise.seek(seeded, self._episodes.steps[seeded] + 1)
 
     def begin(self, envs: np.ndarray, points: StartingPoints | None = None) -> VectorStep:
         """Begin the next episode of some envs, and read all states.
@@ -151,6 +159,8 @@ class ArrayBatch:
         self._episodes.restart(envs, steps)
         if self.actuators is not None:
             self.actuators.restart(envs)
+        if self.sensor is not None:
+            self.sensor.begin(envs, steps)
 
     def _read(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
@@ -175,6 +185,9 @@ class ArrayBatch:
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
         if not sound:
             require_sound(x, h, observation, self._problem)
+        if self.sensor is not None:
+            observation = self.sensor.observe(x, counted)
+            info |= self.sensor.report(x)
         if self._problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
         reward = filled(reward, self._shape).copy()

@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 
 from safe_envs.dynamics.philox import Key, StreamReader, key_of
 from safe_envs.envs.delay_line import Actuators
@@ -16,9 +15,10 @@ from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions
+from safe_envs.envs.sensor import Sample, sensor_of
 from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
-from safe_envs.envs.spec import SystemSpec
+from safe_envs.envs.spec import OwnSpec
 from safe_envs.errors import InvalidInputError, NumericalError, flag
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
@@ -29,7 +29,9 @@ _UNKNOWN = -1
 """Gymnasium's seed of a generator that was set."""
 
 
-class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
+class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
+    OwnSpec, IndependentCopies, gym.Env[np.ndarray, np.ndarray]
+):
     """Any `SafetyProblem` as a Gymnasium env.
 
     Actions are in [-1, 1] for every input and are scaled to the input bounds; what lies beyond is
@@ -72,7 +74,8 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         self.viewer = open_viewer(problem, render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_a_second(problem)}
         self.problem = problem
-        self.observation_space = self._bounds = observation_box(problem)
+        self.observation_space = observation_box(problem)
+        self._bounds = observation_box(problem.unmeasured)
         self.action_space = action_box(problem)
         self.render_mode = render_mode
         self._simulation = Simulation(problem, "floats")
@@ -81,7 +84,6 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
         self._ends_on_violation = flag("terminate_on_violation", terminate_on_violation)
-        self._spec: EnvSpec | None = None
         self._noise = NoiseStream(self._simulation.integrator.channels, self._limit)
         self._reader = StreamReader()
         self._key: Key | None = None
@@ -89,18 +91,10 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         self.sent: Sequence[float] = ()
         self.executed: Sequence[float] = ()
         self._actuators = None if problem.direct else Actuators(problem)
+        self._sensor = sensor_of(problem, self._limit)
         self._x: tuple[float, ...] | None = None
         self._episode = Episode()
         self._reset_options = ResetOptions(problem, self._limit)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """The spec that the env was made of, with the length of its episodes."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, given: EnvSpec | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        self._spec = None if given is None else SystemSpec.of(given, self._limit)
 
     @property
     def episode(self) -> Episode:
@@ -113,6 +107,11 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         if self._x is None:
             raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
         return self._x
+
+    @property
+    def measured(self) -> Sample | None:
+        """What has arrived from the sensor; None where the observation is of the true state."""
+        return None if self._sensor is None else self._sensor.sample
 
     @property
     def state(self) -> np.ndarray:
@@ -243,8 +242,7 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
                 ' render_mode="rgb_array" or "human"'
             )
             return None
-        if self._x is None:
-            raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
+        _ = self.components
         return self.viewer.render()
 
     def close(self) -> None:
@@ -272,6 +270,8 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         self._episode.restart(steps)
         if self._actuators is not None:
             self._actuators.restart()
+        if self._sensor is not None:
+            self._sensor.begin(self._key, self._number, steps)
 
     def _show_start(self) -> None:
         """Let what is drawn begin at the present state."""
@@ -296,5 +296,8 @@ class SafeEnv(IndependentCopies, gym.Env[np.ndarray, np.ndarray]):
         info = episode.count(barriers, h)
         if self._actuators is not None:
             info |= self._actuators.report()
+        if self._sensor is not None:
+            observation = self._sensor.observe(x)
+            info |= self._sensor.report(x)
         unsafe = self._ends_on_violation and h < 0.0
         return observation, reward, left or goal >= 0.0 or unsafe, info

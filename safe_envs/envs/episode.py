@@ -68,6 +68,7 @@ class Episodes:
             another array after each time.
         last_states: with same-step autoreset, the states in which the episodes that ended last did
             so, (num_envs, n); of the other envs anything.
+        last_sample: likewise, what had arrived from their sensors, a `Sample`; None without any.
     """
 
     def __init__(self, num_envs: int) -> None:
@@ -80,6 +81,7 @@ class Episodes:
         self.started = False
         self.placements = np.zeros(num_envs, dtype=np.int64)
         self.last_states = np.empty((num_envs, 0))
+        self.last_sample: Any = None
 
     def due(self) -> np.ndarray | None:
         """Return the envs that the coming step restarts (next-step autoreset); None without any."""

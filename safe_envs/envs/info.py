@@ -41,6 +41,13 @@ and from an env with the option `delay` or `slew_limit`
 
 There a filter's `safe_action` is what it sends, which is executed later.
 
+and from an env with the option `measurement`
+
+| key | type | meaning |
+|---|---|---|
+| `state` | float64 (n,) | true state, by which all else is judged |
+| `received` | bool (k,) | which channels of the sensor reported a sample at this instant |
+
 and with a specification, of the trace of the episode so far
 
 | key | type | meaning |

@@ -26,10 +26,11 @@ class NoiseStream:
     Args:
         channels: numbers in a control period.
         periods: of an episode; nothing is drawn ahead for more.
+        purpose: of the stream, see `safe_envs.dynamics.philox`.
     """
 
-    def __init__(self, channels: int, periods: int) -> None:
-        self._channels, self._periods = channels, periods
+    def __init__(self, channels: int, periods: int, purpose: int = NOISE) -> None:
+        self._channels, self._periods, self._purpose = channels, periods, purpose
         self._reader = StreamReader()
         self.begin((0, 0), 0)
 
@@ -57,7 +58,7 @@ class NoiseStream:
     def _draw(self) -> None:
         left = self._periods - self._drawn
         count = min(left, _CHUNK) if left > 0 else _CHUNK
-        self._reader.seek(self._key, self._episode, NOISE, self._drawn * self._channels)
+        self._reader.seek(self._key, self._episode, self._purpose, self._drawn * self._channels)
         uniforms = self._reader.uniforms((count, self._channels))
         self._rows = standard_normals(uniforms, out=uniforms).tolist()
         self._position = 0
@@ -74,10 +75,14 @@ class NoiseStreams:
         streams: of the envs.
         channels: numbers in a control period.
         periods: of an episode; nothing is drawn ahead for more.
+        purpose: of the streams, see `safe_envs.dynamics.philox`.
     """
 
-    def __init__(self, streams: EpisodeStreams, channels: int, periods: int) -> None:
+    def __init__(
+        self, streams: EpisodeStreams, channels: int, periods: int, purpose: int = NOISE
+    ) -> None:
         self._streams, self._channels, self._periods = streams, channels, periods
+        self._purpose = purpose
         self._chunk = min(_CHUNK, periods)
         # Env i has the slots 2 i and 2 i + 1, one for its episode and one for the beginning of the
         # next; what a slot holds stands at its end.
@@ -227,6 +232,6 @@ class NoiseStreams:
         for i, episode, word, count in zip(
             envs.tolist(), episodes.tolist(), words, counts.tolist(), strict=True
         ):
-            reader.seek(keys[i], episode, NOISE, word).fill(found[first : first + count])
+            reader.seek(keys[i], episode, self._purpose, word).fill(found[first : first + count])
             first += count
         return standard_normals(found, out=found)

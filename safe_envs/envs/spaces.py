@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,17 +11,50 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import Components, constants, finite
 from safe_envs.errors import InvalidInputError
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.validators import real_array
+
+_FAR = 1e6
+"""Bound of what is measured, in its unit, where its range is not known."""
+
+_DEVIATIONS = 10.0
+"""Standard deviations of a sensor that observations leave room for."""
 
 _LOWEST, _HIGHEST = constants((-1.0, 1.0))
 
 
 def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
-    """Return the observation space of a problem: its features within their bounds."""
-    low = np.array([f.low for f in problem.features], dtype=np.float32)
-    high = np.array([f.high for f in problem.features], dtype=np.float32)
-    return gym.spaces.Box(low, high, dtype=np.float32)
+    """Return the observation space of a problem: what is measured, or its features."""
+    if problem.measurement is not None:
+        ends = [channel_bounds(problem, c) for c in problem.measurement.channels]
+    else:
+        ends = [(f.low, f.high) for f in problem.features]
+    low, high = np.array(ends, dtype=np.float32).T
+    return gym.spaces.Box(low.copy(), high.copy(), dtype=np.float32)
+
+
+def channel_bounds(problem: SafetyProblem, channel: Channel) -> tuple[float, float]:
+    """Return bounds of what a channel of the sensor measures.
+
+    Those of a periodic channel are half a period; the others are the ends of what is measured as a
+    state or a feature, or a large number, and its bias and ten standard deviations beyond.
+
+    Args:
+        problem: which is measured.
+        channel: one of its sensor.
+    """
+    if channel.period:
+        return -0.5 * channel.period, 0.5 * channel.period
+    ranges = {f.expression: (f.low, f.high) for f in problem.features}
+    ranges |= {
+        v.symbol: (v.low, v.high)
+        for v in problem.states
+        if math.isfinite(v.low) and math.isfinite(v.high)
+    }
+    low, high = ranges.get(channel.expression, (-_FAR, _FAR))
+    beyond = abs(channel.bias) + _DEVIATIONS * channel.noise
+    return low - beyond, high + beyond
 
 
 def action_box(problem: SafetyProblem) -> gym.spaces.Box:

@@ -87,6 +87,22 @@ class SystemSpec(EnvSpec):
         return min(steps, self.kwargs.get("max_episode_steps") or steps)
 
 
+class OwnSpec:
+    """Base of envs whose spec tells the length of their own episodes, `_limit` periods."""
+
+    _spec: EnvSpec | None = None
+    _limit: int
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The spec that the env was made of, with the length of its episodes."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, given: EnvSpec | None) -> None:
+        self._spec = None if given is None else SystemSpec.of(given, self._limit)
+
+
 def register_system(
     env_id: str, entry_point: str, vector_entry_point: str, **arguments: Any
 ) -> None:

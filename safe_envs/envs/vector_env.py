@@ -19,6 +19,7 @@ from safe_envs.envs.episode import Episodes, last_of_episode
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions, StartingPoints
 from safe_envs.envs.seeding import Seeds
+from safe_envs.envs.sensor import Sample
 from safe_envs.envs.vector_interface import VectorInterface
 from safe_envs.errors import InvalidInputError, flag, require_whole
 from safe_envs.problem.problem import SafetyProblem
@@ -92,6 +93,12 @@ class SafeVectorEnv(VectorInterface):
     def executed(self) -> Sequence[Any]:
         """The components of those that were executed in it; see `SafeEnv`."""
         return self._batch.executed
+
+    @property
+    def measured(self) -> Sample | None:
+        """What has arrived from the sensors; see `SafeEnv.measured`."""
+        sensor = getattr(self._batch, "sensor", None)
+        return None if sensor is None else sensor.sample
 
     @property
     def state(self) -> np.ndarray:
@@ -261,7 +268,7 @@ class SafeVectorEnv(VectorInterface):
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = last_of_episode(ended, observation, info)
-                episodes.last_states = self.state
+                episodes.last_states, episodes.last_sample = self.state, self.measured
                 observation, _, _, _, info = stepper.begin(ended)
             episodes.begun = ended
         else:

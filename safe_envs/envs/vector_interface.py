@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -15,14 +14,16 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.simulation import steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
-from safe_envs.envs.spec import SystemSpec
+from safe_envs.envs.spec import OwnSpec
 from safe_envs.errors import ConfigurationError
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
 
-class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class VectorInterface(
+    OwnSpec, IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
+):
     """Spaces, metadata, spec and seeds of a batch of envs; base of `SafeVectorEnv`.
 
     Attributes:
@@ -52,7 +53,6 @@ class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.nda
         self.render_mode = render_mode
         self._autoreset = _mode(autoreset_mode)
         self._limit = steps_until(problem, max_episode_steps)
-        self._spec: EnvSpec | None = None
         self.problem, self.num_envs = problem, num_envs
         self.metadata = {
             "render_modes": [*RENDER_MODES[1:]],
@@ -65,15 +65,6 @@ class VectorInterface(IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.nda
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._actions = BatchActions(problem, num_envs)
         self._streams = EpisodeStreams(num_envs)
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """The spec that the envs were made of, with the length of their episodes."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, given: EnvSpec | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        self._spec = None if given is None else SystemSpec.of(given, self._limit)
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -24,8 +24,12 @@ def world_source(problem: SafetyProblem, data: Data) -> Source:
         data: receives its numbers.
 
     Raises:
-        NotCompilableError: It has a delay or a slew limit, or filters believe one.
+        NotCompilableError: It has a sensor, a delay or a slew limit, or filters believe a delay.
     """
+    if problem.measurement is not None:
+        raise NotCompilableError(
+            f"{problem.name} has a sensor, whose samples the engine 'numpy' alone simulates"
+        )
     if not problem.direct:
         raise NotCompilableError(
             f"{problem.name} has {problem.actuators}: inputs under way are kept by the engine"

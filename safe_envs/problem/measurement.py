@@ -121,3 +121,19 @@ def default_measurement(problem: Any) -> Measurement:
     return Measurement(
         tuple(Channel(f.name, f.expression, _DEFAULT_NOISE * (f.high - f.low)) for f in features)
     )
+
+
+def require_autonomous(which: str, system: Any) -> None:
+    """Raise SystemDefinitionError for a system with signals or explicit time.
+
+    Args:
+        which: "plant" or "model", for the error.
+        system: a `ControlAffineSDE`.
+    """
+    moves = f"the signals {', '.join(map(str, system.signals))}" if system.signals else "the time"
+    if system.signals or system.uses_time:
+        raise SystemDefinitionError(
+            f"the {which} depends on {moves}, which nothing measures in an env; make each a state,"
+            " with its rate in the drift (1 for the time), or filter in a loop of your own by"
+            " SafetyFilter(system, ...)"
+        )

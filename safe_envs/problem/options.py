@@ -12,6 +12,7 @@ from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number, named_values, numbers
+from safe_envs.problem.measurement_text import read_items
 from safe_envs.problem.option_errors import refused_noise
 
 Reader = Callable[[str, Any], Any]
@@ -38,6 +39,10 @@ def _read_box(option: str, texts: Sequence[str]) -> list[float] | list[list[floa
         if len(pair) != 2:
             raise ConfigurationError(f"{option} {shown(text)} has {len(pair)} numbers; give LO,HI")
     return pairs[0] if len(pairs) == 1 else pairs
+
+
+def _read_measurement(option: str, texts: Sequence[str]) -> list[str]:
+    return read_items(option, texts)
 
 
 def _option(
@@ -83,6 +88,11 @@ class ProblemOptions:
             unaware of them.
         rate_limit: the same as part of the system, whose inputs become states, and their rates
             the inputs: see `safe_envs.problem.rate_limits`.
+        measurement: what is measured of the state, and becomes the observation: "default" for the
+            problem's own sensor, other texts of `safe_envs.problem.measurement_text`, a list of
+            them, standard deviations by name or expression, or a `Measurement`. None for the
+            features without any error.
+        sensor_noise: factor of the standard deviations of all that is measured.
 
     Raises:
         ConfigurationError: A value is of the wrong kind.
@@ -115,6 +125,13 @@ class ProblemOptions:
     rate_limit: Sequence[Any] | None = _option(
         "Bounds of the inputs' rates, which become the inputs.", _read_box, "LO,HI", True
     )
+    measurement: str | Sequence[str] | Mapping[str, Any] | None = _option(
+        "What is measured in place of the state: default, or NAME or expression, noise and more.",
+        _read_measurement,
+        "EXPR:noise=S",
+        True,
+    )
+    sensor_noise: float | None = _option("Factor of the standard deviations of the sensor.")
 
     def __post_init__(self) -> None:
         for name in PARAMETER_GROUPS:
@@ -125,7 +142,7 @@ class ProblemOptions:
                 raise ConfigurationError(
                     f"{name} = {values!r}; give a dictionary of names and values"
                 )
-        for name in ("dt", "horizon"):
+        for name in ("dt", "horizon", "sensor_noise"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, finite_number(name, getattr(self, name)))
 

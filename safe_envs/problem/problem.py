@@ -22,7 +22,8 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.measurement import Channel, Measurement
+from safe_envs.problem.measurement import Channel, Measurement, require_autonomous
+from safe_envs.problem.measurement_text import measurement_of
 from safe_envs.problem.option_errors import require_bounds, require_period, unknown_start
 from safe_envs.problem.options import ProblemOptions, noise_levels
 from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
@@ -121,7 +122,7 @@ class SafetyProblem:
         object.__setattr__(self, "start", self.start or next(iter(self.starts)))
         object.__setattr__(self, "box", tuple((i.low, i.high) for i in self.inputs))
         for which, system in (("plant", plant), ("model", model)):
-            _require_autonomous(which, system)
+            require_autonomous(which, system)
         if (plant.states, plant.inputs) != (model.states, model.inputs):
             raise SystemDefinitionError("plant and model must have the same states and inputs")
         if (
@@ -229,6 +230,11 @@ class SafetyProblem:
         return not (self.delay or self.believed_delay or self.slew_limit)
 
     @property
+    def unmeasured(self) -> SafetyProblem:
+        """The problem without a sensor, whose observation is of the true state."""
+        return self if self.measurement is None else replace(self, measurement=None)
+
+    @property
     def actuators(self) -> str:
         """What lies between the sent and the executed input, in words of the options."""
         slew = "".join(f", slew_limit {low:g},{high:g}" for low, high in self.slew_limit)
@@ -266,6 +272,8 @@ class SafetyProblem:
                 replace(i, low=low, high=high)
                 for i, (low, high) in zip(self.inputs, pairs, strict=True)
             )
+        if given.measurement is not None or given.sensor_noise is not None:
+            changes["measurement"] = measurement_of(self, given.measurement, given.sensor_noise)
         if given.slew_limit is not None:
             changes["slew_limit"] = rate_limits("slew_limit", given.slew_limit, len(self.inputs))
         if given.rate_limit is not None:
@@ -282,14 +290,3 @@ class SafetyProblem:
             changes["starts"] = {**self.starts, "given": Start.given(self.states, start)}
             changes["start"] = "given"
         return replace(self, **changes)
-
-
-def _require_autonomous(which: str, system: ControlAffineSDE) -> None:
-    """Raise SystemDefinitionError for a system with signals or explicit time."""
-    moves = f"the signals {', '.join(map(str, system.signals))}" if system.signals else "the time"
-    if system.signals or system.uses_time:
-        raise SystemDefinitionError(
-            f"the {which} depends on {moves}, which nothing measures in an env; make each a state,"
-            " with its rate in the drift (1 for the time), or filter in a loop of your own by"
-            " SafetyFilter(system, ...)"
-        )

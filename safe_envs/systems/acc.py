@@ -12,6 +12,7 @@ from safe_envs.problem.backup import BackupFunction
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
@@ -126,6 +127,11 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
             Variable(x_2, 0.0, 50.0, "m/s"),
             Variable(x_3, 0.0, 1000.0, "m"),
         ),
+        sensors=(
+            Channel("own_speed", x_1, 0.1),
+            Channel("relative_speed", x_2 - x_1, 0.25),
+            Channel("gap", x_3, 0.5),
+        ),
         starts={"thesis": Start.at((15.0, LEAD_SPEED, 150.0))},
         dt=0.05,
         horizon=100.0,
@@ -192,6 +198,11 @@ class ACC(SystemEnv):
 
     ## Mismatch
     None.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: a radar: the relative
+    speed $x_2 - x_1$ with a standard deviation of .25 m/s, and the gap with .5 m; the own speed
+    with .1 m/s.
 
     ## Backup
     `brake`: full braking until the car is slower than its lead, then it keeps its speed. The

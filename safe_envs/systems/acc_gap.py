@@ -10,6 +10,7 @@ from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.backup import BackupFunction
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
@@ -85,6 +86,7 @@ def acc_gap(
             Feature("z", z, 0.0, 500.0),
             Feature("closeness", _CLOSENESS, 0.0, 1.0),
         ),
+        sensors=(Channel("own_speed", v, 0.1), Channel("gap", z, 0.5)),
         starts={"thesis": Start.at((10.0, 15.0))},
         dt=0.01,
         horizon=30.0,
@@ -140,6 +142,10 @@ class ACCGap(SystemEnv):
 
     ## Mismatch
     None.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: the own speed with a
+    standard deviation of .1 m/s, and the distance with .5 m.
 
     ## Backup
     `brake`: full braking until the car is slower than its lead, then it keeps its speed. The

@@ -12,6 +12,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
@@ -50,6 +51,7 @@ def _problem(name: str, *, system: ControlAffineSDE, **rest: Any) -> SafetyProbl
         plant=system,
         model=system,
         inputs=(Variable(u, -10.0, 10.0, "1/s"),),
+        sensors=(Channel("x_1", x_1, 0.05), Channel("x_2", x_2, 0.05)),
         dt=0.01,
         filter="scbf",
         gains=(2.0,),
@@ -158,6 +160,10 @@ class CubicSDE(SystemEnv):
     None by default. The thesis takes the diffusion as unknown: `model={"k": 0.0}` is a designer who
     neglects it.
 
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: both states with a
+    standard deviation of .05.
+
     ## Reward
     $$exp(-x_1^2 - x_2^2)$$
 
@@ -223,6 +229,10 @@ class CubicSDEDisk(SystemEnv):
 
     ## Mismatch
     None by default.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: both states with a
+    standard deviation of .05.
 
     ## Reward
     $$exp(-4 (h/r^2)^2)$$

@@ -12,11 +12,22 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import positive, uniform_box
-from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, turn_rate_towards, vehicle, x, y
+from safe_envs.systems.dubins import (
+    HEADING,
+    POSE_SENSORS,
+    SHOWN,
+    omega,
+    theta,
+    turn_rate_towards,
+    vehicle,
+    x,
+    y,
+)
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
 
@@ -91,6 +102,20 @@ def separation(x_i: sp.Expr, y_i: sp.Expr, distance: float) -> sp.Expr:
     return (x - x_i) ** 2 + (y - y_i) ** 2 - distance**2
 
 
+def obstacle_sensors(x_i: sp.Expr, y_i: sp.Expr, suffix: str = "") -> tuple[Channel, Channel]:
+    """Return the range of an obstacle and its bearing, as a radar of the vehicle measures them.
+
+    Args:
+        x_i: of the obstacle, in m.
+        y_i: of the obstacle, in m.
+        suffix: of the names.
+    """
+    return (
+        Channel(f"range{suffix}", sp.sqrt((x_i - x) ** 2 + (y_i - y) ** 2), 0.1),
+        Channel(f"bearing{suffix}", sp.atan2(y_i - y, x_i - x) - theta, 0.05, period=2.0 * math.pi),
+    )
+
+
 def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
     """Build the problem of reaching a goal past an obstacle.
 
@@ -123,6 +148,7 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
             Feature("ahead_x", x_o - x, -11.0, 25.0),
             Feature("ahead_y", y_o - y, -10.0, 10.0),
         ),
+        sensors=(*POSE_SENSORS, *obstacle_sensors(x_o, y_o)),
         starts={
             "spread": uniform_box((*_START, *_OBSTACLE_START), (0.5, 0.5, 0.5, 0.0, 0.0)),
             "thesis": Start.at((*_START, *_OBSTACLE_START)),
@@ -183,6 +209,11 @@ class DubinsObstacle(SystemEnv):
     ## Mismatch
     The plant has $v = .8$ m/s, the model $v = .5$ m/s; both know the speed of the obstacle, $v_o =
     .5$ m/s.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: position with a standard
+    deviation of .05 m and heading with .05 rad, known modulo 2 pi, range of the obstacle with
+    .1 m and its bearing from the heading with .05 rad.
 
     ## Reward
     The cosine of the angle between heading and goal at each step, in $[-1, 1]$, which is the

@@ -13,8 +13,16 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import positive, uniform_box
-from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, x, y
-from safe_envs.systems.dubins_obstacle import separation, v_o, vehicle_among, way_to, x_o, y_o
+from safe_envs.systems.dubins import HEADING, POSE_SENSORS, SHOWN, omega, theta, x, y
+from safe_envs.systems.dubins_obstacle import (
+    obstacle_sensors,
+    separation,
+    v_o,
+    vehicle_among,
+    way_to,
+    x_o,
+    y_o,
+)
 
 _GOAL = (1.4, 1.0)
 _GATE, _GATE_RADIUS = (-0.6, 1.1), 0.4
@@ -51,6 +59,7 @@ def dubins_reach(*, radius: float = 0.4) -> SafetyProblem:
             Feature("ahead_x", x_o - x, -7.0, 7.0),
             Feature("ahead_y", y_o - y, -7.0, 7.0),
         ),
+        sensors=(*POSE_SENSORS, *obstacle_sensors(x_o, y_o)),
         starts={
             "spread": uniform_box((*_START, *_OBSTACLE_START), (0.2, 0.2, 0.5, 0.0, 0.0)),
             "fixed": Start.at((*_START, *_OBSTACLE_START)),
@@ -118,6 +127,11 @@ class DubinsReach(SystemEnv):
     ## Mismatch
     None: plant and model have $v = 1$ m/s and $v_o = .7$ m/s; `plant={"v": 1.2}` or `model={"v_o":
     0.5}` makes them differ.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: position with a standard
+    deviation of .05 m and heading with .05 rad, known modulo 2 pi, range of the obstacle with
+    .1 m and its bearing from the heading with .05 rad.
 
     ## Reward
     The cosine of the angle between heading and goal at each step, in $[-1, 1]$, which is the

@@ -9,6 +9,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
@@ -72,6 +73,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         inputs=(Variable(u, -5.0, 5.0, "N m"),),
         reward=sp.exp(-((5 * (theta - _TARGET)) ** 2)),
         nominal=(sp.Integer(0),),
+        sensors=(Channel("theta", theta, 0.02), Channel("thetadot", thetadot, 0.1)),
         starts={
             "uniform": uniform_box((0.0, 0.0), (reach, reach), h),
             "near-origin": Start.at((0.1, 0.1)),
@@ -127,6 +129,10 @@ class Pendulum(SystemEnv):
     ## Mismatch
     None by default. The thesis takes the diffusion as unknown: `model={"sigma": 0.0}` is a designer
     who neglects it.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: the angle with a standard
+    deviation of .02 rad, and its rate with .1 rad/s.
 
     ## Backup
     `upright`: $u = -15 theta - 16 thetadot$. Its terminal set is proved for the numbers of the

@@ -11,6 +11,7 @@ import sympy as sp
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
@@ -139,6 +140,12 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
             *vertical.FOLLOWED,
             *followed,
         ),
+        sensors=(
+            *(Channel(s.name, s, 0.05) for s in (x, y, vertical.HEIGHT[0].symbol)),
+            *(Channel(s.name, s, 0.01) for s in (phi, theta)),
+            Channel(psi.name, psi, 0.02, period=2.0 * math.pi),
+            *(Channel(s.name, s, 0.02) for s in (phidot, thetadot, psidot)),
+        ),
         noise=("sigma_x", "sigma_y", "sigma_z"),
         plane=("x", "z"),
         scene="side-view",
@@ -234,6 +241,11 @@ class Quadrotor(SystemEnv):
 
     ## Mismatch
     The plant has $m = .6$ kg, the model $m = .4$ kg.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: position with a standard
+    deviation of .05 m, roll and pitch with .01 rad, yaw with .02 rad, modulo 2 pi, and the
+    three rates of turn with .02 rad/s. Velocities are not measured.
 
     ## Reward
     $$exp(-(z - z_ref)^2)$$

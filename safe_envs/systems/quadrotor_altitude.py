@@ -12,6 +12,7 @@ from safe_envs.number_text import finite_number
 from safe_envs.problem.backup import Backup, BackupFunction, BackupLaw
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable
@@ -137,6 +138,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         states=HEIGHT,
         inputs=(Variable(U_1, 0.0, _MOST_THRUST, "N"),),
         features=(*(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in HEIGHT), *FOLLOWED),
+        sensors=(Channel("z", z, 0.05),),
         nominal=(thrust_law(),),
         starts={"spread": uniform_box((5.0, 0.0), (0.5, 0.5)), "thesis": Start.at((5.0, 0.0))},
         noise=("sigma_z",),
@@ -187,6 +189,10 @@ class QuadrotorAltitude(SystemEnv):
     ## Mismatch
     The plant has $m = .6$ kg, the model $m = .4$ kg: the designer expects one and a half times the
     acceleration that the thrust gives.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: the altitude with a
+    standard deviation of .05 m. The vertical speed is not measured.
 
     ## Backup
     `hover`: thrust brakes to a hover in the middle of the band. Its terminal set is proved for the

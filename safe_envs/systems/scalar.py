@@ -8,6 +8,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
 from safe_envs.systems._common import positive, uniform_box
@@ -49,6 +50,7 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
         inputs=(Variable(u, -10.0, 10.0, "1/s"),),
         reward=sp.exp(-((2 * (x / edge - 1)) ** 2)),
         nominal=(-x + edge - x,),
+        sensors=(Channel("x", x, 0.1),),
         starts={"spread": uniform_box((0.0,), (0.9 * edge,)), "origin": Start.at((0.0,))},
         dt=0.01,
         horizon=5.0,
@@ -92,6 +94,10 @@ class Scalar(SystemEnv):
 
     ## Mismatch
     None.
+
+    ## Sensor
+    With `measurement="default"`, in each control period, all assumed: $x$ with a standard
+    deviation of .1.
 
     ## Reward
     $$exp(-(2 (x/limit - 1))^2)$$

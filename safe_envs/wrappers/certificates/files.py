@@ -14,6 +14,13 @@ import sympy as sp
 
 from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import read_json
+from safe_envs.dynamics.expression_text import (
+    number_text,
+    read_expression,
+    read_number,
+    require_name,
+    write_expression,
+)
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, shortened, shown
 from safe_envs.wrappers.certificates.certificate import (
@@ -21,13 +28,6 @@ from safe_envs.wrappers.certificates.certificate import (
     BarrierCertificate,
     HeldCertificate,
     Plant,
-)
-from safe_envs.wrappers.certificates.expression_text import (
-    number_text,
-    read_expression,
-    read_number,
-    require_name,
-    write_expression,
 )
 
 FORMAT = 1

@@ -11,11 +11,11 @@ from fractions import Fraction
 import pytest
 import sympy as sp
 
+from safe_envs.dynamics.expression_text import read_expression
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
 from safe_envs.wrappers.certificates.checker import check
-from safe_envs.wrappers.certificates.expression_text import read_expression
 from safe_envs.wrappers.certificates.files import (
     checksum,
     load_certificate,

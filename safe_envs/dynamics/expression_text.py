@@ -1,4 +1,4 @@
-"""Expressions of certificates as text: arithmetic of named symbols, read without running code."""
+"""Expressions as text: arithmetic of named symbols, read without running code."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ FUNCTIONS: dict[str, Any] = {
     for name in ("Abs", "Max", "Min", "atan", "cos", "exp", "log", "sin", "sqrt", "tanh")
 }
 """Those that both checkers know; a plant has them in place of tan, sinh and cosh."""
+
+SENSOR_FUNCTIONS: dict[str, Any] = {**FUNCTIONS, "atan2": sp.atan2, "tan": sp.tan}
+"""Those of measurements: no checker has to know them."""
 
 _CONSTANTS: dict[str, Any] = {"pi": sp.pi, "E": sp.E}
 _OPERATORS: dict[type[ast.AST], Any] = {
@@ -90,15 +93,21 @@ def write_expression(expression: sp.Expr, names: Mapping[str, sp.Symbol], where:
     return text
 
 
-def read_expression(text: Any, names: Mapping[str, sp.Symbol], where: str) -> sp.Expr:
+def read_expression(
+    text: Any,
+    names: Mapping[str, Any],
+    where: str,
+    functions: Mapping[str, Any] = FUNCTIONS,
+) -> sp.Expr:
     """Read arithmetic of symbols, with exact numbers, without Python's eval.
 
     Nothing is computed whose size is not known to be small before.
 
     Args:
         text: such as "x_1**3 - 3*x_2/5".
-        names: the symbols, by name.
+        names: the symbols, or expressions that stand for them, by name.
         where: it stands, for errors.
+        functions: that it may have, by name.
 
     Raises:
         ConfigurationError: it is no such arithmetic, or too long.
@@ -114,7 +123,7 @@ def read_expression(text: Any, names: Mapping[str, sp.Symbol], where: str) -> sp
     try:
         tree = ast.parse(source, mode="eval").body
         _require_few_parts(tree, where)
-        return _Reading(names, source, where).value(tree)
+        return _Reading(names, source, where, functions).value(tree)
     except ConfigurationError:
         raise
     except (
@@ -174,8 +183,11 @@ def _require_few_parts(tree: ast.expr, where: str) -> None:
 class _Reading:
     """One expression that is being read."""
 
-    def __init__(self, names: Mapping[str, sp.Symbol], source: str, where: str) -> None:
+    def __init__(
+        self, names: Mapping[str, Any], source: str, where: str, functions: Mapping[str, Any]
+    ) -> None:
         self._names, self._source, self._where = {**_CONSTANTS, **names}, source, where
+        self._functions = functions
 
     def value(self, node: ast.expr) -> Any:
         terms = []
@@ -209,15 +221,16 @@ class _Reading:
             case ast.UnaryOp(kind, operand) if type(kind) in _OPERATORS:
                 return _OPERATORS[type(kind)](self.value(operand))
             case ast.Call(ast.Name(name), arguments, []) if arguments:
-                most = _MOST_ARGUMENTS if name in ("Max", "Min") else 1
-                if name in FUNCTIONS and len(arguments) <= most:
-                    found = FUNCTIONS[name](*map(self.value, arguments))
+                most = {"Max": _MOST_ARGUMENTS, "Min": _MOST_ARGUMENTS, "atan2": 2}.get(name, 1)
+                least = 2 if name == "atan2" else 1
+                if name in self._functions and least <= len(arguments) <= most:
+                    found = self._functions[name](*map(self.value, arguments))
                     # sympy compares each two of them, and flattens what is nested.
                     if len(found.args) <= _MOST_ARGUMENTS or name not in ("Max", "Min"):
                         return found
                 raise ConfigurationError(
                     f"{self._where}: unknown function {shown(name)} of {len(arguments)} arguments;"
-                    f" {nearest(name, FUNCTIONS)}"
+                    f" {nearest(name, self._functions)}"
                 )
         raise ConfigurationError(
             f"{self._where}: {shown(ast.unparse(node))} is not allowed; write arithmetic with"

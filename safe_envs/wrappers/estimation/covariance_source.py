@@ -1,0 +1,206 @@
+"""The covariance of a Kalman filter as straight-line code, which leaves out what is zero.
+
+The same code serves floats of one state and arrays of a batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
+from typing import Any
+
+from safe_envs.wrappers.estimation.packed import pairs, places
+
+Pattern = tuple[tuple[int, int], ...]
+"""Places of the entries of a matrix that are not 0."""
+
+_Matrix = dict[tuple[int, int], str]
+"""Names of the entries of a matrix that are not 0."""
+
+
+class GeneratedFunction:
+    """A function of generated code, which is copied and pickled by what it was generated from.
+
+    Args:
+        maker: returns the text of a function `compute`.
+        arguments: of the maker, hashable.
+    """
+
+    def __init__(self, maker: Callable[..., str], *arguments: Any) -> None:
+        self._source = (maker, *arguments)
+        self.call = _compiled(maker, arguments)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return GeneratedFunction, self._source
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> GeneratedFunction:
+        return self
+
+
+@lru_cache(maxsize=256)
+def _compiled(maker: Callable[..., str], arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    namespace: dict[str, Any] = {}
+    exec(compile(maker(*arguments), "<covariance>", "exec"), namespace)  # noqa: S102
+    return namespace["compute"]
+
+
+class _Lines:
+    """Lines of code, each of which names a number."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def let(self, expression: str) -> str:
+        name = f"t{len(self.lines)}"
+        self.lines.append(f"    {name} = {expression}")
+        return name
+
+    def product(self, one: _Matrix, other: _Matrix, plus: _Matrix | None = None) -> _Matrix:
+        """Return one * other (+ plus), of matrices."""
+        sums: dict[tuple[int, int], list[str]] = {}
+        for (i, k), a in one.items():
+            for (l, j), b in other.items():
+                if k == l:
+                    sums.setdefault((i, j), []).append(f"{a} * {b}")
+        for place, c in (plus or {}).items():
+            sums.setdefault(place, []).insert(0, c)
+        return {place: self._sum(terms) for place, terms in sums.items()}
+
+    def _sum(self, terms: list[str]) -> str:
+        return terms[0] if len(terms) == 1 and "*" not in terms[0] else self.let(" + ".join(terms))
+
+
+def euler_source(n: int, slopes: Pattern, noise: Pattern) -> str:
+    """Return code for P <- (I + h A) P (I + h A)' + h Q.
+
+    Args:
+        n: number of states.
+        slopes: places of the entries of h A, which the function takes after those of P.
+        noise: places (i, j), i <= j, of h Q, which it takes last.
+    """
+    lines, p, a = _Lines(), _symmetric(n), _named("a", slopes)
+    moved = lines.product(a, p, plus=p)  # (I + h A) P
+    return _whole(lines, n, moved, a, _named("q", noise), ["p", "a", "q"], n, slopes, noise)
+
+
+def linear_source(n: int, entries: Pattern) -> str:
+    """Return code for P <- F P F', with the entries of F - I after those of P."""
+    lines, p, a = _Lines(), _symmetric(n), _named("a", entries)
+    moved = lines.product(a, p, plus=p)
+    return _whole(lines, n, moved, a, {}, ["p", "a"], n, entries, ())
+
+
+def _whole(
+    lines: _Lines,
+    n: int,
+    moved: _Matrix,
+    a: _Matrix,
+    q: _Matrix,
+    groups: Sequence[str],
+    size: int,
+    entries: Pattern,
+    noise: Pattern,
+) -> str:
+    """Return code for M (I + a)' + q, given M."""
+    found = []
+    for i, j in pairs(n):
+        terms = [moved[i, j]] if (i, j) in moved else []
+        terms += [f"{moved[i, k]} * {e}" for (r, k), e in a.items() if r == j and (i, k) in moved]
+        terms += [q[i, j]] if (i, j) in q else []
+        found.append(" + ".join(terms) or "0.0")
+    counts = {"p": len(pairs(size)), "a": len(entries), "q": len(noise)}
+    return _function(lines, [(g, counts[g]) for g in groups], found)
+
+
+def runge_kutta_source(n: int, slopes: Pattern, h: float) -> str:
+    """Return code for F - I of a step of Runge and Kutta, all n n entries, row by row.
+
+    With the slopes A_1..A_4 at the stages: K_1 = A_1, K_2 = A_2 (I + h/2 K_1), K_3 = A_3 (I + h/2
+    K_2), K_4 = A_4 (I + h K_3), F = I + h/6 (K_1 + 2 K_2 + 2 K_3 + K_4).
+
+    Args:
+        n: number of states.
+        slopes: places of the entries of A, which the function takes for each stage.
+        h: length of the step in s.
+    """
+    lines = _Lines()
+    stages = [_named(name, slopes) for name in "abcd"]
+    derivatives = [stages[0]]
+    for stage, length in zip(stages[1:], (h / 2, h / 2, h), strict=True):
+        scaled = {at: lines.let(f"{length!r} * {k}") for at, k in derivatives[-1].items()}
+        derivatives.append(lines.product(stage, scaled, plus=stage))
+    found = []
+    for i in range(n):
+        for j in range(n):
+            terms = [
+                f"{factor}{k[i, j]}"
+                for k, factor in zip(derivatives, ("", "2.0 * ", "2.0 * ", ""), strict=True)
+                if (i, j) in k
+            ]
+            found.append(f"{h / 6!r} * ({' + '.join(terms)})" if terms else "0.0")
+    return _function(lines, [(name, len(slopes)) for name in "abcd"], found)
+
+
+def update_source(n: int, rows: tuple[tuple[int, ...], ...], variances: tuple[float, ...]) -> str:
+    """Return code for the update by one channel after the other, in Joseph's form.
+
+    All are linearised at the same point, so that their order makes no difference: of channel i the
+    innovation is e = nu_i - h_i d, with d the change of the mean so far. With b = P h, s = h' b + r
+    and the gain K = b/s, or 0 for a lost sample:
+
+        d <- d + K e,    P <- (I - K h') P (I - K h')' + r K K'
+
+    The function takes the entries of P, those of the rows h, the innovations nu, and 1.0 or 0.0 for
+    received and lost samples. It returns d, P, and the sum of e^2/s over what was received.
+
+    Args:
+        n: number of states.
+        rows: for each channel the states that it depends on.
+        variances: r of each channel.
+    """
+    lines, p = _Lines(), _symmetric(n)
+    change: list[str | None] = [None] * n
+    index, squares = 0, []
+    for channel, (row, r) in enumerate(zip(rows, variances, strict=True)):
+        h = {j: f"h{index + place}" for place, j in enumerate(row)}
+        index += len(row)
+        b = [lines.let(" + ".join(f"{p[i, j]} * {c}" for j, c in h.items())) for i in range(n)]
+        s = lines.let(" + ".join(f"{c} * {b[j]}" for j, c in h.items()) + f" + {r!r}")
+        weight = lines.let(f"g{channel} / {s}")
+        e = f"v{channel}" + "".join(f" - {c} * {change[j]}" for j, c in h.items() if change[j])
+        e = lines.let(e)
+        gain = [lines.let(f"{each} * {weight}") for each in b]
+        change = [
+            lines.let(f"{gain[i]} * {e}" + (f" + {old}" if old else ""))
+            for i, old in enumerate(change)
+        ]
+        squares.append(f"{e} * {e} * {weight}")
+        m = {
+            (i, j): lines.let(f"{p[i, j]} - {gain[i]} * {b[j]}")
+            for i in range(n)
+            for j in range(n)
+            if i <= j or j in h
+        }
+        left = [
+            lines.let(f"{r!r} * {gain[i]} - " + " - ".join(f"{m[i, j]} * {c}" for j, c in h.items()))
+            for i in range(n)
+        ]
+        for i, j in pairs(n):
+            p[i, j] = p[j, i] = lines.let(f"{m[i, j]} + {left[i]} * {gain[j]}")
+    found = [*(str(d) for d in change), *(p[pair] for pair in pairs(n)), " + ".join(squares)]
+    groups = [("p", len(pairs(n))), ("h", index), ("v", len(rows)), ("g", len(rows))]
+    return _function(lines, groups, found)
+
+
+def _function(lines: _Lines, groups: Iterable[tuple[str, int]], found: Sequence[str]) -> str:
+    arguments = ", ".join(f"{name}{i}" for name, count in groups for i in range(count))
+    body = "\n".join(lines.lines)
+    return f"def compute({arguments}):\n{body}\n    return ({', '.join(found)},)\n"
+
+
+def _symmetric(n: int) -> _Matrix:
+    return {place: f"p{index}" for place, index in places(n).items()}
+
+
+def _named(name: str, pattern: Pattern) -> _Matrix:
+    return {place: f"{name}{index}" for index, place in enumerate(pattern)}
