@@ -10,12 +10,12 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import HEADING, POSE_SENSORS, SHOWN, omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import (
-    obstacle_sensors,
     separation,
     vehicle_among,
     way_to,
@@ -99,11 +99,7 @@ def dubins_obstacles(*, num_obstacles: int = 5, radius: float = 0.4) -> SafetyPr
         ),
         sensors=(
             *POSE_SENSORS,
-            *(
-                channel
-                for i, place in enumerate(places, start=1)
-                for channel in obstacle_sensors(*place, f"_{i}")
-            ),
+            *(Channel(p.name, p, 0.05, period=2.0 * math.pi) for p in phases),
         ),
         starts={
             "spread": Start(
@@ -180,8 +176,8 @@ class DubinsObstacles(SystemEnv):
 
     ## Sensor
     With `measurement="default"`, in each control period, all assumed: position with a standard
-    deviation of .05 m and heading with .05 rad, known modulo 2 pi, range of each obstacle with
-    .1 m and its bearing from the heading with .05 rad.
+    deviation of .05 m and heading with .05 rad, known modulo 2 pi; each obstacle broadcasts its
+    phase, with .05 rad.
 
     ## Reward
     The cosine of the angle between heading and goal at each step, in $[-1, 1]$, which is the

@@ -40,7 +40,7 @@ class GeneratedFunction:
 @lru_cache(maxsize=256)
 def _compiled(maker: Callable[..., str], arguments: tuple[Any, ...]) -> Callable[..., Any]:
     namespace: dict[str, Any] = {}
-    exec(compile(maker(*arguments), "<covariance>", "exec"), namespace)  # noqa: S102
+    exec(compile(maker(*arguments), "<covariance of a filter>", "exec"), namespace)
     return namespace["compute"]
 
 
@@ -59,8 +59,8 @@ class _Lines:
         """Return one * other (+ plus), of matrices."""
         sums: dict[tuple[int, int], list[str]] = {}
         for (i, k), a in one.items():
-            for (l, j), b in other.items():
-                if k == l:
+            for (row, j), b in other.items():
+                if k == row:
                     sums.setdefault((i, j), []).append(f"{a} * {b}")
         for place, c in (plus or {}).items():
             sums.setdefault(place, []).insert(0, c)
@@ -78,38 +78,16 @@ def euler_source(n: int, slopes: Pattern, noise: Pattern) -> str:
         slopes: places of the entries of h A, which the function takes after those of P.
         noise: places (i, j), i <= j, of h Q, which it takes last.
     """
-    lines, p, a = _Lines(), _symmetric(n), _named("a", slopes)
-    moved = lines.product(a, p, plus=p)  # (I + h A) P
-    return _whole(lines, n, moved, a, _named("q", noise), ["p", "a", "q"], n, slopes, noise)
-
-
-def linear_source(n: int, entries: Pattern) -> str:
-    """Return code for P <- F P F', with the entries of F - I after those of P."""
-    lines, p, a = _Lines(), _symmetric(n), _named("a", entries)
+    lines, p, a, q = _Lines(), _symmetric(n), _named("a", slopes), _named("q", noise)
     moved = lines.product(a, p, plus=p)
-    return _whole(lines, n, moved, a, {}, ["p", "a"], n, entries, ())
-
-
-def _whole(
-    lines: _Lines,
-    n: int,
-    moved: _Matrix,
-    a: _Matrix,
-    q: _Matrix,
-    groups: Sequence[str],
-    size: int,
-    entries: Pattern,
-    noise: Pattern,
-) -> str:
-    """Return code for M (I + a)' + q, given M."""
     found = []
     for i, j in pairs(n):
-        terms = [moved[i, j]] if (i, j) in moved else []
-        terms += [f"{moved[i, k]} * {e}" for (r, k), e in a.items() if r == j and (i, k) in moved]
+        terms = [moved[i, j]]
+        terms += [f"{moved[i, k]} * {entry}" for (row, k), entry in a.items() if row == j]
         terms += [q[i, j]] if (i, j) in q else []
-        found.append(" + ".join(terms) or "0.0")
-    counts = {"p": len(pairs(size)), "a": len(entries), "q": len(noise)}
-    return _function(lines, [(g, counts[g]) for g in groups], found)
+        found.append(" + ".join(terms))
+    groups = [("p", len(pairs(n))), ("a", len(slopes)), ("q", len(noise))]
+    return _function(lines, groups, found)
 
 
 def runge_kutta_source(n: int, slopes: Pattern, h: float) -> str:
@@ -182,7 +160,9 @@ def update_source(n: int, rows: tuple[tuple[int, ...], ...], variances: tuple[fl
             if i <= j or j in h
         }
         left = [
-            lines.let(f"{r!r} * {gain[i]} - " + " - ".join(f"{m[i, j]} * {c}" for j, c in h.items()))
+            lines.let(
+                f"{r!r} * {gain[i]} - " + " - ".join(f"{m[i, j]} * {c}" for j, c in h.items())
+            )
             for i in range(n)
         ]
         for i, j in pairs(n):

@@ -1,0 +1,291 @@
+"""State estimators of a model and a sensor: what they share, and how they are named."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import Flavour, compile_function
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_whole, shown
+from safe_envs.number_text import finite_number
+from safe_envs.problem.measurement import Measurement
+from safe_envs.validators import numbers_in
+
+Components = Sequence[Any]
+"""Floats of one state, or arrays (B,) of a batch."""
+
+
+class Update(NamedTuple):
+    """A belief after a sample.
+
+    Attributes:
+        mean: n components.
+        covariance: n (n + 1)/2 components, see `safe_envs.wrappers.estimation.packed`.
+        innovation: k components: what was measured less what was expected; 0 of lost samples.
+        nis: normalized innovation squared, nu' S^-1 nu of what was received: for a linear model
+            and Gaussian noise chi-square distributed, with as many degrees of freedom.
+    """
+
+    mean: Components
+    covariance: Components
+    innovation: Components
+    nis: Any
+
+
+class Estimator(ABC):
+    """Base of the estimators: a belief about the state, a mean and a covariance, in time.
+
+    The model moves by the step of the simulator, and its sensor is without bias: a bias and a
+    mismatch of the plant are unknown to the estimator.
+
+    Attributes:
+        name: by which texts know it.
+        text: with its settings.
+        n: number of states.
+
+    Args:
+        model: that is believed.
+        measurement: what is measured.
+        dt: control period in s.
+        substeps: integration steps in it.
+        process_noise: standard deviation per square root of a second of noise that the estimator
+            adds to the model's, for all states or one number for each: for what the model does not
+            know. Without noise the covariance would go to 0, and no sample count any more.
+
+    Raises:
+        SystemDefinitionError: Something unknown is measured.
+        ConfigurationError: A number is out of range, or something is measured without noise.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(
+        self,
+        model: ControlAffineSDE,
+        measurement: Measurement,
+        dt: float,
+        substeps: int = 1,
+        process_noise: float | Sequence[float] = 0.0,
+    ) -> None:
+        require_whole("substeps", substeps, 1)
+        self.dt, self.substeps = finite_number("dt", dt), int(substeps)
+        if not self.dt > 0.0:
+            raise ConfigurationError(f"dt = {self.dt} s; a control period is positive")
+        if model.signals or model.uses_time:
+            raise SystemDefinitionError(
+                "an estimator predicts with the model, which may hold neither signals nor the time;"
+                " make each a state, with its rate in the drift (1 for the time)"
+            )
+        measurement.require_known(model)
+        exact = [c.name for c in measurement.channels if not c.noise > 0.0]
+        if exact:
+            raise ConfigurationError(
+                f"{', '.join(exact)}: measured without noise, for which the gain of an estimator is"
+                " singular; give a small standard deviation, or the true state without a sensor"
+            )
+        self.model, self.measurement, self.n = model, measurement, model.n
+        self._added = _process_noise(process_noise, model)
+        self._expected = [model.numeric(c.expression) for c in measurement.channels]
+        self.variances = tuple(c.noise**2 for c in measurement.channels)
+
+    @property
+    def text(self) -> str:
+        """The name with the settings."""
+        added = [float(a) for a in self._added]
+        if not any(added):
+            return self.name
+        equal = added[:1] if len(set(added)) == 1 else added
+        return f"{self.name}:process_noise={','.join(format(a, 'g') for a in equal)}"
+
+    @abstractmethod
+    def predict(
+        self, flavour: Flavour, mean: Components, covariance: Components, u: Components
+    ) -> tuple[Components, Components]:
+        """Return the belief one control period later.
+
+        Args:
+            flavour: "floats" for one state, "arrays" for a batch.
+            mean: n components.
+            covariance: n (n + 1)/2 components.
+            u: m components of the input that is executed.
+
+        Returns:
+            The mean and the covariance.
+        """
+
+    @abstractmethod
+    def update(
+        self,
+        flavour: Flavour,
+        mean: Components,
+        covariance: Components,
+        y: Components,
+        received: Components,
+    ) -> Update:
+        """Return the belief after a sample.
+
+        Args:
+            flavour: see `predict`.
+            mean: n components.
+            covariance: n (n + 1)/2 components.
+            y: k components of what was measured; finite numbers where it was lost.
+            received: whether each component was.
+        """
+
+    def gained(
+        self, flavour: Flavour, mean: Components, covariance: Components, u: Components
+    ) -> tuple[Components, Components]:
+        """Return the covariance after the coming sample, and by how much that lowers it.
+
+        The second is K S K', with the gain K and the covariance S of the innovation: the covariance
+        of the jump of the mean.
+
+        Args:
+            flavour: see `predict`.
+            mean: n components.
+            covariance: n (n + 1)/2 components.
+            u: m components of the input until then.
+        """
+        mean, before = self.predict(flavour, mean, covariance, u)
+        y = self.expected(flavour, mean)
+        after = self.update(flavour, mean, before, y, [True] * len(y)).covariance
+        return after, [b - a for b, a in zip(before, after, strict=True)]
+
+    def expected(self, flavour: Flavour, mean: Components) -> Components:
+        """Return what a sensor without noise measures of a state."""
+        return self._functions[flavour](*mean)
+
+    @cached_property
+    def _functions(self) -> dict[Flavour, Any]:
+        return {f: compile_function(self.model.states, self._expected, f) for f in _FLAVOURS}
+
+    def innovations(
+        self, flavour: Flavour, y: Components, expected: Components, received: Components
+    ) -> list[Any]:
+        """Return what was measured less what was expected.
+
+        That of a periodic channel is within half a period of 0, and that of a lost sample is 0.
+
+        Args:
+            flavour: see `predict`.
+            y: k components.
+            expected: k components.
+            received: whether each was measured.
+        """
+        found, up = [], math.ceil if flavour == "floats" else np.ceil
+        for channel, value, mean, has in zip(
+            self.measurement.channels, y, expected, received, strict=True
+        ):
+            difference = value - mean
+            if channel.period:
+                turns = up(difference / channel.period - 0.5)
+                difference = difference - channel.period * turns
+            found.append(difference * has)
+        return found
+
+    @cached_property
+    def periods(self) -> tuple[float, ...]:
+        """The period of each state that is measured by itself modulo one; 0 of the others."""
+        known = {c.expression: c.period for c in self.measurement.channels if c.period}
+        return tuple(known.get(s, 0.0) for s in self.model.states)
+
+    @cached_property
+    def jacobian(self) -> Any:
+        """A = d(f + g u)/dx, a matrix of expressions of the states and inputs."""
+        model = self.model
+        rate = model.numeric(model.drift + model.input_matrix * sp.Matrix(model.inputs))
+        return sp.Matrix(rate).jacobian(list(model.states))
+
+    @cached_property
+    def diffusion_square(self) -> Any:
+        """Sigma sigma' with what is added to it, a matrix of expressions of the states."""
+        sigma = sp.Matrix(self.model.numeric(self.model.diffusion))
+        added = sp.diag(*[sp.Float(a, 17) ** 2 if a else 0 for a in self._added])
+        return sigma * sigma.T + added
+
+    @cached_property
+    def output_jacobian(self) -> Any:
+        """H = dc/dx, a matrix of expressions of the states."""
+        return sp.Matrix(self._expected).jacobian(list(self.model.states))
+
+
+_ROUNDING = 1e-9
+"""Standard deviation, in parts of the mean, below which a state counts as known."""
+
+_FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
+
+
+def nonzero(matrix: Any, upper: bool = False) -> tuple[tuple[int, int], ...]:
+    """Return the places of the entries of a matrix that are not 0.
+
+    Args:
+        matrix: of expressions.
+        upper: only those (i, j) with i <= j.
+    """
+    rows, columns = matrix.shape
+    return tuple(
+        (i, j)
+        for i in range(rows)
+        for j in range(columns)
+        if matrix[i, j] != 0 and not (upper and i > j)
+    )
+
+
+def nees(
+    estimator: Estimator, x: np.ndarray, mean: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normalized estimation error squared, e' P^-1 e, and its degrees of freedom.
+
+    Where P is singular, its pseudo-inverse takes the place of the inverse, and its rank that of n.
+    Errors of states that are measured modulo a period are taken modulo that.
+
+    Args:
+        estimator: whose belief it is.
+        x: true states, shape (B, n).
+        mean: shape (B, n).
+        covariance: shape (B, n, n).
+
+    Returns:
+        Values (B,) and whole numbers (B,).
+    """
+    error = x - mean
+    for i, period in enumerate(estimator.periods):
+        if period:
+            error[:, i] -= period * np.ceil(error[:, i] / period - 0.5)
+    scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    # What is less than the rounding of the mean is exactly known.
+    scale = np.where(scale > _ROUNDING * np.maximum(abs(mean), _ROUNDING), scale, 0.0)
+    safe = np.where(scale > 0.0, scale, 1.0)
+    # In units of standard deviations no state's unit decides what counts as singular.
+    live = (scale > 0.0).astype(float)
+    correlation = covariance / (safe[:, :, None] * safe[:, None, :])
+    values, vectors = np.linalg.eigh(correlation * live[:, :, None] * live[:, None, :])
+    known = values > 1e-10 * np.maximum(values[:, -1:], 1e-300)
+    along = np.einsum("bij,bi->bj", vectors, error / safe)
+    parts = np.where(known, along**2 / np.where(known, values, 1.0), 0.0)
+    return parts.sum(axis=1), known.sum(axis=1)
+
+
+def packed_entries(matrix: Any) -> tuple[tuple[tuple[int, int], ...], list[Any]]:
+    """Return the places and the expressions of the upper triangle that are not 0."""
+    found = nonzero(matrix, upper=True)
+    return found, [matrix[i, j] for i, j in found]
+
+
+def _process_noise(given: Any, model: ControlAffineSDE) -> tuple[float, ...]:
+    values = numbers_in(given)
+    if values.shape not in ((), (1,), (model.n,)) or not (
+        np.isfinite(values).all() and (values >= 0.0).all()
+    ):
+        raise ConfigurationError(
+            f"process_noise = {shown(given)}; give a number >= 0, or one for each of the {model.n}"
+            " states"
+        )
+    return tuple(np.broadcast_to(values, model.n).tolist())
