@@ -12,17 +12,26 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Flavour, compile_function, finite, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.errors import InvalidInputError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.conditions.spec_text import Conditions, conditions_for
+from safe_envs.wrappers.conditions.at_estimate import (
+    EstimateSettings,
+    belief_places,
+    constraint_at_estimate,
+    with_belief_signals,
+)
+from safe_envs.wrappers.conditions.spec_text import Conditions
+from safe_envs.wrappers.estimation import Estimator, make_estimator
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
+from safe_envs.wrappers.filter_qp.problem_arguments import known_for_problem
 from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
+from safe_envs.wrappers.measured_filter import FiltersMeasurements
 
 
-class SafetyFilter(ComponentFilter):
+class SafetyFilter(FiltersMeasurements, ComponentFilter):
     """Chooses the input nearest to a proposed one that every condition allows.
 
     It minimises 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier and to the
@@ -62,6 +71,9 @@ class SafetyFilter(ComponentFilter):
         dt: control period in s, for conditions with a sampling margin of first order.
         clf: goal of the joint QP, whose weights replace W.
         adjustable: names of the system's parameters whose values may be given at each call.
+        estimator: of the state, for `filter_measurement`.
+        instants: control instants of an episode, for conditions with `belief`.
+        region: (low, high) of each state, for conditions with `measurement_error`.
 
     Attributes:
         model: the system, as given.
@@ -87,6 +99,9 @@ class SafetyFilter(ComponentFilter):
         dt: float | None = None,
         clf: CLF | None = None,
         adjustable: Sequence[str | sp.Symbol] = (),
+        estimator: Estimator | None = None,
+        instants: int | None = None,
+        region: Sequence[tuple[float, float]] | None = None,
         **unknown: Never,
     ) -> None:
         arguments.refuse_unknown(unknown, SafetyFilter.__init__)
@@ -94,7 +109,13 @@ class SafetyFilter(ComponentFilter):
         known = arguments.with_adjustable(system, adjustable)
         self.pairs = arguments.read_pairs(known, barriers, conditions)
         arguments.require_goal(clf, weights)
-        self.constraints = tuple(c.constraint(known, barrier) for barrier, c in self.pairs)
+        certain = () if estimator is None else estimator.certain
+        settings = EstimateSettings(dt, instants, region, certain)
+        self.constraints = tuple(
+            constraint_at_estimate(c, known, barrier, settings, len(self.pairs))
+            for barrier, c in self.pairs
+        )
+        known = with_belief_signals(known, self.constraints)
         endless = limits.takes_endless(self.constraints, clf)
         qp = FilterQP(
             known,
@@ -110,6 +131,8 @@ class SafetyFilter(ComponentFilter):
         fixed = [p.name for p in known.parameters]
         self._given = RuntimeArguments(qp, system.parameters, fixed, endless)
         self._state_shape, self._input_shape = (system.n,), (system.m,)
+        self.belief_places = belief_places(qp.runtime, system.n)
+        self._measure_by(estimator)
         self.warm_up()
 
     @classmethod
@@ -121,6 +144,7 @@ class SafetyFilter(ComponentFilter):
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
         adjustable: Sequence[str | sp.Symbol] = (),
+        estimator: Estimator | str | None = None,
     ) -> SafetyFilter:
         """Return the filter for the barriers of a problem.
 
@@ -134,6 +158,7 @@ class SafetyFilter(ComponentFilter):
                 problem's goal.
             priorities: see the class.
             adjustable: see the class.
+            estimator: of a measured problem, or its text, like "ekf".
 
         Raises:
             SystemDefinitionError: What is given is no problem.
@@ -141,23 +166,7 @@ class SafetyFilter(ComponentFilter):
                 made for another problem, one corrects the model and another knows the plant, or the
                 problem has no clf.
         """
-        arguments.require_problem(problem)
-        arguments.require_word("knowledge", knowledge, ("model", "plant"))
-        arguments.require_word("objective", objective, ("nearest", "clf"))
-        if objective == "clf" and problem.clf is None:
-            raise ConfigurationError(
-                f"objective = 'clf', but {problem.name} has no control Lyapunov function; use"
-                " 'nearest'"
-            )
-        each = conditions_for(problem, conditions)
-        correcting = [condition.name for condition in each if condition.corrects_model]
-        if knowledge == "plant" and 0 < len(correcting) < len(each):
-            raise ConfigurationError(
-                f"{correcting[0]} corrects the model, and the other barriers' conditions know the"
-                " plant; use knowledge='model'"
-            )
-        known = problem.model if knowledge == "model" or correcting else problem.plant
-        clf = problem.clf if objective == "clf" else None
+        known, each, clf = known_for_problem(problem, conditions, knowledge, objective)
         return cls(
             known,
             problem.barriers,
@@ -167,6 +176,9 @@ class SafetyFilter(ComponentFilter):
             dt=problem.dt,
             clf=clf,
             adjustable=adjustable,
+            estimator=None if estimator is None else make_estimator(estimator, problem, knowledge),
+            instants=problem.steps + 1,
+            region=[(v.low, v.high) for v in problem.states],
         )
 
     def warm_up(self) -> SafetyFilter:
@@ -184,7 +196,12 @@ class SafetyFilter(ComponentFilter):
         return self._compile_barriers("arrays")
 
     def _compile_barriers(self, flavour: Flavour) -> Any:
-        expressions = [self.qp.model.numeric(barrier.expression) for barrier, _ in self.pairs]
+        # A condition with a belief keeps the barrier of that.
+        kept = [
+            barrier.expression if c.belief is None else constraint.chain[0]
+            for (barrier, c), constraint in zip(self.pairs, self.constraints, strict=True)
+        ]
+        expressions = [self.qp.model.numeric(h) for h in kept]
         return compile_function(self.qp.symbols, expressions, flavour)
 
     def filter(

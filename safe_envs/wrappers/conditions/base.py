@@ -19,6 +19,7 @@ from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers.conditions.chain import not_smooth, resolved
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
+from safe_envs.wrappers.conditions.names import COMMON
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
@@ -65,6 +66,13 @@ class Condition(ABC):
         autonomous: whether it is only for models and barriers that neither hold signals nor the
             time, as what was learned or proved of one.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the constraint.
+        belief: probability, for all control instants of an episode and all barriers together, with
+            which the error of an estimate exceeds the margin of the belief barrier, whose chain
+            takes the place of that of h; see `safe_envs.wrappers.conditions.belief`. None at a true
+            state, and for certainty equivalence.
+        measurement_error: bound of the error of each state, one number for all or one for each,
+            within which the constraint is met; see `safe_envs.wrappers.conditions.bounded_error`.
+            () for none.
 
     Raises:
         ConfigurationError: a parameter is out of its range.
@@ -79,6 +87,8 @@ class Condition(ABC):
     autonomous: ClassVar[bool] = False
 
     sampling_margin: str | float = field(default="none", kw_only=True)
+    belief: float | None = field(default=None, kw_only=True)
+    measurement_error: tuple[float, ...] = field(default=(), kw_only=True)
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__dict__.get("name", cls.__name__)
@@ -89,6 +99,18 @@ class Condition(ABC):
             raise ConfigurationError(
                 f"sampling_margin = {shown(margin)}; allowed: none, {FIRST_ORDER}, or a number >= 0"
             )
+
+        if self.belief is not None and not (is_nonnegative(self.belief) and 0 < self.belief < 1):
+            raise ConfigurationError(
+                f"belief = {shown(self.belief)}; give a probability above 0 and below 1"
+            )
+        given = self.measurement_error
+        errors = given if isinstance(given, tuple | list) else (given,)
+        if not all(map(is_nonnegative, errors)):
+            raise ConfigurationError(
+                f"measurement_error = {shown(given)}; give a number >= 0, or one for each state"
+            )
+        object.__setattr__(self, "measurement_error", tuple(map(float, errors)))
 
     @property
     def derivative(self) -> Derivative:
@@ -115,6 +137,11 @@ class Condition(ABC):
             ConfigurationError: The condition is only for models without signals and time, or the
                 code of a condition from outside fails.
         """
+        if self.belief is not None or self.measurement_error:
+            raise ConfigurationError(
+                f"{self.name} with belief or measurement_error is a condition at an estimate, which"
+                " a filter has; what is asked for is of true states: leave them out"
+            )
         if self.autonomous:
             _require_autonomous(self.name, model, barrier)
         try:
@@ -173,8 +200,8 @@ class Condition(ABC):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Arguments that make the same condition, besides the sampling margin."""
-        given = {key: value for key, value in vars(self).items() if key != "sampling_margin"}
+        """Arguments that make the same condition, besides those of every condition."""
+        given = {key: value for key, value in vars(self).items() if key not in COMMON}
         return {key: value for key, value in given.items() if value is not None}
 
 

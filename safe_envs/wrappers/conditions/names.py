@@ -5,14 +5,17 @@ from __future__ import annotations
 from safe_envs import plugins
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 
+COMMON = ("sampling_margin", "belief", "measurement_error")
+"""Names of the parameters of every condition."""
+
 PARAMETERS = {
-    "cbf": ("alpha", "sampling_margin"),
-    "ecbf": ("k", "poles", "sampling_margin"),
-    "hocbf": ("p", "sampling_margin"),
-    "rcbf": ("gamma", "form", "sampling_margin"),
-    "srcbf": ("gamma", "form", "sampling_margin"),
-    "szcbf": ("alphas", "sampling_margin"),
-    "scbf": ("sampling_margin",),
+    "cbf": ("alpha", *COMMON),
+    "ecbf": ("k", "poles", *COMMON),
+    "hocbf": ("p", *COMMON),
+    "rcbf": ("gamma", "form", *COMMON),
+    "srcbf": ("gamma", "form", *COMMON),
+    "szcbf": ("alphas", *COMMON),
+    "scbf": COMMON,
 }
 """Names of the parameters of the conditions that need nothing but a model of the system."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 from safe_envs.dynamics.lie import generator, lie_derivative_f, relative_degree
@@ -20,6 +20,7 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.certified import Certified
+from safe_envs.wrappers.conditions.names import COMMON
 from safe_envs.wrappers.conditions.registry import condition_class, name_of
 from safe_envs.wrappers.conditions.text_parts import ConditionText, part_of, parts_of
 from safe_envs.wrappers.learning import LearnedModel, load_learned
@@ -111,7 +112,7 @@ def parse_for_system(
                 f"{condition.name} is learned or proved of a problem; {advice}"
             )
         degree = 0
-        if set(given) <= {"sampling_margin"}:
+        if set(given) <= set(COMMON):
             derivative = generator if condition.stochastic else lie_derivative_f
             degree = relative_degree(system, barrier.expression, derivative)
         found.append(_of_model(part, condition, given, (1.0,) * degree))
@@ -184,7 +185,7 @@ def _parts_for(text: str, count: int, taker: str) -> list[ConditionText]:
 def _of_model(
     part: ConditionText, condition: Any, given: dict[str, Any], gains: Sequence[float]
 ) -> Condition:
-    if _reads_file(condition) or set(given) <= {"sampling_margin"}:
+    if _reads_file(condition) or set(given) <= set(COMMON):
         return replace(_made(part, condition.for_gains, gains), **given)
     return _made(part, condition, **given)
 
@@ -289,8 +290,9 @@ def _entry(text: str) -> Any:
 
 def _spec(condition: Condition) -> str:
     given = dict(condition.parameters)
-    if condition.sampling_margin != "none":
-        given["sampling_margin"] = condition.sampling_margin
+    standard = {f.name: f.default for f in fields(Condition)}
+    common = {key: getattr(condition, key) for key in COMMON}
+    given |= {key: value for key, value in common.items() if value != standard[key]}
     settings = [
         f"{key}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
         for key, value in given.items()

@@ -17,6 +17,8 @@ from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_
 from safe_envs.number_text import finite_number
 from safe_envs.problem.measurement import Measurement
 from safe_envs.validators import numbers_in
+from safe_envs.wrappers.estimation.initial_belief import InitialBelief
+from safe_envs.wrappers.estimation.packed import unpacked
 
 Components = Sequence[Any]
 """Floats of one state, or arrays (B,) of a batch."""
@@ -49,6 +51,7 @@ class Estimator(ABC):
         name: by which texts know it.
         text: with its settings.
         n: number of states.
+        variances: of the noise of each channel.
 
     Args:
         model: that is believed.
@@ -58,6 +61,7 @@ class Estimator(ABC):
         process_noise: standard deviation per square root of a second of noise that the estimator
             adds to the model's, for all states or one number for each: for what the model does not
             know. Without noise the covariance would go to 0, and no sample count any more.
+        initial: belief before the first sample, if it is known.
 
     Raises:
         SystemDefinitionError: Something unknown is measured.
@@ -73,6 +77,7 @@ class Estimator(ABC):
         dt: float,
         substeps: int = 1,
         process_noise: float | Sequence[float] = 0.0,
+        initial: InitialBelief | None = None,
     ) -> None:
         require_whole("substeps", substeps, 1)
         self.dt, self.substeps = finite_number("dt", dt), int(substeps)
@@ -91,6 +96,9 @@ class Estimator(ABC):
                 " singular; give a small standard deviation, or the true state without a sensor"
             )
         self.model, self.measurement, self.n = model, measurement, model.n
+        if initial is not None:
+            initial.require_states(model.n)
+        self.initial = initial
         self._added = _process_noise(process_noise, model)
         self._expected = [model.numeric(c.expression) for c in measurement.channels]
         self.variances = tuple(c.noise**2 for c in measurement.channels)
@@ -195,6 +203,27 @@ class Estimator(ABC):
         """The period of each state that is measured by itself modulo one; 0 of the others."""
         known = {c.expression: c.period for c in self.measurement.channels if c.period}
         return tuple(known.get(s, 0.0) for s in self.model.states)
+
+    @cached_property
+    def certain(self) -> tuple[int, ...]:
+        """Places of the states that are known without any uncertainty, throughout.
+
+        Initially they are, no noise drives them, and their rates depend on none but themselves.
+        """
+        if self.initial is None:
+            return ()
+        states, n = self.model.states, self.n
+        start = unpacked(self.initial.covariance, n)
+        known = {i for i in range(n) if not start[i, i] and not self.diffusion_square[i, i]}
+        rates = sp.Matrix(self.model.numeric(self.model.drift)).row_join(
+            sp.Matrix(self.model.numeric(self.model.input_matrix))
+        )
+        while True:
+            others = {s for i, s in enumerate(states) if i not in known}
+            lost = {i for i in known if rates[i, :].free_symbols & others}
+            if not lost:
+                return tuple(sorted(known))
+            known -= lost
 
     @cached_property
     def jacobian(self) -> Any:

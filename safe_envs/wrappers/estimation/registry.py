@@ -6,32 +6,45 @@ from typing import Any
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.number_text import numbers
+from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.measurement import Measurement
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.estimation.estimator import Estimator
+from safe_envs.wrappers.estimation.initial_belief import initial_belief
 from safe_envs.wrappers.estimation.kalman import ExtendedKalmanFilter, KalmanFilter
 from safe_envs.wrappers.estimation.names import settings_of
+from safe_envs.wrappers.estimation.observability import require_observable
 from safe_envs.wrappers.estimation.unscented import UnscentedKalmanFilter
 
 _CLASSES = {each.name: each for each in (KalmanFilter, ExtendedKalmanFilter, UnscentedKalmanFilter)}
 
 
 def make_estimator(given: Any, problem: SafetyProblem, knowledge: str = "model") -> Estimator:
-    """Return an estimator of a measured problem.
+    """Return an estimator of a measured problem, which begins with its start distribution.
 
     Args:
-        given: its text, or an `Estimator`, which is returned.
+        given: its text, or an `Estimator` with an initial belief, which is returned.
         problem: with a measurement.
         knowledge: "model" for what the designer believes, "plant" for the true system.
 
     Raises:
-        ConfigurationError: The name or a setting is unknown, or the problem is not measured.
+        ConfigurationError: The name or a setting is unknown, the problem is not measured or has
+            delayed or rate-limited actuators, or an `Estimator` is of something else.
+        SystemDefinitionError: The measurement does not determine the state.
     """
+    measured = require_measured(problem)
+    require_direct(problem, "estimators")
     if isinstance(given, Estimator):
         if given.model.states != problem.model.states:
             raise ConfigurationError(
                 f"the estimator {given.text} is of other states than {problem.name}; make one for"
                 " its model"
+            )
+        if given.initial is None or given.measurement != measured:
+            what = "has no initial belief" if given.initial is None else "is of another sensor"
+            raise ConfigurationError(
+                f"the estimator {given.text} {what}; make it with initial=... and the measurement"
+                f" of {problem.name}, or name it, like 'ekf'"
             )
         return given
     if not isinstance(given, str):
@@ -39,11 +52,13 @@ def make_estimator(given: Any, problem: SafetyProblem, knowledge: str = "model")
             f"estimator = {shown(given)}; give kf, ekf or ukf, or an Estimator object"
         )
     name, settings = settings_of(given)
-    measured = require_measured(problem)
     known = problem.plant if knowledge == "plant" else problem.model
     values: dict[str, Any] = {key: numbers(key, text) for key, text in settings.items()}
     single = {key: value[0] if len(value) == 1 else value for key, value in values.items()}
-    return _CLASSES[name](known, measured, problem.dt, problem.substeps, **single)
+    initial = initial_belief(problem)
+    found = _CLASSES[name](known, measured, problem.dt, problem.substeps, initial=initial, **single)
+    require_observable(found, problem, initial)
+    return found
 
 
 def require_measured(problem: SafetyProblem) -> Measurement:

@@ -11,9 +11,8 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import Flavour
 from safe_envs.envs.sensor import Sample
-from safe_envs.errors import NumericalError
+from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.wrappers.estimation.estimator import Components, Estimator
-from safe_envs.wrappers.estimation.initial_belief import InitialBelief
 from safe_envs.wrappers.estimation.packed import cholesky
 
 
@@ -35,16 +34,20 @@ class BeliefTracker:
             do not count.
 
     Args:
-        estimator: of the belief.
-        initial: belief before the first sample.
+        estimator: of the belief, with an initial one.
         num_envs: size of a batch; None for one env.
+
+    Raises:
+        ConfigurationError: The estimator has no initial belief.
     """
 
-    def __init__(
-        self, estimator: Estimator, initial: InitialBelief, num_envs: int | None = None
-    ) -> None:
-        initial.require_states(estimator.n)
-        self.estimator, self._initial, self._num_envs = estimator, initial, num_envs
+    def __init__(self, estimator: Estimator, num_envs: int | None = None) -> None:
+        if estimator.initial is None:
+            raise ConfigurationError(
+                f"the estimator {estimator.text} has no belief to begin with; make it with"
+                " initial=InitialBelief.of(mean, covariance), or initial_belief(problem)"
+            )
+        self.estimator, self._initial, self._num_envs = estimator, estimator.initial, num_envs
         self._flavour: Flavour = "floats" if num_envs is None else "arrays"
         self._delay = estimator.measurement.delay
         k = len(estimator.measurement.channels)

@@ -20,6 +20,7 @@ from safe_envs.wrappers.estimation.estimator import (
     Update,
     packed_entries,
 )
+from safe_envs.wrappers.estimation.initial_belief import InitialBelief
 from safe_envs.wrappers.estimation.packed import cholesky, pairs
 
 
@@ -37,6 +38,7 @@ class UnscentedKalmanFilter(Estimator):
         dt: see there.
         substeps: see there.
         process_noise: see there.
+        initial: see there.
         alpha: spread of the sigma points.
         beta: 2 is best for Gaussian errors with a small alpha.
         kappa: see above.
@@ -50,18 +52,19 @@ class UnscentedKalmanFilter(Estimator):
 
     name = "ukf"
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  (what every estimator has, and the settings of the transform)
         self,
         model: ControlAffineSDE,
         measurement: Measurement,
         dt: float,
         substeps: int = 1,
         process_noise: float | Sequence[float] = 0.0,
+        initial: InitialBelief | None = None,
         alpha: float = 1.0,
         beta: float = 0.0,
         kappa: float = 0.0,
     ) -> None:
-        super().__init__(model, measurement, dt, substeps, process_noise)
+        super().__init__(model, measurement, dt, substeps, process_noise, initial)
         self.alpha, self.beta, self.kappa = (
             finite_number(name, value)
             for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa))
