@@ -178,12 +178,15 @@ class BatchSensor(_Sensor):
         self.sample = _merged(begun, nothing, self.sample)
 
     def observe(self, x: Sequence[np.ndarray], fresh: np.ndarray | None) -> np.ndarray:
-        """Take a sample of the states, and return the observations, float32 (num_envs, k).
+        """Take a sample of the states.
 
         Args:
             x: components of the states.
             fresh: the envs that have just begun, of which alone a sample is taken; None for a
                 sample of all.
+
+        Returns:
+            The observations, float32 (num_envs, k).
         """
         new, last = self._sampled(x, self.noise.next(fresh)), self.sample
         if fresh is None:
