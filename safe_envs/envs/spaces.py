@@ -53,12 +53,11 @@ def channel_bounds(problem: SafetyProblem, channel: Channel) -> tuple[float, flo
     if channel.period:
         return -0.5 * channel.period, 0.5 * channel.period
     ranges = {f.expression: (f.low, f.high) for f in problem.features}
-    ranges |= {
-        v.symbol: (v.low, v.high)
-        for v in problem.states
-        if math.isfinite(v.low) and math.isfinite(v.high)
-    }
+    for v in problem.states:
+        ranges.setdefault(v.symbol, (v.low, v.high))
     low, high = ranges.get(channel.expression, (-_FAR, _FAR))
+    if not (math.isfinite(low) and math.isfinite(high)):
+        low, high = -_FAR, _FAR
     beyond = abs(channel.bias) + _DEVIATIONS * channel.noise
     return low - beyond, high + beyond
 

@@ -152,8 +152,8 @@ def require_full_state(problem: Any, what: str) -> None:
     """
     if problem.measurement is not None:
         raise ConfigurationError(
-            f"{what} act on the full state, and {problem.name} is measured: give an estimator, as"
-            " by --estimator ekf or StateEstimatorWrapper, and here the problem's `unmeasured`; or"
+            f"{what} act on the full state, and {problem.name} is measured; give an estimator, by"
+            " --estimator ekf or as StateEstimatorWrapper with policies of problem.unmeasured, or"
             " leave the measurement out"
         )
 

@@ -26,6 +26,8 @@ from safe_envs.problem.option_errors import LONGEST_DELAY
 _SETTINGS = ("noise", "bias", "dropout", "period")
 _WORDS = (*_SETTINGS, "default", "delay")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,39}")
+_SYMBOL = re.compile(r"(?<![\w.])[A-Za-z_]\w*(?!\w|\s*\()")
+_CONSTANTS = ("pi", "E")
 _MOST_ITEMS, _MOST_CHARACTERS, _LONGEST_NAME = 100, 1000, 40
 _FORM = "write 'default', 'EXPR:noise=S:bias=B:dropout=P', or 'delay=D'"
 
@@ -55,6 +57,27 @@ def read_items(option: str, texts: Any) -> list[str]:
             " NAME=EXPR"
         )
     return items
+
+
+def require_names(texts: Sequence[str], known: Sequence[str]) -> None:
+    """Check the names in the items of a measurement, where a problem is not known otherwise.
+
+    Args:
+        texts: the items, of the form that `read_items` checks.
+        known: names of states, features, parameters and channels.
+
+    Raises:
+        ConfigurationError: A name is unknown.
+    """
+    for item in texts:
+        head, _ = _parts("measurement", item)
+        if head == "default" or head.startswith("delay="):
+            continue
+        for name in _SYMBOL.findall(head.rpartition("=")[2]):
+            if name not in (*known, *_CONSTANTS):
+                raise ConfigurationError(
+                    f"measurement {shown(head)}: unknown name {shown(name)}; {nearest(name, known)}"
+                )
 
 
 def measurement_of(problem: Any, given: Any, factor: float | None = None) -> Any:

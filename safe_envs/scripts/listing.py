@@ -31,6 +31,7 @@ def list_envs(json: Json = None) -> None:
             "noise": list(found.noise.values()),
             "dt": found.dt,
             "horizon": found.horizon,
+            "sensor": dict(found.sensors),
         }
         rows.append({"env_id": env_id, "about": found.about, **values})
     ids = Column("id", tuple(Text(row["env_id"], style="bold") for row in rows), "l")

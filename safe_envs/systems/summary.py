@@ -19,6 +19,7 @@ from typing import Any
 
 from safe_envs.errors import unknown
 from safe_envs.number_text import finite_number
+from safe_envs.problem.measurement_text import require_names
 from safe_envs.problem.option_errors import (
     refused_box,
     refused_noise,
@@ -49,6 +50,8 @@ class SystemSummary:
         parameters: names, of the plant and of the model.
         barrier: names of the arguments of the barrier.
         starts: names of the initial distributions.
+        features: names of the entries of the observation.
+        sensors: standard deviation of each channel of the default sensor, by name.
     """
 
     about: str
@@ -62,6 +65,8 @@ class SystemSummary:
     parameters: tuple[str, ...]
     barrier: tuple[str, ...]
     starts: tuple[str, ...]
+    features: tuple[str, ...]
+    sensors: Mapping[str, float]
 
     def require_options(self, title: str, options: Mapping[str, Any]) -> None:
         """Raise ConfigurationError for options that the env cannot have, whatever their values.
@@ -90,7 +95,12 @@ class SystemSummary:
                 require_bounds(name, low, high)
         if given.dt is not None:
             require_period(given.dt)
+        names = (*self.states, *self.features, *self.sensors, *self.parameters)
         # Rates of the inputs become states.
+        if given.rate_limit is not None:
+            names += self.inputs
+        if isinstance(given.measurement, list):
+            require_names(given.measurement, names)
         if given.rate_limit is None:
             self._require_start(given.start)
 
@@ -143,6 +153,8 @@ def summary_of(env_id: str) -> SystemSummary:
         parameters=tuple(levels),
         barrier=tuple(inspect.signature(env.problem_factory).parameters),
         starts=tuple(problem.starts),
+        features=tuple(f.name for f in problem.features),
+        sensors={channel.name: channel.noise for channel in problem.sensors},
     )
 
 

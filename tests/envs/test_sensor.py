@@ -1,0 +1,374 @@
+"""Envs that are measured report noisy, biased, lost and late samples, and nothing else changes."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import json
+import math
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sympy as sp
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from scipy.stats import binomtest, chi2, kstest
+
+from safe_envs import SafeEnv, SafeVectorEnv
+from safe_envs.dynamics.philox import NOISE, SENSOR, StreamReader, key_of
+from safe_envs.envs.array_batch import ArrayBatch
+from safe_envs.errors import NotCompilableError
+from safe_envs.problem.measurement import Channel, Measurement
+from safe_envs.systems import ENV_IDS
+from tests.conftest import problem_of
+from tests.envs.test_vector_env import assert_same, only_where_present, pair
+
+PENDULUM, ACC = "safe_envs/Pendulum-v0", "safe_envs/ACC-v0"
+DUBINS = "safe_envs/StochasticDubins-v0"
+COMPLETE = ["default:bias=.03:dropout=.3", "delay=2"]
+
+
+def walk(env, count, seed=3):
+    """Return the samples, the infos and the other results of some steps."""
+    rng = np.random.default_rng(0)
+    _, info = env.reset(seed=seed)
+    infos, samples, rest = [info], [env.measured], []
+    for _ in range(count):
+        _, reward, terminated, truncated, info = env.step(
+            rng.uniform(-1.0, 1.0, env.action_space.shape)
+        )
+        infos.append(info)
+        samples.append(env.measured)
+        rest.append((reward, terminated, truncated))
+    return samples, infos, rest
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_a_sensor_changes_nothing_but_what_is_observed(env_id, num_envs):
+    def walked(problem):
+        env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+        _, infos, rest = walk(env, 6)
+        return env.state.tobytes(), infos, [[np.array(v).tobytes() for v in row] for row in rest]
+
+    plain, measured = (walked(problem_of(env_id, measurement=m)) for m in (None, COMPLETE))
+    assert (plain[0], plain[2]) == (measured[0], measured[2])
+    for mine, other in zip(plain[1], measured[1], strict=True):
+        added = set(other) - set(mine)
+        assert added - {f"_{name}" for name in added} == {"state", "received"}
+        for key, value in mine.items():
+            np.testing.assert_array_equal(value, other[key])
+    np.testing.assert_array_equal(
+        measured[1][-1]["state"], np.frombuffer(measured[0]).reshape(np.shape(other["state"]))
+    )
+
+
+def test_an_env_without_the_option_has_no_sensor():
+    env, batch = SafeEnv(problem_of(PENDULUM)), SafeVectorEnv(problem_of(PENDULUM), 2)
+    _, info = env.reset(seed=0)
+    batch.reset(seed=0)
+    assert (env.measured, batch.measured) == (None, None)
+    assert not {"state", "received"} & set(info)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("env_id", [PENDULUM, "safe_envs/DubinsObstacle-v0"])
+def test_batches_equal_single_envs_with_autoreset(env_id, mode):
+    dt = problem_of(env_id).dt
+    ours, theirs = pair(env_id, mode, False, 3, measurement=COMPLETE, horizon=7 * dt)
+    mine, other = (env.reset(seed=7) for env in (ours, theirs))
+    assert_same(mine[0], other[0], "reset")
+    assert_same(only_where_present(mine[1]), only_where_present(other[1]), "reset info")
+    rng = np.random.default_rng(0)
+    for step in range(18):
+        actions = rng.uniform(-1.0, 1.0, ours.action_space.shape).astype(np.float32)
+        *mine, my_info = ours.step(actions)
+        *other, other_info = theirs.step(actions)
+        for a, b in zip(mine, other, strict=True):
+            assert_same(a, b, f"step {step}")
+        assert_same(
+            only_where_present(my_info), only_where_present(other_info), f"step {step}: info"
+        )
+
+
+def test_samples_do_not_depend_on_the_number_of_envs():
+    problem = problem_of(ACC, measurement=COMPLETE)
+    batches, env = [SafeVectorEnv(problem, n) for n in (1, 4)], SafeEnv(problem)
+    for batch in batches:
+        batch.reset(seed=[*range(8, 9 - batch.num_envs, -1), 5][-batch.num_envs :])
+    env.reset(seed=5)
+    for _ in range(300):
+        env.step(np.array([0.1]))
+        for batch in batches:
+            batch.step(np.full((batch.num_envs, 1), 0.1))
+        one, four = ([np.array([v[-1] for v in part]) for part in b.measured] for b in batches)
+        np.testing.assert_array_equal(one, four)
+        np.testing.assert_array_equal(one[1], env.measured.received)
+        # To the rounding of a square, as the states.
+        np.testing.assert_allclose(one[0], env.measured.values, rtol=1e-12)
+
+
+def test_the_errors_are_the_numbers_of_a_stream_of_their_own():
+    problem = problem_of(PENDULUM, measurement=["default:noise=.5:dropout=.4"])
+    samples, infos, _ = walk(SafeEnv(problem), 50, seed=11)
+    uniforms = StreamReader().seek(key_of(11), 0, SENSOR).uniforms((51, 4))
+    assert not np.array_equal(uniforms, StreamReader().seek(key_of(11), 0, NOISE).uniforms((51, 4)))
+    for (values, received), info, drawn in zip(samples, infos, uniforms, strict=True):
+        # An independent route to the quantile: lost where the uniform is below the probability.
+        assert list(received) == (drawn[2:] >= 0.4).tolist()
+        for value, has, x, u in zip(values, received, info["state"], drawn[:2], strict=True):
+            if has:
+                assert sp.erf((value - x) / (0.5 * math.sqrt(2.0))) == pytest.approx(
+                    2.0 * u - 1.0, abs=1e-12
+                )
+
+
+def test_errors_have_the_stated_mean_deviation_and_share_of_losses():
+    channels = (Channel("y", problem_of(PENDULUM).states[0].symbol, 0.2, bias=0.7, dropout=0.3),)
+    problem = problem_of(PENDULUM, measurement=Measurement(channels))
+    env = SafeVectorEnv(problem, 500)
+    _, info = env.reset(seed=1)
+    errors, lost, seen = [], 0, 0
+    for _ in range(40):
+        received = env.measured.received[0]
+        errors.append((env.measured.values[0] - info["state"][:, 0])[received])
+        lost, seen = lost + int((~received).sum()), seen + received.size
+        *_, info = env.step(np.zeros((500, 1)))
+    scaled = (np.concatenate(errors) - 0.7) / 0.2
+    assert kstest(scaled, "norm").pvalue > 1e-3
+    n = scaled.size
+    assert abs(scaled.mean()) < 4.0 / math.sqrt(n)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], n - 1)
+    assert low < scaled.var(ddof=1) * (n - 1) < high
+    interval = binomtest(lost, seen).proportion_ci(0.9999, "exact")
+    assert interval.low < 0.3 < interval.high
+
+
+@pytest.mark.parametrize("delay", [1, 5])
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_samples_arrive_exactly_so_many_periods_late(delay, num_envs):
+    def samples(items):
+        problem = problem_of(ACC, measurement=items)
+        env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+        return walk(env, 20)[0]
+
+    prompt, late = (
+        samples(["default:dropout=.2"]),
+        samples(["default:dropout=.2", f"delay={delay}"]),
+    )
+    for before in late[:delay]:
+        assert not np.any(before.received)
+        # The point of the Box nearest to 0, which holds 0 here.
+        assert not np.any(before.values)
+    for mine, other in zip(late[delay:], prompt, strict=False):
+        np.testing.assert_array_equal(mine.received, other.received)
+        np.testing.assert_array_equal(
+            np.where(mine.received, mine.values, 0.0), np.where(other.received, other.values, 0.0)
+        )
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_a_lost_sample_repeats_the_last_value(num_envs):
+    problem = problem_of(PENDULUM, measurement="default:dropout=.7")
+    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+    samples, _, _ = walk(env, 40)
+    for before, now in itertools.pairwise(samples):
+        same = np.equal(before.values, now.values)
+        np.testing.assert_array_equal(same, ~np.array(now.received))
+
+
+def test_observations_are_clipped_and_samples_are_not():
+    x = problem_of(PENDULUM).states[0].symbol
+    far = Measurement((Channel("y", 1e9 * x + 5e9, 0.0),))
+    env = SafeEnv(problem_of(PENDULUM, measurement=far))
+    observation, info = env.reset(seed=0)
+    assert observation.tolist() == [1e6]
+    assert env.measured.values == [pytest.approx(1e9 * info["state"][0] + 5e9)]
+
+
+def test_angles_are_known_modulo_a_turn():
+    problem = problem_of(DUBINS, measurement=["turned=100*theta:noise=1:period=3"])
+    box = SafeEnv(problem).observation_space
+    assert (box.low.tolist(), box.high.tolist()) == ([-1.5], [1.5])
+    env, batch = SafeEnv(problem), SafeVectorEnv(problem, 3)
+    for values in ([s.values for s in walk(env, 200)[0]], [s.values for s in walk(batch, 50)[0]]):
+        assert -1.5 < np.min(values) < -1.2
+        assert 1.2 < np.max(values) <= 1.5
+
+
+@pytest.mark.parametrize("num_envs", [None, 3])
+def test_a_sample_without_a_value_is_lost(num_envs):
+    problem = problem_of(
+        PENDULUM, measurement=["root=sqrt(theta):noise=.1", "default"], start=(0.3, -2.0)
+    )
+    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+    samples, infos, _ = walk(env, 40)
+    lost = 0
+    for (values, received), info in zip(samples, infos, strict=True):
+        np.testing.assert_array_equal(received[0], info["state"][..., 0] >= 0.0)
+        assert np.all(received[1:])
+        assert np.isfinite(values).all()
+        lost += int(np.sum(~np.asarray(received[0])))
+    assert lost
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_an_episode_from_a_later_time_has_the_errors_of_that_instant(num_envs):
+    problem = problem_of(ACC, measurement=["default:dropout=.3"])
+    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+    samples, infos, _ = walk(env, 12)
+    action = np.zeros(env.action_space.shape)
+    env.reset(seed=3, options={"state": infos[5]["state"], "t": 5 * problem.dt})
+    for k in (5, 6):
+        np.testing.assert_array_equal(env.measured.received, samples[k].received)
+        errors = [
+            np.where(s.received, s.values, 0.0) - np.where(s.received, c, 0.0)
+            for s, c in (
+                (samples[k], _exact(infos[k]["state"])),
+                (env.measured, _exact(env.state)),
+            )
+        ]
+        np.testing.assert_allclose(*errors, atol=1e-9)
+        env.step(action)
+
+
+def _exact(x):
+    own, lead, gap = np.moveaxis(x, -1, 0)
+    return [own, lead - own, gap]
+
+
+def test_a_state_that_is_set_is_measured_from_the_next_step_on():
+    problem = problem_of(PENDULUM, measurement=["default:noise=0"])
+    env, batch = SafeEnv(problem), SafeVectorEnv(problem, 2)
+    for each in (env, batch):
+        each.reset(seed=0)
+        before = np.array(each.measured.values)
+        each.state = np.array([0.1, 0.2])
+        np.testing.assert_array_equal(each.measured.values, before)
+        each.step(np.zeros(each.action_space.shape))
+        np.testing.assert_array_equal(np.moveaxis(each.state, -1, 0), each.measured.values)
+
+
+def test_a_restored_batch_goes_on_with_the_samples_under_way():
+    problem = problem_of(ACC, measurement=COMPLETE)
+    first, second = (SafeVectorEnv(problem, 2, max_episode_steps=9) for _ in range(2))
+    first.reset(seed=5)
+    actions = np.random.default_rng(1).uniform(-1.0, 1.0, (14, 2, 1))
+    for k in range(4):
+        first.step(actions[k])
+    second.reset(seed=99)
+    second.restore(first.snapshot(), seed=5)
+    np.testing.assert_array_equal(first.measured.values, second.measured.values)
+    for k in range(4, 14):
+        mine, other = (env.step(actions[k]) for env in (first, second))
+        for a, b in zip(mine[:4], other[:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(mine[4]["received"], other[4]["received"])
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))]
+)
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_copies_go_on_alone(copied, num_envs):
+    problem = problem_of(ACC, measurement=COMPLETE)
+    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 0.3)
+    for _ in range(5):
+        env.step(action)
+    other = copied(env)
+    mine = [env.step(action)[0].tolist() for _ in range(10)]
+    assert [other.step(action)[0].tolist() for _ in range(10)] == mine
+
+
+def test_a_reset_of_some_envs_leaves_the_samples_of_the_others():
+    problem = problem_of(ACC, measurement=COMPLETE)
+    env, plain = (SafeVectorEnv(problem, 3, "Disabled") for _ in range(2))
+    for each in (env, plain):
+        each.reset(seed=2)
+        for _ in range(4):
+            each.step(np.zeros((3, 1)))
+    before = np.array(env.measured.values)
+    _, info = env.reset(options={"reset_mask": np.array([False, True, False])})
+    np.testing.assert_array_equal(np.array(env.measured.values)[:, [0, 2]], before[:, [0, 2]])
+    assert not np.array(env.measured.values)[:, 1].any()
+    assert not info["received"][1].any()
+    for _ in range(6):
+        for each in (env, plain):
+            each.step(np.zeros((3, 1)))
+        for mine, other in zip(env.measured, plain.measured, strict=True):
+            np.testing.assert_array_equal(np.array(mine)[:, [0, 2]], np.array(other)[:, [0, 2]])
+
+
+def test_same_step_autoreset_keeps_the_last_samples():
+    problem = problem_of(ACC, measurement=["default:dropout=.2"], horizon=0.15)
+    env, plain = SafeVectorEnv(problem, 2, "SameStep"), SafeVectorEnv(problem, 2, "Disabled")
+    for each in (env, plain):
+        each.reset(seed=4)
+    for _ in range(3):
+        results = [each.step(np.zeros((2, 1))) for each in (env, plain)]
+    np.testing.assert_array_equal(env.episodes.last_sample.values, plain.measured.values)
+    np.testing.assert_array_equal(env.episodes.last_sample.received, plain.measured.received)
+    np.testing.assert_array_equal(np.stack(results[0][4]["final_obs"]), results[1][0])
+    np.testing.assert_array_equal(
+        np.stack(results[0][4]["final_info"]["received"]), results[1][4]["received"]
+    )
+    assert not np.array_equal(env.measured.values, plain.measured.values)
+
+
+def test_a_violation_ends_the_episode_by_the_true_state():
+    blind = Measurement((Channel("y", problem_of(DUBINS).states[0].symbol, 100.0),))
+    ends = []
+    for measurement in (None, blind):
+        env = SafeEnv(problem_of(DUBINS, measurement=measurement), terminate_on_violation=True)
+        env.reset(seed=0)
+        steps = 0
+        while not env.step(np.array([0.0]))[2]:
+            steps += 1
+        ends.append(steps)
+    assert ends[0] == ends[1]
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_envs_pass_the_checks_of_gymnasium(env_id):
+    env = gym.make(env_id, measurement="default", horizon=problem_of(env_id).dt * 20)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_envs_pass_the_check_of_stable_baselines():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker.check_env(gym.make(ACC, measurement=COMPLETE).unwrapped)
+
+
+@pytest.mark.parametrize(
+    "given", ["default", COMPLETE, {"x_1": 0.1, "gap": {"noise": 0.2}, "delay": 1}]
+)
+def test_envs_are_made_again_of_their_spec(given):
+    env = gym.make(ACC, measurement=given, sensor_noise=2.0)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert json.loads(env.spec.to_json())["kwargs"]["measurement"] == given
+    assert again.unwrapped.problem.measurement == env.unwrapped.problem.measurement
+    batch = gym.make_vec(ACC, 2, measurement=given, sensor_noise=2.0)
+    np.testing.assert_array_equal(batch.reset(seed=0)[0][0], again.reset(seed=0)[0])
+
+
+def test_the_compiled_engine_leaves_sensors_to_numpy():
+    problem = problem_of(ACC, measurement="default")
+    with pytest.raises(NotCompilableError, match="has a sensor"):
+        SafeVectorEnv(problem, 2, engine="compiled")
+    assert isinstance(SafeVectorEnv(problem, 2, engine="auto")._batch, ArrayBatch)
+
+
+def test_pictures_are_of_the_true_state():
+    pytest.importorskip("pygame")
+    frames = []
+    for measurement in (None, ["default:bias=.5"]):
+        env = SafeEnv(problem_of(PENDULUM, measurement=measurement), render_mode="rgb_array")
+        env.reset(seed=0)
+        env.step(np.array([0.5]))
+        frames.append(env.render())
+    np.testing.assert_array_equal(*frames)
