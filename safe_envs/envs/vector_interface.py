@@ -21,7 +21,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
 
-class VectorInterface(
+class VectorInterface(  # pyright: ignore[reportIncompatibleVariableOverride]
     OwnSpec, IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
 ):
     """Spaces, metadata, spec and seeds of a batch of envs; base of `SafeVectorEnv`.
