@@ -79,8 +79,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self.action_space = action_box(problem)
         self.render_mode = render_mode
         self._simulation = Simulation(problem, "floats")
-        center, half = center_and_half_width(problem)
-        self._scales = list(zip(center, half, strict=True))
+        self._scales = list(zip(*center_and_half_width(problem), strict=True))
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
         self._ends_on_violation = flag("terminate_on_violation", terminate_on_violation)
@@ -88,8 +87,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._reader = StreamReader()
         self._key: Key | None = None
         self._number = 0
-        self.sent: Sequence[float] = ()
-        self.executed: Sequence[float] = ()
+        self.sent = self.executed = ()
         self._actuators = None if problem.direct else Actuators(problem)
         self._sensor = sensor_of(problem, self._limit)
         self._x: tuple[float, ...] | None = None
@@ -289,8 +287,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
                 f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or"
                 " raise substeps"
             )
-        left = outside > 0.0
-        if left:
+        if left := outside > 0.0:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
         info = episode.count(barriers, h)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
 
 from safe_envs.dynamics.codegen import compile_function, filled, stacked
 from safe_envs.dynamics.philox import SENSOR, Key
@@ -36,6 +36,8 @@ class Sample(NamedTuple):
 class _Sensor:
     """The part of a sensor that does not depend on the number of envs.
 
+    A sample that is no finite number, such as a range beyond where its formula is defined, is lost.
+
     The errors of the sample of control instant i are the words 2 k i to 2 k (i + 1) of the
     episode's stream `SENSOR`: k normal numbers of the noise, and k that decide which samples are
     lost. So they depend on the seed, the episode and the instant alone.
@@ -45,10 +47,10 @@ class _Sensor:
         channels = measurement.channels
         self._channels, self._delay = channels, measurement.delay
         plant = problem.plant
-        formulas = [plant.numeric(channel.expression) for channel in channels]
-        self._measure = compile_function(plant.states, formulas, flavour)
+        self._formulas = [plant.numeric(channel.expression) for channel in channels]
+        self._measure = compile_function(plant.states, self._formulas, flavour)
         # A sample is lost where its second normal number is below the quantile.
-        self._lost_below = [float(ndtri(channel.dropout)) for channel in channels]
+        self._lost_below = [_quantile(channel.dropout) for channel in channels]
         box = observation_box(problem)
         self._low, self._high = box.low, box.high
         nearest = np.clip(0.0, self._low.astype(float), self._high.astype(float))
@@ -74,6 +76,10 @@ class Sensor(_Sensor):
 
     def __init__(self, problem: SafetyProblem, measurement: Measurement, periods: int) -> None:
         super().__init__(problem, measurement, "floats")
+        self._apart = [
+            compile_function(problem.plant.states, (formula,), "floats")
+            for formula in self._formulas
+        ]
         self._noise = NoiseStream(self.draws, periods + 1, SENSOR)
         self._nothing = Sample(self._before_any, [False] * len(self._channels))
         self._restart()
@@ -94,9 +100,12 @@ class Sensor(_Sensor):
         draws, k = self._noise.next(), len(self._channels)
         values = [
             _wrapped(c, value + c.bias + c.noise * v)
-            for c, value, v in zip(self._channels, self._measure(*x), draws[:k], strict=True)
+            for c, value, v in zip(self._channels, self._readings(x), draws[:k], strict=True)
         ]
-        received = [d >= low for d, low in zip(draws[k:], self._lost_below, strict=True)]
+        received = [
+            d >= low and math.isfinite(value)
+            for d, low, value in zip(draws[k:], self._lost_below, values, strict=True)
+        ]
         self._under_way.append(Sample(values, received))
         arrived = self._under_way.popleft()
         values = [
@@ -108,6 +117,13 @@ class Sensor(_Sensor):
     def report(self, x: Sequence[float]) -> Info:
         """Return what a measured env adds to the info; see `safe_envs.envs.info`."""
         return {"state": np.array(x), "received": np.array(self.sample.received)}
+
+    def _readings(self, x: Sequence[float]) -> Sequence[float]:
+        """Return what is measured without an error, NaN where it has no value."""
+        try:
+            return self._measure(*x)
+        except (ArithmeticError, ValueError):
+            return [_value_or_nan(measure, x) for measure in self._apart]
 
     def _restart(self) -> None:
         self.sample = self._nothing
@@ -162,12 +178,15 @@ class BatchSensor(_Sensor):
         self.sample = merged(begun, nothing, self.sample)
 
     def observe(self, x: Sequence[np.ndarray], fresh: np.ndarray | None) -> np.ndarray:
-        """Take a sample of the states, and return the observations, float32 (num_envs, k).
+        """Take a sample of the states.
 
         Args:
             x: components of the states.
             fresh: the envs that have just begun, of which alone a sample is taken; None for a
                 sample of all.
+
+        Returns:
+            The observations, float32 (num_envs, k).
         """
         new, last = self._sampled(x, self.noise.next(fresh)), self.sample
         if fresh is None:
@@ -210,12 +229,28 @@ class BatchSensor(_Sensor):
 
     def _sampled(self, x: Sequence[np.ndarray], draws: np.ndarray) -> Sample:
         k = len(self._channels)
-        values = [
-            _wrapped_batch(c, filled(value, self._shape) + (c.bias + c.noise * v))
-            for c, value, v in zip(self._channels, self._measure(*x), draws[:k], strict=True)
+        with np.errstate(all="ignore"):
+            values = [
+                _wrapped_batch(c, filled(value, self._shape) + c.bias + c.noise * v)
+                for c, value, v in zip(self._channels, self._measure(*x), draws[:k], strict=True)
+            ]
+        received = [
+            (d >= low) & np.isfinite(value)
+            for d, low, value in zip(draws[k:], self._lost_below, values, strict=True)
         ]
-        received = [d >= low for d, low in zip(draws[k:], self._lost_below, strict=True)]
         return Sample(values, received)
+
+
+def _value_or_nan(measure: Callable[..., Sequence[float]], x: Sequence[float]) -> float:
+    try:
+        return measure(*x)[0]
+    except (ArithmeticError, ValueError):
+        return math.nan
+
+
+def _quantile(probability: float) -> float:
+    """Return the number below which a standard normal one is with a probability below 1."""
+    return NormalDist().inv_cdf(probability) if probability else -math.inf
 
 
 def sensor_of(problem: SafetyProblem, periods: int) -> Sensor | None:
@@ -262,7 +297,9 @@ def merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
 def _wrapped(channel: Channel, value: float) -> float:
     """Return a value within half a period of 0."""
     period = channel.period
-    return value - period * math.ceil(value / period - 0.5) if period else value
+    if not period or not math.isfinite(value):
+        return value
+    return value - period * math.ceil(value / period - 0.5)
 
 
 def _wrapped_batch(channel: Channel, values: np.ndarray) -> np.ndarray:

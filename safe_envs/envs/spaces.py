@@ -34,6 +34,12 @@ def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
     return gym.spaces.Box(low.copy(), high.copy(), dtype=np.float32)
 
 
+def observation_names(problem: SafetyProblem) -> list[str]:
+    """Return the names of the entries of an observation."""
+    measured = problem.measurement
+    return [each.name for each in (problem.features if measured is None else measured.channels)]
+
+
 def channel_bounds(problem: SafetyProblem, channel: Channel) -> tuple[float, float]:
     """Return bounds of what a channel of the sensor measures.
 

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from safe_envs.errors import ConfigurationError, require_whole, shown
+from safe_envs.problem.option_errors import LONGEST_DELAY
 from safe_envs.validators import numbers_in
-
-LONGEST_DELAY = 1000
-"""Control periods: all inputs under way are kept, and predicted with at every decision."""
 
 Limits = tuple[tuple[float, float], ...]
 """(low, high) of the rate of each input, in its unit per second."""

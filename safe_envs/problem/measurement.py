@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_whole, shown
-from safe_envs.problem.actuators import LONGEST_DELAY
+from safe_envs.errors import (
+    ConfigurationError,
+    SystemDefinitionError,
+    require_whole,
+    shortened,
+    shown,
+)
+from safe_envs.problem.option_errors import LONGEST_DELAY
 
 _DEFAULT_NOISE = 0.01
-"""Standard deviation of the fallback's channels, as a part of the range of their features."""
+"""Standard deviation of the fallback's channels: this part of a range, or this in its unit."""
+
+_LARGEST = 1e30
+"""Of noise, bias and period: observations are in single precision, and hold ten times as much."""
+
+_SHORTEST = 1e-9
+"""Of a period: the quotient of a number and it is a number."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +52,16 @@ class Channel:
 
     def __post_init__(self) -> None:
         allowed = {
-            "noise": (0.0, math.inf, "a number >= 0"),
-            "bias": (-math.inf, math.inf, "a finite number"),
-            "dropout": (0.0, 1.0, "a probability below 1"),
-            "period": (0.0, math.inf, "a number >= 0, 0 for none"),
+            "noise": (0.0, _LARGEST, f"a number from 0, below {_LARGEST:g}"),
+            "bias": (-_LARGEST, _LARGEST, f"a number between -{_LARGEST:g} and {_LARGEST:g}"),
+            "dropout": (0.0, 1.0, "a probability from 0, below 1"),
+            "period": (_SHORTEST, _LARGEST, f"0 for none, or a number from {_SHORTEST:g}"),
         }
         for setting, (low, high, words) in allowed.items():
             value = getattr(self, setting)
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (is_number and math.isfinite(value) and low <= value < high):
+            none = setting == "period" and is_number and value == 0
+            if not (none or (is_number and low <= value < high)):
                 raise ConfigurationError(
                     f"{setting} = {shown(value)} of the measurement {self.name}; give {words}"
                 )
@@ -76,8 +88,8 @@ class Measurement:
         names = [channel.name for channel in self.channels]
         if not names or len(set(names)) < len(names):
             raise ConfigurationError(
-                f"a measurement has the channels {', '.join(names) or 'none'}; give at least one,"
-                " each with a name of its own"
+                f"a measurement has the channels {shortened(', '.join(names) or 'none')}; give at"
+                " least one, each with a name of its own, like NAME=EXPR"
             )
         require_whole("delay of the measurement", self.delay, 0)
         if self.delay > LONGEST_DELAY:
@@ -93,34 +105,57 @@ class Measurement:
             plant: the `ControlAffineSDE` whose states are measured.
         """
         for channel in self.channels:
-            plant.require_known(
-                f"the measurement {channel.name}",
-                channel.expression.free_symbols,
-                (*plant.states, *plant.parameters),
-            )
+            used, what = channel.expression.free_symbols, f"the measurement {channel.name}"
+            plant.require_known(what, used, (*plant.states, *plant.parameters))
+            if not used.intersection(plant.states):
+                names = ", ".join(map(str, plant.states))
+                raise SystemDefinitionError(f"{what} depends on no state; the states are {names}")
 
 
 def default_measurement(problem: Any) -> Measurement:
     """Return the realistic sensor of a problem.
 
-    Those are its own `sensors`. Where it states none, each feature of the observation is measured
-    with a standard deviation of 1 % of its range.
+    Those are its own `sensors`. Where it states none, each feature of the observation that is one
+    of the states alone is measured, and each state of which no such feature tells, with a standard
+    deviation of 1 % of its range, or of .01 where the range is not finite.
 
     Args:
         problem: a `SafetyProblem`.
-
-    Raises:
-        SystemDefinitionError: A feature depends on the time alone, which no sensor measures.
     """
     if problem.sensors:
         return Measurement(problem.sensors)
     states = set(problem.plant.states)
-    features = [f for f in problem.features if f.expression.free_symbols & states]
-    if not features:
-        raise SystemDefinitionError(f"no feature of {problem.name} depends on a state")
+    found = {
+        f.name: (f.expression, f.low, f.high)
+        for f in problem.features
+        if f.expression.free_symbols and f.expression.free_symbols <= states
+    }
+    told = set().union(*(expression.free_symbols for expression, *_ in found.values()))
+    found |= {
+        v.symbol.name: (v.symbol, v.low, v.high) for v in problem.states if v.symbol not in told
+    }
     return Measurement(
-        tuple(Channel(f.name, f.expression, _DEFAULT_NOISE * (f.high - f.low)) for f in features)
+        tuple(
+            Channel(name, expression, _DEFAULT_NOISE * (span if 0.0 < span < _LARGEST else 1.0))
+            for name, (expression, low, high) in found.items()
+            for span in (high - low,)
+        )
     )
+
+
+def require_full_state(problem: Any, what: str) -> None:
+    """Raise ConfigurationError where the observation is a measurement.
+
+    Args:
+        problem: a `SafetyProblem`.
+        what: acts on the observation of the full state, a plural.
+    """
+    if problem.measurement is not None:
+        raise ConfigurationError(
+            f"{what} act on the full state, and {problem.name} is measured: give an estimator, as"
+            " by --estimator ekf or StateEstimatorWrapper, and here the problem's `unmeasured`; or"
+            " leave the measurement out"
+        )
 
 
 def require_autonomous(which: str, system: Any) -> None:

@@ -6,23 +6,27 @@ Each item names what is measured, with settings after colons:
     [NAME=]EXPR[:noise=S][:bias=B][:dropout=P][:period=T]
     delay=D                                     control periods, of all that is measured
 
-EXPR is arithmetic of states and parameters; the name of a channel of the default sensor, or of a
-feature, stands for its expression. A channel of the default sensor brings its settings along, and
-what depends on `atan2` is known modulo 2 pi.
+EXPR is arithmetic of states and parameters; the name of a feature stands for its expression. EXPR
+may be the name of a channel of the default sensor too, which brings its settings along. What holds
+`atan2` is known modulo 2 pi by default.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.number_text import finite_number
+from safe_envs.problem.option_errors import LONGEST_DELAY
 
 _SETTINGS = ("noise", "bias", "dropout", "period")
-_MOST_ITEMS = 100
+_WORDS = (*_SETTINGS, "default", "delay")
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,39}")
+_MOST_ITEMS, _MOST_CHARACTERS, _LONGEST_NAME = 100, 1000, 40
 _FORM = "write 'default', 'EXPR:noise=S:bias=B:dropout=P', or 'delay=D'"
 
 
@@ -42,8 +46,14 @@ def read_items(option: str, texts: Any) -> list[str]:
     items = [texts] if isinstance(texts, str) else list(texts)
     if not 0 < len(items) <= _MOST_ITEMS:
         raise ConfigurationError(f"{option} has {len(items)} items; give 1 to {_MOST_ITEMS}")
-    for item in items:
-        _parts(option, item)
+    heads = [_parts(option, item)[0] for item in items]
+    names = [head.partition("=")[0] for head in heads]
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigurationError(
+            f"{option} has {shown(twice[0])} more than once; give each a name of its own, like"
+            " NAME=EXPR"
+        )
     return items
 
 
@@ -76,8 +86,6 @@ def measurement_of(problem: Any, given: Any, factor: float | None = None) -> Any
         raise ConfigurationError(
             f"sensor_noise = {factor}: nothing is measured; give measurement='default' too"
         )
-    if factor < 0.0:
-        raise ConfigurationError(f"sensor_noise = {factor}; give a factor >= 0")
     scaled = [replace(c, noise=factor * c.noise) for c in found.channels]
     return replace(found, channels=tuple(scaled))
 
@@ -86,10 +94,10 @@ def _listed(given: Any) -> list[str]:
     """Return what options may give as a list of items."""
     if isinstance(given, Mapping):
         items = []
-        for name, settings in given.items():
-            if not isinstance(settings, Mapping):
-                settings = {"noise": settings}
-            items.append(":".join([str(name), *(f"{k}={v}" for k, v in settings.items())]))
+        for name, value in given.items():
+            settings = value if isinstance(value, Mapping) else {"noise": value}
+            parts = [f"{k}={v}" for k, v in settings.items()]
+            items.append(f"delay={value}" if name == "delay" else ":".join([str(name), *parts]))
         given = items
     if not (isinstance(given, str | Sequence) and all(isinstance(i, str) for i in given)):
         raise ConfigurationError(
@@ -101,19 +109,22 @@ def _listed(given: Any) -> list[str]:
 
 def _parts(option: str, item: Any) -> tuple[str, dict[str, float]]:
     """Return the head of an item and its settings."""
-    if not isinstance(item, str) or len(item) > 1000:
-        raise ConfigurationError(f"{option} {shown(item)}: {_FORM}")
+    if not isinstance(item, str) or len(item) > _MOST_CHARACTERS:
+        raise ConfigurationError(
+            f"{option} {shown(item)}: {_FORM}, in at most {_MOST_CHARACTERS} characters"
+        )
     head, *entries = [part.strip() for part in item.split(":")]
+    head = re.sub(r"\s*=\s*", "=", head)
     found: dict[str, float] = {}
     for entry in entries:
-        name, _, value = entry.partition("=")
+        name, _, value = (part.strip() for part in entry.partition("="))
         if name not in _SETTINGS:
             raise ConfigurationError(
                 f"{option} {shown(item)}: unknown setting {shown(name)}; {nearest(name, _SETTINGS)}"
             )
         if name in found:
             raise ConfigurationError(f"{option} {shown(item)}: {name} comes twice; give it once")
-        found[name] = finite_number(f"{name} of {option} {shown(head)}", value)
+        found[name] = _setting(f"{name} of {option} {shown(head)}", name, value)
     if not head:
         raise ConfigurationError(f"{option} {shown(item)} names nothing that is measured; {_FORM}")
     if head == "default" and "period" in found:
@@ -122,14 +133,35 @@ def _parts(option: str, item: Any) -> tuple[str, dict[str, float]]:
         )
     if head.startswith("delay="):
         _delay(option, head, found)
+    elif head != "default":
+        _require_name(option, head)
     return head, found
+
+
+def _setting(what: str, name: str, value: str) -> float:
+    found = finite_number(what, value)
+    if (name != "bias" and found < 0.0) or (name == "dropout" and found >= 1.0):
+        allowed = "a probability from 0, below 1" if name == "dropout" else "a number from 0"
+        raise ConfigurationError(f"{what} = {found:g}; give {allowed}")
+    return found
+
+
+def _require_name(option: str, head: str) -> None:
+    name, equals, text = head.partition("=")
+    if name in _WORDS or "=" in text or (equals and not (text and _NAME.fullmatch(name))):
+        raise ConfigurationError(
+            f"{option} {shown(head)}: give NAME=EXPR, with a name of up to {_LONGEST_NAME} letters,"
+            f" digits and underscores that is none of {', '.join(_WORDS)}; settings follow the"
+            " expression, EXPR:noise=S"
+        )
 
 
 def _delay(option: str, head: str, settings: Mapping[str, float]) -> int:
     value = finite_number(f"{option} delay", head.removeprefix("delay="))
-    if settings or value != int(value):
+    if settings or not (value.is_integer() and 0 <= value <= LONGEST_DELAY):
         raise ConfigurationError(
-            f"{option} {shown(head)}: give a whole number of control periods alone, delay=2"
+            f"{option} {shown(head)}: give a whole number of control periods from 0 to"
+            f" {LONGEST_DELAY} alone, like delay=2"
         )
     return int(value)
 
@@ -163,16 +195,28 @@ def _channel(problem: Any, known: Sequence[Any], head: str, settings: Mapping[st
     if text in by_name:
         return replace(by_name[text], name=name.strip(), **settings)
     plant = problem.plant
-    names = {
-        **{f.name: f.expression for f in problem.features},
-        **{s.name: s for s in (*plant.parameters, *plant.states)},
-    }
+    # Of two meanings of a name, the first one counts.
+    meanings = (
+        *((s.name, s) for s in plant.states),
+        *((f.name, f.expression) for f in problem.features),
+        *((s.name, s) for s in plant.parameters),
+    )
+    names: dict[str, Any] = {}
+    for known_name, meaning in meanings:
+        names.setdefault(known_name, meaning)
     where = f"measurement {shown(name)}"
     expression = read_expression(text, names, where, SENSOR_FUNCTIONS)
     if "noise" not in settings:
         raise ConfigurationError(
-            f"{where} has no noise; give its standard deviation, {shown(head)}:noise=S; those with"
-            f" one of their own are {', '.join(by_name)}"
+            f"{where} has no noise; give its standard deviation, {head}:noise=S; those with one of"
+            f" their own are {', '.join(by_name)}"
+        )
+    unknown = expression.free_symbols.difference(plant.states, plant.parameters)
+    if unknown or not expression.free_symbols.intersection(plant.states):
+        states = ", ".join(map(str, plant.states))
+        raise ConfigurationError(
+            f"{where} depends on {', '.join(map(str, unknown)) or 'no state'}; give an expression"
+            f" of the states {states}"
         )
     period = 2.0 * math.pi if expression.has(sp.atan2) else 0.0
     return Channel(name.strip(), expression, **{"period": period, **settings})

@@ -11,6 +11,9 @@ from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown
 
+LONGEST_DELAY = 1000
+"""Control periods: all inputs under way are kept, and predicted with at every decision."""
+
 _WIDEST = 1e100
 """Largest bound of an input: its square, an effort, is still a number."""
 

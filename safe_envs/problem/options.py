@@ -145,6 +145,8 @@ class ProblemOptions:
         for name in ("dt", "horizon", "sensor_noise"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, finite_number(name, getattr(self, name)))
+        if self.sensor_noise is not None and self.sensor_noise < 0.0:
+            raise ConfigurationError(f"sensor_noise = {self.sensor_noise:g}; give a factor from 0")
 
     @classmethod
     def of(

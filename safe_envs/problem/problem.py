@@ -272,15 +272,16 @@ class SafetyProblem:
                 replace(i, low=low, high=high)
                 for i, (low, high) in zip(self.inputs, pairs, strict=True)
             )
-        if given.measurement is not None or given.sensor_noise is not None:
-            changes["measurement"] = measurement_of(self, given.measurement, given.sensor_noise)
         if given.slew_limit is not None:
             changes["slew_limit"] = rate_limits("slew_limit", given.slew_limit, len(self.inputs))
         if given.rate_limit is not None:
             limits = rate_limits("rate_limit", given.rate_limit, len(self.inputs))
             free = replace(self, **changes)
+            rest = {"measurement": given.measurement, "sensor_noise": given.sensor_noise}
             start = with_resting_inputs(given.start, free)
-            return replace(free, **with_rates(free, limits)).configured(start=start)
+            return replace(free, **with_rates(free, limits)).configured(start=start, **rest)
+        if given.measurement is not None or given.sensor_noise is not None:
+            changes["measurement"] = measurement_of(self, given.measurement, given.sensor_noise)
         start = given.start
         if isinstance(start, str):
             if start not in self.starts:

@@ -43,6 +43,7 @@ from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.actuators import Limits, resting_input
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.measurement import Channel
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable, input_bounds
@@ -50,6 +51,9 @@ from safe_envs.validators import numbers_in
 
 _ROUNDING = 1e-6
 """Part of the width of an input's bounds by which its range as a state is wider."""
+
+_INPUT_NOISE = 1e-3
+"""Standard deviation of a sensor of an input, as a part of the width of its bounds."""
 
 _DEGREE_FREE = ("hocbf", "szcbf")
 """Default filters for every relative degree, which stay."""
@@ -67,6 +71,8 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
     - The reward, an expression of the executed input, takes the one that a period ends with.
     - The goal of the joint QP is left out: of its V, one derivative does not hold the rate.
     - The backup is left out: its laws give the input, not the rate.
+    - A sensor that the problem states gets the inputs, with a standard deviation of a thousandth of
+      the width of their bounds. What was measured of the problem without limits stays as it is.
 
     Args:
         problem: a `SafetyProblem` without limits.
@@ -104,6 +110,7 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
         "filter": problem.filter if problem.filter in _DEGREE_FREE else suitable,
         "clf": None,
         "backup": None,
+        "sensors": problem.sensors and (*problem.sensors, *map(_input_sensor, problem.inputs)),
         "sampling": _sampling(problem.sampling, ranges),
         "frame": _framed(problem.frame, problem.inputs),
         "rates": limits,
@@ -157,6 +164,10 @@ def require_apart(given: ProblemOptions, problem: Any) -> None:
 def _as_state(v: Variable) -> Variable:
     wider = _ROUNDING * (v.high - v.low)
     return replace(v, low=v.low - wider, high=v.high + wider)
+
+
+def _input_sensor(v: Variable) -> Channel:
+    return Channel(v.symbol.name, v.symbol, _INPUT_NOISE * (v.high - v.low))
 
 
 def _rate_of(v: Variable, ends: tuple[float, float]) -> Variable:

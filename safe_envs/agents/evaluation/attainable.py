@@ -123,6 +123,8 @@ def attainable_safety(
     """
     require_whole("episodes", episodes, 0)
     require_confidence(confidence)
+    # A value is that of the true state, whatever is measured of it.
+    problem = problem.unmeasured
     world = problem if settings.knowledge == "plant" else replace(problem, plant=problem.model)
     policy = BestPolicy(world, settings, file)
     part = _TABLE_WORK if episodes else 1.0

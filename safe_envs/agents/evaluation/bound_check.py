@@ -58,7 +58,7 @@ class Horizon:
 
 
 @dataclass(frozen=True)
-class Measurement:
+class MeasuredSafety:
     """The measured safety from a start.
 
     Attributes:
@@ -85,8 +85,8 @@ class Measurement:
 
 
 def judged(
-    bounds: Sequence[Bound], measurements: Sequence[Measurement], verification: Verification
-) -> tuple[list[Bound], list[Measurement]]:
+    bounds: Sequence[Bound], measurements: Sequence[MeasuredSafety], verification: Verification
+) -> tuple[list[Bound], list[MeasuredSafety]]:
     """Withhold the values of what was estimated and is contradicted.
 
     See `safe_envs.agents.evaluation.contradiction`.
@@ -125,7 +125,7 @@ def measure(
     seed: int = 0,
     engine: str = "auto",
     progress: Progress | None = None,
-) -> list[Measurement]:
+) -> list[MeasuredSafety]:
     """Simulate a policy under the conditions, and compare its safety with the bounds.
 
     The starts are the problem's, and the one where the printed bound is largest.
@@ -191,7 +191,7 @@ def _measure(
     seed: int,
     engine: str,
     progress: Progress | None,
-) -> Measurement:
+) -> MeasuredSafety:
     formulas, starts = verification.formulas, starts_of(world, seed)
     lasting = formulas.noisy and any(
         b.forever and b.value
@@ -219,7 +219,7 @@ def _measure(
         horizons += [_horizon(verification, answer, k * world.duration, starts) for k in run]
         visited += answer.visited[answer.rows[0].filter]
         repeats, done = answer.is_deterministic, done + run[-1]
-    return Measurement(
+    return MeasuredSafety(
         name,
         starts[0] if len(starts) == 1 else None,
         episodes,
@@ -257,7 +257,7 @@ def _horizon(
     return Horizon(time, curve.safe[i], curve.rate[i], curve.ci_low[i], curve.ci_high[i], bounds)
 
 
-def _all_compared(found: list[Measurement]) -> list[Measurement]:
+def _all_compared(found: list[MeasuredSafety]) -> list[MeasuredSafety]:
     comparisons = max(
         1, sum(bool(bound.value) for m in found for h in m.horizons for bound in h.bounds)
     )
@@ -266,7 +266,7 @@ def _all_compared(found: list[Measurement]) -> list[Measurement]:
     ]
 
 
-def _compared(measurement: Measurement, horizon: Horizon, comparisons: int) -> Horizon:
+def _compared(measurement: MeasuredSafety, horizon: Horizon, comparisons: int) -> Horizon:
     """Name the bounds above the interval, or above the rate where nothing is random.
 
     A mean over starts may lie above the mean over all starts by a few of its standard errors.

@@ -66,6 +66,8 @@ def frontier(
     """
     settings = settings or FrontierSettings()
     # Unknown names are errors before a long computation.
+    # A price is that of the true state, whatever is measured of it.
+    problem = problem.unmeasured
     wanted, left_out = _resolved(problem, spec)
     parts = WorkParts(progress, 1 + len(wanted) + settings.policies)
     points = []

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety, contradicted
-from safe_envs.agents.evaluation.bound_check import Measurement
+from safe_envs.agents.evaluation.bound_check import MeasuredSafety
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.held_input import HeldAverager, held_bound_of
@@ -61,7 +61,7 @@ def safety_chain(
     verification: Verification,
     starts: np.ndarray,
     bounds: Sequence[Bound],
-    measurements: Sequence[Measurement],
+    measurements: Sequence[MeasuredSafety],
     policy: str = "nominal",
 ) -> SafetyChain:
     """Return the chain of conditions, without what contradicts another part of it.

@@ -11,6 +11,7 @@ import numpy as np
 from safe_envs.agents.policies.base import Policy, checked_observation
 from safe_envs.agents.policies.observed_state import ObservedState
 from safe_envs.envs.spaces import center_and_half_width
+from safe_envs.problem.measurement import require_full_state
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.reduction import reduced
@@ -38,8 +39,8 @@ class BestPolicy(Policy):
         settings: of the table.
 
     Raises:
-        ConfigurationError: There is no table of the problem, as of one with too many states, or
-            the observation does not determine a state that the table needs.
+        ConfigurationError: The problem is measured, there is no table of it, as of one with too
+            many states, or the observation does not determine a state that the table needs.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class BestPolicy(Policy):
         settings: ValueSettings | None = None,
         file: Path | None = None,
     ) -> None:
+        require_full_state(problem, "policies of tables")
         self.problem, self._file = problem, file
         self.settings = settings or ValueSettings(knowledge="plant")
         asked = self.settings

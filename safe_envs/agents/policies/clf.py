@@ -13,6 +13,7 @@ from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.problem.clf import CLF
+from safe_envs.problem.measurement import require_full_state
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.filter_qp import FilterQP, FilterQPSolver, UndefinedConstraintError
 
@@ -30,12 +31,14 @@ class CLFController(StatelessPolicy):
         clf: the goal; that of the problem by default.
 
     Raises:
-        ConfigurationError: there is no goal, or the observation does not hold the states.
+        ConfigurationError: the problem is measured, there is no goal, or the observation does not
+            hold the states.
 
     Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2.
     """
 
     def __init__(self, problem: SafetyProblem, clf: CLF | None = None) -> None:
+        require_full_state(problem, "CLF controllers")
         goal = clf or problem.clf
         if goal is None:
             raise ConfigurationError(

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.policies.base import Spaces, StatelessPolicy
+from safe_envs.envs.spaces import observation_names
 from safe_envs.errors import ConfigurationError, InvalidInputError, SafeEnvsError, shortened
 from safe_envs.problem.problem import SafetyProblem
 
@@ -91,7 +92,7 @@ def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) 
         return made
     if callable(made):
         if spaces is None:
-            return FunctionPolicy(made, len(problem.features), len(problem.inputs))
+            return FunctionPolicy(made, len(observation_names(problem)), len(problem.inputs))
         return FunctionPolicy(made, *map(gym.spaces.flatdim, spaces))
     raise ConfigurationError(
         f"a {type(made).__name__} is no policy; give an object with predict(observation, state,"

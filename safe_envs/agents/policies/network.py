@@ -13,6 +13,7 @@ from safe_envs.agents.policies.base import require_spaces
 from safe_envs.agents.policies.names import POLICY_FILE, saved_policy_file
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.envs.env import action_box, observation_box
+from safe_envs.envs.spaces import observation_names
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.data import files
@@ -125,7 +126,7 @@ def _policy(content: files.Content, problem: SafetyProblem) -> NetworkPolicy:
     details, scaling = content.details, content.details["normalization"]
     network = Network.from_arrays(content.arrays, "actor", details["activation"])
     ends = (len(network.input_mean), len(network.output_mean))
-    if ends != (len(problem.features), len(problem.inputs)):
+    if ends != (len(observation_names(problem)), len(problem.inputs)):
         raise ValueError("the network is not one from observations to actions")
     normalization = None if scaling is None else Normalization.from_json(scaling)
     if normalization is not None and {len(normalization.mean), len(normalization.var)} != {ends[0]}:
@@ -155,7 +156,7 @@ def _spaces(problem: SafetyProblem) -> dict[str, Any]:
         for ends in (box.low, box.high)
     )
     return {
-        "features": [f.name for f in problem.features],
+        "features": observation_names(problem),
         "observation": {"low": low, "high": high},
     }
 

@@ -12,8 +12,9 @@ from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.philox import POLICY, EpisodeUniforms, episode_seeds
-from safe_envs.envs.spaces import center_and_half_width
+from safe_envs.envs.spaces import center_and_half_width, observation_names
 from safe_envs.errors import NumericalError
+from safe_envs.problem.measurement import require_full_state
 from safe_envs.problem.problem import SafetyProblem
 
 
@@ -24,9 +25,13 @@ class NominalController(StatelessPolicy):
 
     Args:
         problem: whose `nominal` laws, input bounds and features are taken.
+
+    Raises:
+        ConfigurationError: The problem is measured.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
+        require_full_state(problem, "nominal controllers")
         super().__init__(len(problem.features))
         self._name = problem.name
         self._box = problem.box
@@ -89,7 +94,7 @@ class ZeroController(StatelessPolicy):
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
-        super().__init__(len(problem.features))
+        super().__init__(len(observation_names(problem)))
         center, half = center_and_half_width(problem)
         inputs = [min(max(0.0, low), high) for low, high in problem.box]
         self._action = np.array([(u - c) / w for u, c, w in zip(inputs, center, half, strict=True)])
@@ -119,7 +124,7 @@ class RandomPolicy(StatelessPolicy):
     deterministic = False
 
     def __init__(self, problem: SafetyProblem, seed: int = 0) -> None:
-        super().__init__(len(problem.features))
+        super().__init__(len(observation_names(problem)))
         self._m = len(problem.inputs)
         self._generator = np.random.default_rng(seed)
         self._uniforms: EpisodeUniforms | None = None

@@ -20,6 +20,7 @@ from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, S
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.actuators import require_direct
+from safe_envs.problem.measurement import require_full_state
 from safe_envs.problem.problem import SafetyProblem
 
 PARTICLES = 250
@@ -123,6 +124,7 @@ def estimate_rare(
     )
     resolved = ResolvedEvaluation(spec)
     require_direct(resolved.problem, "estimates of rare events")
+    require_full_state(resolved.problem, "the filters of estimates of rare events")
     work = WorkParts(progress, resolved.parts + 2 * len(resolved.names))
     resolved.learn(work.part)
     config = {**resolved.config(), "particles": particles, "repetitions": repetitions}

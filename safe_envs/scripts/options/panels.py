@@ -9,7 +9,9 @@ PANELS: dict[str, str] = {
     ),
     "Time, start and bounds": "dt substeps horizon start box rate-limit barrier",
     "Filters": "filter knowledge objective learned",
-    "Noise and mismatch": "noise plant model delay model-delay slew-limit",
+    "Noise and mismatch": (
+        "noise plant model delay model-delay slew-limit measurement sensor-noise"
+    ),
     "Training": (
         "n-timesteps set action intervention-penalty promise-curriculum curriculum-part cost-limit"
         " violation-limit eval-freq eval-episodes resume train"

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.best_text import COMPUTED, attainable_text, is_certified
-from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
+from safe_envs.agents.evaluation.bound_check import Horizon, MeasuredSafety
 from safe_envs.agents.evaluation.bound_text import (
     bound_text,
     continuous_text,
@@ -161,7 +161,7 @@ def _cells(horizon: Horizon, names: Sequence[str]) -> Iterator[str | Text]:
         yield contradicted if name in horizon.contradicted else value or "withheld"
 
 
-def _verdict(measurements: Sequence[Measurement], numbers: Mapping[str, str]) -> str:
+def _verdict(measurements: Sequence[MeasuredSafety], numbers: Mapping[str, str]) -> str:
     horizons = [horizon for found in measurements for horizon in found.horizons]
     bounds = {bound.name: bound for horizon in horizons for bound in horizon.bounds}
     wrong = {name for horizon in horizons for name in horizon.contradicted}

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.bound_check import Measurement
+from safe_envs.agents.evaluation.bound_check import MeasuredSafety
 from safe_envs.agents.evaluation.safety_chain import SafetyChain
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
@@ -39,7 +39,7 @@ class VerifyAnswer:
     verification: Verification
     starts: np.ndarray
     bounds: Sequence[Bound]
-    measurements: Sequence[Measurement]
+    measurements: Sequence[MeasuredSafety]
     chain: SafetyChain
 
     @property
@@ -95,7 +95,7 @@ class VerifyAnswer:
         )
 
 
-def _measured(found: Measurement) -> dict[str, Any]:
+def _measured(found: MeasuredSafety) -> dict[str, Any]:
     horizons = [{**vars(h), "bounds": [vars(b) for b in h.bounds]} for h in found.horizons]
     shown = {key: getattr(found, key) for key in ("start", "state", "episodes", "repeats")}
     return {**shown, "horizons": horizons}

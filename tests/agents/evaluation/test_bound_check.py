@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.evaluation import bound_check
-from safe_envs.agents.evaluation.bound_check import Horizon, Measurement, measure, starts_of
+from safe_envs.agents.evaluation.bound_check import Horizon, MeasuredSafety, measure, starts_of
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.verification.results import Bound
@@ -150,7 +150,7 @@ def test_the_upper_end_errs_as_seldom_as_it_says(trials, error):
 def test_a_mean_over_starts_may_be_off_by_its_error():
     bound = Bound("a", 0.9, "estimated", "", error=0.01)
     nowhere = Horizon(1.0, 1750, 0.875, 0.87, 0.88, (bound,))
-    measurement = Measurement("s", None, 2000, False, (nowhere,))
+    measurement = MeasuredSafety("s", None, 2000, False, (nowhere,))
     assert bound_check._compared(measurement, nowhere, 1).contradicted == ()
     exact = replace(nowhere, bounds=(replace(bound, error=0.0),))
     assert bound_check._compared(measurement, exact, 1).contradicted == ("a",)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.evaluation import safety_chain as of
-from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
+from safe_envs.agents.evaluation.bound_check import Horizon, MeasuredSafety
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.safety_chain import safety_chain
 from safe_envs.agents.evaluation.yardstick import against_attainable, chained
@@ -46,7 +46,7 @@ def chain_of(verification, monkeypatch):
 def measured(rate, episodes=100, repeats=False):
     safe = round(rate * episodes)
     horizon = Horizon(1.0, safe, rate, rate - 0.05, min(rate + 0.05, 1.0), ())
-    return Measurement("the start", None, episodes, repeats, (horizon,))
+    return MeasuredSafety("the start", None, episodes, repeats, (horizon,))
 
 
 def held_of(value, word="proved"):
