@@ -68,6 +68,7 @@ class Episodes:
             another array after each time.
         last_states: with same-step autoreset, the states in which the episodes that ended last did
             so, (num_envs, n); of the other envs anything.
+        last_steps: likewise, how many control periods they had, int64 (num_envs,).
         last_sample: likewise, what had arrived from their sensors, a `Sample`; None without any.
     """
 
@@ -81,6 +82,7 @@ class Episodes:
         self.started = False
         self.placements = np.zeros(num_envs, dtype=np.int64)
         self.last_states = np.empty((num_envs, 0))
+        self.last_steps = self.steps
         self.last_sample: Any = None
 
     def due(self) -> np.ndarray | None:
@@ -164,6 +166,16 @@ class Episodes:
         # What was counted before cannot lower the smallest value again.
         np.minimum(self.h_min, h, out=self.h_min)
         return safety_info(violation, cost, barriers, self.h_min.copy(), self.episode_cost.copy())
+
+    def keep_last(self, states: np.ndarray, sample: Any) -> None:
+        """Keep where all envs are, before those whose episodes have ended begin new ones.
+
+        Args:
+            states: shape (num_envs, n).
+            sample: a `Sample`, or None.
+        """
+        self.last_states, self.last_sample = states, sample
+        self.last_steps = self.steps.copy()
 
     def place(self, envs: np.ndarray) -> None:
         """Count that states were set in some envs, given by a mask."""

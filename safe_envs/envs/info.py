@@ -48,6 +48,28 @@ and from an env with the option `measurement`
 | `state` | float64 (n,) | true state, by which all else is judged |
 | `received` | bool (k,) | which channels of the sensor reported a sample at this instant |
 
+and with a state estimator
+
+| key | type | meaning |
+|---|---|---|
+| `estimate` | float64 (n,) | estimate of the state, at which filters above it decide |
+| `estimate_covariance` | float64 (n, n) | covariance P of its error, as the estimator believes |
+| `innovation` | float64 (k,) | what was measured less what was expected; 0 of lost samples |
+| `nees` | float | normalized estimation error squared, e' P^-1 e, with the true error |
+| `nees_dof` | int | degrees of freedom of it, the rank of P |
+| `nis` | float | normalized innovation squared of the last sample |
+| `nis_dof` | int | how many channels that sample had |
+| `lost` | int | values of channels that were lost in the episode so far |
+
+and with a filter that has conditions with `belief`
+
+| key | type | meaning |
+|---|---|---|
+| `belief_barrier` | float64 (k,) | the belief's barriers |
+
+With an estimator, the action and the flags of a filter are those at the estimate; cost, violation
+and barrier are those of the true state.
+
 and with a specification, of the trace of the episode so far
 
 | key | type | meaning |

@@ -174,8 +174,8 @@ class BatchSensor(_Sensor):
         begun = np.zeros(self._shape, dtype=bool)
         begun[envs] = True
         nothing = self._nothing
-        self._under_way = deque([_merged(begun, nothing, each) for each in self._under_way])
-        self.sample = _merged(begun, nothing, self.sample)
+        self._under_way = deque([merged(begun, nothing, each) for each in self._under_way])
+        self.sample = merged(begun, nothing, self.sample)
 
     def observe(self, x: Sequence[np.ndarray], fresh: np.ndarray | None) -> np.ndarray:
         """Take a sample of the states.
@@ -196,9 +196,9 @@ class BatchSensor(_Sensor):
             arrived = new
             if self._delay:
                 # Of an episode that has just begun nothing else is under way.
-                self._under_way[-1] = _merged(fresh, new, self._under_way[-1])
+                self._under_way[-1] = merged(fresh, new, self._under_way[-1])
                 arrived = self._nothing
-            arrived = _merged(fresh, arrived, last)
+            arrived = merged(fresh, arrived, last)
         values = [
             np.where(has, value, old) for value, has, old in zip(*arrived, last.values, strict=True)
         ]
@@ -278,8 +278,14 @@ def batch_sensor_of(
     return None if measured is None else BatchSensor(problem, measured, streams, periods)
 
 
-def _merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
-    """Return a sample that is one in some envs and another elsewhere."""
+def merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
+    """Return samples of a batch that are one in some envs and another elsewhere.
+
+    Args:
+        where: bool (num_envs,).
+        one: of the envs where it is True.
+        other: of the others.
+    """
     return Sample(
         *(
             [np.where(where, a, b) for a, b in zip(*pair, strict=True)]

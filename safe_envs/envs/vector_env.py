@@ -268,7 +268,7 @@ class SafeVectorEnv(VectorInterface):
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = last_of_episode(ended, observation, info)
-                episodes.last_states, episodes.last_sample = self.state, self.measured
+                episodes.keep_last(self.state, self.measured)
                 observation, _, _, _, info = stepper.begin(ended)
             episodes.begun = ended
         else:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from safe_envs.wrappers.env_wrappers.specification_monitor_vector import (
         SpecificationMonitorVector,
     )
+    from safe_envs.wrappers.env_wrappers.state_estimator import StateEstimatorWrapper
+    from safe_envs.wrappers.env_wrappers.state_estimator_vector import StateEstimatorVectorWrapper
     from safe_envs.wrappers.filter_qp import FilterDecision
     from safe_envs.wrappers.safety_filter import SafetyFilter
 
@@ -47,6 +49,8 @@ __all__ = [
     "SafetyMonitorVector",
     "SpecificationMonitor",
     "SpecificationMonitorVector",
+    "StateEstimatorVectorWrapper",
+    "StateEstimatorWrapper",
     "make_vec_with_cost",
     "make_with_cost",
 ]
@@ -68,6 +72,8 @@ _MODULES = {
     "SafetyMonitorVector": "safe_envs.wrappers.env_wrappers.monitor_vector",
     "SpecificationMonitor": "safe_envs.wrappers.env_wrappers.specification_monitor",
     "SpecificationMonitorVector": "safe_envs.wrappers.env_wrappers.specification_monitor_vector",
+    "StateEstimatorVectorWrapper": "safe_envs.wrappers.env_wrappers.state_estimator_vector",
+    "StateEstimatorWrapper": "safe_envs.wrappers.env_wrappers.state_estimator",
     "make_vec_with_cost": "safe_envs.wrappers.env_wrappers.cost_return",
     "make_with_cost": "safe_envs.wrappers.env_wrappers.cost_return",
 }

@@ -204,6 +204,14 @@ class SafetyFilter(FiltersMeasurements, ComponentFilter):
         expressions = [self.qp.model.numeric(h) for h in kept]
         return compile_function(self.qp.symbols, expressions, flavour)
 
+    def barriers_at(self, values: Sequence[Any]) -> Sequence[Any]:
+        """Return the barriers at a batch, as numbers or arrays (B,).
+
+        Args:
+            values: of the symbols of `qp`, arrays (B,).
+        """
+        return self._barriers_arrays(*values)
+
     def filter(
         self,
         x: Any,

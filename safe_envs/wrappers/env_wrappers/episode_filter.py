@@ -25,6 +25,7 @@ from safe_envs.wrappers.env_wrappers.lone_filters import (
     lone_filter_for,
     settings_of,
 )
+from safe_envs.wrappers.estimation import Estimator
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from safe_envs.wrappers.safety_filter import SafetyFilter
@@ -178,6 +179,7 @@ def episode_filter(
     priorities: Sequence[float] | None,
     num_envs: int,
     delay: int | None = None,
+    estimator: Estimator | None = None,
 ) -> Memoryless | DelayMemory | PromiseMemory:
     """Return a filter for the episodes of envs.
 
@@ -190,6 +192,7 @@ def episode_filter(
         num_envs: size of the batch.
         delay: of the inputs as the filter believes it, in control periods; None for that of the
             problem's plant or model, as `knowledge` says.
+        estimator: of the state that the filter is given, if that is an estimate.
 
     Raises:
         ConfigurationError: What is given is unknown or does not fit the problem.
@@ -218,5 +221,7 @@ def episode_filter(
         )
     if delay != problem.believed_delay:
         problem = replace(problem, model_delay=delay)  # which conditions may refuse
-    found = SafetyFilter.for_problem(problem, given, knowledge, objective, priorities)
+    found = SafetyFilter.for_problem(
+        problem, given, knowledge, objective, priorities, estimator=estimator
+    )
     return DelayMemory(found, problem, delay, num_envs) if delay else Memoryless(found)

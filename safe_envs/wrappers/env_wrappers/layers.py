@@ -8,7 +8,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.episode import Episode, Episodes
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.envs.reset_options import refuse_time
@@ -17,13 +16,17 @@ from safe_envs.independent_copies import IndependentCopies
 from safe_envs.number_text import finite_number
 from safe_envs.problem.actuators import resting_input
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.env_wrappers.belief_values import belief_values_of
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice, episode_filter
+from safe_envs.wrappers.env_wrappers.estimator_layer import EstimatorLayer, require_truth_below
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.value.promise_memory import PromiseMemory
 
 
 class FilterLayer(IndependentCopies):
     """The part of a filter's wrapper that does not depend on the number of envs."""
+
+    _inner: Any
 
     def attach(
         self,
@@ -55,10 +58,13 @@ class FilterLayer(IndependentCopies):
             ConfigurationError: What is given is unknown or does not fit the env.
         """
         problem: SafetyProblem = inner.problem
+        require_truth_below(problem, inner)
+        estimator = inner.estimator if isinstance(inner, EstimatorLayer) else None
         self._filter = episode_filter(
-            problem, condition, knowledge, objective, priorities, num_envs, delay
+            problem, condition, knowledge, objective, priorities, num_envs, delay, estimator
         )
         self.safety_filter = self._filter.safety_filter
+        self._beliefs = belief_values_of(self.safety_filter, estimator)
         if observe_promise and not isinstance(self._filter, PromiseMemory):
             raise ConfigurationError(
                 f"observe_promise = {observe_promise!r}: the filter {self._filter.text} has no p_k"
@@ -127,6 +133,15 @@ class FilterLayer(IndependentCopies):
                 f"probability = {probability!r}; give a number above 0, up to the filter's {most:g}"
             )
         memory.asked = float(probability)
+
+    def known(self, u: Sequence[Any]) -> Sequence[Any]:
+        """Return what the filter decides from: components of the state, and of a belief if it has.
+
+        Args:
+            u: components of the proposed input.
+        """
+        x = self._inner.components
+        return x if self._beliefs is None else self._beliefs.at(x, self._inner.tracker, u)
 
     def watch_states(self, episodes: Episode | Episodes) -> None:
         """Look from now on for states that are set.
@@ -206,44 +221,6 @@ def third_party_spec(
             " 'model'"
         )
     return FilterSpec.of(view)
-
-
-def state_layer(env: Any, kinds: tuple[type, ...], vector: bool) -> Any:
-    """Return the layer of an env from which a filter reads the state.
-
-    Args:
-        env: an env, possibly wrapped.
-        kinds: classes of layers that show the state.
-        vector: whether the filter is for a batch.
-
-    Raises:
-        ConfigurationError: There is none.
-    """
-    layer = env
-    while isinstance(layer, gym.Wrapper | gym.vector.VectorWrapper) and not isinstance(
-        layer, kinds
-    ):
-        layer = layer.env
-    if not isinstance(layer, kinds):
-        raise _unreadable(layer, vector)
-    return layer
-
-
-def _unreadable(env: Any, vector: bool) -> ConfigurationError:
-    if isinstance(env, gym.vector.VectorEnv) != vector:
-        kind, wrapper = ("single", "") if vector else ("vector", "Vector")
-        return ConfigurationError(
-            f"{env} is a {kind} env; put SafetyFilter{wrapper}Wrapper over it"
-        )
-    if vector and any(isinstance(each.unwrapped, SafeEnv) for each in getattr(env, "envs", [])):
-        return ConfigurationError(
-            f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many"
-            " times faster too"
-        )
-    return ConfigurationError(
-        f"{env} is not one of this project's envs, so that a filter cannot read its state; give"
-        " model, barriers, state_fn: see FilterSpec"
-    )
 
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:

@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
@@ -16,10 +15,12 @@ from safe_envs.wrappers.env_wrappers.filtered_box import filtered_box
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
-    state_layer,
     third_party_spec,
 )
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
+from safe_envs.wrappers.env_wrappers.state_estimator import StateEstimatorWrapper
+from safe_envs.wrappers.env_wrappers.state_layer import only_checks_between, state_layer
+from safe_envs.wrappers.estimation import Estimator
 
 
 class SafetyFilterWrapper(
@@ -48,6 +49,9 @@ class SafetyFilterWrapper(
             by default.
         delay: of the inputs as the filter believes it, in control periods; by default that of the
             env's `delay` and `model_delay`. It predicts so far ahead, see `DelayedFilter`.
+        estimator: of the state, over an env with the option `measurement`; see
+            `StateEstimatorWrapper`. The observation remains what is measured; for estimates put
+            that wrapper below this one.
         observe_promise: append p_k of the promise filter, in [0, 1], to the observation, on which
             what it will allow depends.
         **view: for a third-party env `model`, `barriers`, `state_fn`, and what else of
@@ -69,11 +73,14 @@ class SafetyFilterWrapper(
         priorities: Sequence[float] | None = None,
         observe_promise: bool = False,
         delay: int | None = None,
+        estimator: Estimator | str | None = None,
         **view: Any,
     ) -> None:
         if view:
             env = SafetyMonitor(env, third_party_spec(env.unwrapped, SafeEnv, view, knowledge))
-        inner = state_layer(env, (SafeEnv, SafetyMonitor), vector=False)
+        if estimator is not None:
+            env = StateEstimatorWrapper(env, estimator, "measurement", knowledge)
+        inner = state_layer(env, (SafeEnv, SafetyMonitor, StateEstimatorWrapper), vector=False)
         text = self.attach(
             inner, condition, knowledge, objective, priorities, observe_promise, delay
         )
@@ -92,7 +99,7 @@ class SafetyFilterWrapper(
         self.action_space = filtered_box(env.action_space, inner)
         if observe_promise:
             self.observation_space = self.observation_box(env.observation_space)
-        self._directly = _only_checks_between(env, inner)
+        self._directly = only_checks_between(env, inner)
         self._interventions = 0
         self._infeasible = 0
 
@@ -119,7 +126,7 @@ class SafetyFilterWrapper(
         """Filter the action and hold it for one control period."""
         proposed = self._inner.physical_action(action)
         self.follow()
-        decision = self._filter.decide_floats(self._inner.components, proposed)
+        decision = self._filter.decide_floats(self.known(proposed), proposed)
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
         if self._inner.viewer is not None:
             self._inner.viewer.announce([nominal], [active], [decision.feasible])
@@ -148,14 +155,8 @@ class SafetyFilterWrapper(
         return self.observed(observation), reward, terminated, truncated, info
 
     def _reported(self) -> Info:
-        return {key: value.item() for key, value in self._filter.report().items()}
-
-
-def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor) -> bool:
-    """Return whether no wrapper between the filter and the env can change a step.
-
-    Then its input need not be encoded.
-    """
-    while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
-        env = env.env
-    return env is inner
+        found: Info = {key: value.item() for key, value in self._filter.report().items()}
+        if self._beliefs is not None:
+            tracker = self._inner.tracker
+            found["belief_barrier"] = self._beliefs.barriers(tracker.mean, tracker.covariance)[0]
+        return found

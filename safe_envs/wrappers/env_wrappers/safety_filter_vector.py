@@ -10,7 +10,6 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.batch_stepper import BatchFilter, BatchStepper
 from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -19,10 +18,12 @@ from safe_envs.wrappers.env_wrappers.filtered_box import filtered_box
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
-    state_layer,
     third_party_spec,
 )
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
+from safe_envs.wrappers.env_wrappers.state_estimator_vector import StateEstimatorVectorWrapper
+from safe_envs.wrappers.env_wrappers.state_layer import state_layer
+from safe_envs.wrappers.estimation import Estimator
 from safe_envs.wrappers.filter_qp import FilterDecision
 
 _TALLIES = ("interventions", "infeasible")
@@ -54,12 +55,16 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         priorities: Sequence[float] | None = None,
         observe_promise: bool = False,
         delay: int | None = None,
+        estimator: Estimator | str | None = None,
         **view: Any,
     ) -> None:
         if view:
             spec = third_party_spec(env.unwrapped, SafeVectorEnv, view, knowledge)
             env = SafetyMonitorVector(env, spec)
-        inner = readable(env)
+        if estimator is not None:
+            env = StateEstimatorVectorWrapper(env, estimator, "measurement", knowledge)
+        kinds = (SafeVectorEnv, SafetyMonitorVector, StateEstimatorVectorWrapper)
+        inner = state_layer(env, kinds, vector=True)
         self.attach(
             inner, condition, knowledge, objective, priorities, observe_promise, delay, env.num_envs
         )
@@ -93,7 +98,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             key: np.full((self.num_envs, *np.shape(value)), value)
             for key, value in self._rest.items()
         }
-        at_rest |= self._filter.report()
+        at_rest |= self._reported()
         return self.observed(observation), {**info, **with_masks(at_rest, present)}
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -117,7 +122,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             return self._inner.step_filtered(self._stepper, actions)
         proposed = self._inner.physical_action(actions)
         self.follow()
-        decision = self._filter.decide_arrays(self._inner.components, proposed)
+        decision = self._filter.decide_arrays(tuple(self.known(proposed)), proposed)
         active = (
             decision.active[0]
             if len(decision.active) == 1
@@ -131,7 +136,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             self.env, decision.action, self.env is self._inner
         )
         self._filter.advance(self._reached(), terminated | truncated)
-        added = self._decided(decision, active) | self._filter.report()
+        added = self._decided(decision, active) | self._reported(reached=True)
         begun = self._inner.episodes.begun
         if np.count_nonzero(begun):
             if self._mode == AutoresetMode.SAME_STEP:
@@ -140,17 +145,34 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
                 self._observe_last(info, begun)
             self._filter.begin(self._inner.components, begun)
             self._restart(added, begun)
-            added |= self._filter.report()
+            added |= self._reported()
         info.update(with_masks(added, info["_cost"]))
         return self.observed(observation), reward, terminated, truncated, info
 
-    def _reached(self) -> Components:
+    def _reached(self) -> Sequence[Any]:
         """Return the components of the states that a step led to, of ended episodes too."""
-        x, episodes = self._inner.components, self._inner.episodes
-        if self._mode != AutoresetMode.SAME_STEP or not np.count_nonzero(episodes.begun):
-            return x
-        last = episodes.last_states.T
-        return tuple([np.where(episodes.begun, old, c) for old, c in zip(last, x, strict=True)])
+        inner = self._inner
+        estimates = isinstance(inner, StateEstimatorVectorWrapper)
+        last = (inner if estimates else inner.episodes).last_states.T
+        return self._with_last(inner.components, list(last))
+
+    def _with_last(self, now: Sequence[Any], last: Sequence[Any]) -> Sequence[Any]:
+        """Return components of now, with others in envs whose episodes ended in this step."""
+        begun = self._inner.episodes.begun
+        if self._mode != AutoresetMode.SAME_STEP or not np.count_nonzero(begun):
+            return now
+        return tuple([np.where(begun, old, c) for old, c in zip(last, now, strict=True)])
+
+    def _reported(self, reached: bool = False) -> Info:
+        """Return what the filter reports, of ended episodes too if they were just reached."""
+        found = self._filter.report()
+        if self._beliefs is not None:
+            inner = self._inner
+            x, p = inner.components, inner.tracker.covariance
+            if reached:
+                x, p = self._reached(), self._with_last(p, inner.last_covariance)
+            found = {**found, "belief_barrier": self._beliefs.barriers(x, p)}
+        return found
 
     def _observe_last(self, info: Info, ended: np.ndarray) -> None:
         """Append p_k to the last observations of episodes, which their envs have not seen."""

@@ -16,8 +16,8 @@ from safe_envs.envs.info import Info
 from safe_envs.envs.reset_options import refuse_time
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.env_wrappers.layers import state_layer
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
+from safe_envs.wrappers.env_wrappers.state_layer import state_layer
 from safe_envs.wrappers.value.specification_tracker import SpecificationTracker
 
 

@@ -47,13 +47,14 @@ def require_observable(
     uncertain = unseen @ scaled @ unseen.T
     if np.trace(uncertain) <= _TOLERANCE**2:
         return
-    _, directions = np.linalg.eigh(uncertain)
-    worst = abs(directions[:, -1] @ unseen)
-    names = [s.name for s, part in zip(problem.plant.states, worst, strict=True) if part > 0.1]
+    sizes, directions = np.linalg.eigh(uncertain)
+    found = directions[:, sizes > _TOLERANCE * sizes[-1]].T @ unseen
+    parts = np.sqrt((found**2).sum(axis=0))
+    names = [s.name for s, part in zip(problem.plant.states, parts, strict=True) if part > 0.1]
     raise SystemDefinitionError(
         f"the measurement ({', '.join(c.name for c in estimator.measurement.channels)}) does not"
         f" determine {', '.join(names)} of {problem.name}; measure more, such as"
-        f" measurement=['default'] or '{names[0]}:noise=S'"
+        f" '{names[0]}:noise=S', or take measurement='default'"
     )
 
 
