@@ -11,6 +11,9 @@ from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 
+OF_TRUE_STATES = "it is of filters at the true state"
+"""Why conditions at an estimate have no bound for continuous control."""
+
 
 class BoundAverager:
     """Averages both bounds of a filter over the starts of episodes.
@@ -28,6 +31,8 @@ class BoundAverager:
         self._continuous: GuaranteeAverager | str
         if isinstance(of.parts, FilterSettings):
             self._continuous = of.parts.only_of_steps
+        elif any(c.belief is not None or c.measurement_error for c in of.parts):
+            self._continuous = OF_TRUE_STATES
         else:
             self._continuous = GuaranteeAverager(of.parts, of.problem, of.knowledge, why_not)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from safe_envs.agents.evaluation.estimation import EstimationCounts, EstimationResults
 from safe_envs.agents.evaluation.rounding import touching
 from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.visited_states import StateWatch, VisitedStates
@@ -20,7 +21,9 @@ class EpisodeBatch:
     Those of ended and of surplus episodes stay as they are.
     """
 
-    def __init__(self, size: int, count: int, h: np.ndarray, x: Components, inputs: int) -> None:
+    def __init__(
+        self, size: int, count: int, h: np.ndarray, x: Components, inputs: int, info: Info
+    ) -> None:
         self.watch = StateWatch(x, h, inputs)
         self.alive = np.arange(size) < count
         self.safe = h > 0.0
@@ -31,6 +34,7 @@ class EpisodeBatch:
         self.lengths = np.zeros(size, dtype=np.int64)
         self.effort = np.zeros(size)
         self.returns = np.zeros(size)
+        self.estimation = EstimationCounts(size, info) if "nees" in info else None
 
     def add(
         self,
@@ -50,6 +54,8 @@ class EpisodeBatch:
             info: of the env.
         """
         alive, counts = self.alive, self.alive & self.safe
+        if self.estimation is not None:
+            self.estimation.add(info, alive)
         self.watch.add(x[0], u, info.get("slack"), counts)
         self.watch.reached(x[1], h, self.h_min, alive, counts)
         self.counted += counts
@@ -109,9 +115,11 @@ class PlayedBatch:
         starts: their start states, shape (E, n).
         touching: number of violations that only touch h = 0.
         visited: states that may contradict a bound.
+        estimation: sums over the estimates of each episode; None without an estimator.
     """
 
     results: EpisodeResults
     starts: np.ndarray
     touching: int
     visited: VisitedStates
+    estimation: EstimationResults | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
+from safe_envs.agents.evaluation.estimation import EstimationResults
 from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.safe_flags import SafeFlags
@@ -42,6 +43,7 @@ class EpisodeStatistics:
         self._min_h = np.empty(_QUANTILES_OF)
         self._safe = self._counted = self._interventions = self._infeasible = 0
         self._returns, self._efforts, self._with_effort = RunningSum(), RunningSum(), 0
+        self._estimation: list[EstimationResults] = []
 
     def add(self, batch: PlayedBatch) -> None:
         """Add a batch."""
@@ -63,6 +65,13 @@ class EpisodeStatistics:
         self._returns.add(found.returns)
         self._efforts.add(found.effort[moved])
         self._with_effort += int(np.count_nonzero(moved))
+        if batch.estimation is not None:
+            self._estimation.append(batch.estimation)
+
+    @property
+    def estimation(self) -> EstimationResults | None:
+        """Sums over the estimates of each episode; None without an estimator."""
+        return EstimationResults.joined(self._estimation) if self._estimation else None
 
     def summary(self, confidence: float) -> EpisodeSummary:
         """Return statistics with intervals of a confidence; None where no step counts."""

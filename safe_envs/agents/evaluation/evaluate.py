@@ -22,11 +22,12 @@ from safe_envs.agents.evaluation.identification import describe, seconds_of
 from safe_envs.agents.evaluation.kept_episodes import EpisodeSink, KeptEpisodes
 from safe_envs.agents.evaluation.players import Player, player_of
 from safe_envs.agents.evaluation.repeats import pooled
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts, conditions_of
+from safe_envs.agents.evaluation.resolved import WorkParts, conditions_of
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.views import View, views_of
 from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained, sure_high
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
@@ -53,6 +54,9 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     monitoring: str = "discrete",
     best: bool | None = None,
     closed_loop: bool | None = None,
+    estimator: str | None = None,
+    belief: float = 0.05,
+    observe: str = "estimate",
     jobs: int | None = None,
     progress: Progress | None = None,
     record: bool = False,
@@ -103,6 +107,9 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
             `safe_envs.agents.evaluation.yardstick`; None to tell it if its table is in the cache.
         closed_loop: whether to compute certified tables for the bound of the env's own steps, see
             `safe_envs.wrappers.value.closed_loop`; None to read those in the cache.
+        estimator: of the state of a measured problem, "kf", "ekf" or "ukf".
+        belief: probability of the rows with belief conditions.
+        observe: what policies see with an estimator, "estimate" or "measurement".
         jobs: number of processes, or of threads of the compiled engine; the result is the same.
         progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
@@ -134,6 +141,9 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         monitoring=monitoring,
         best=best,
         closed_loop=closed_loop,
+        estimator=estimator,
+        belief=belief,
+        observe=observe,
     )
     settings = RunSettings(num_envs, jobs, record, progress, engine, keep_episodes, episodes_out)
     return run_evaluation(spec, settings)
@@ -146,42 +156,45 @@ def run_evaluation(spec: EvaluationSpec, settings: RunSettings | None = None) ->
         spec: all that determines the result.
         settings: how it is run.
     """
-    return _Runner(ResolvedEvaluation(spec), settings or RunSettings()).run()
+    return _Runner(spec, settings or RunSettings()).run()
 
 
 class _Runner:
-    """Runs an evaluation, filter by filter."""
+    """Runs an evaluation, row by row."""
 
-    def __init__(self, resolved: ResolvedEvaluation, settings: RunSettings) -> None:
-        self._resolved, self._settings, self._spec = resolved, settings, resolved.spec
-        parts = resolved.parts + sum(map(resolved.repeats, resolved.names))
-        parts += resolved.prepares + bool(resolved.spec.best)
-        if resolved.spec.closed_loop:
-            parts += sum(map(resolved.repeats, resolved.names))
-        self._work = WorkParts(settings.progress, parts)
-        identifications = sum(map(resolved.repeats, resolved.names))
-        self._keeps = settings.keeps(self._spec.episodes * identifications)
-        asked = None if self._spec.bounds else "it was not asked for"
-        self._why_no_bound = resolved.target.why_no_bound or asked
+    def __init__(self, spec: EvaluationSpec, settings: RunSettings) -> None:
+        self._views, self._settings, self._spec = views_of(spec), settings, spec
+        # Of one evaluation, or of two, at the true state and at the estimate.
+        self._all = list(dict.fromkeys(view.resolved for view in self._views))
+        # What is measured, if anything is, tells more of what was asked for.
+        self._resolved = next((r for r in self._all if r.estimator), self._all[0])
+        often = sum(view.resolved.repeats(view.base) for view in self._views)
+        parts = sum(r.parts + r.prepares for r in self._all) + often + bool(spec.best)
+        self._work = WorkParts(settings.progress, parts + often * bool(spec.closed_loop))
+        self._keeps = settings.keeps(spec.episodes * often)
 
     def run(self) -> Evaluation:
         """Run all filters and compare them."""
         resolved, spec, settings = self._resolved, self._spec, self._settings
-        resolved.learn(self._work.part)
+        for each in self._all:
+            each.learn(self._work.part)
         best = self._best()
-        bounded = {name: self._bounded(name) for name in resolved.names}
+        bounded = {view.name: self._bounded(view) for view in self._views}
         # The bounds find the tables as long as they are in use here.
         tables = [
             compute_closed_loop(of, self._work.part())
-            for of in (of for each in bounded.values() for of in each if spec.closed_loop)
+            for view in self._views
+            for of in bounded[view.name]
+            if spec.closed_loop and not view.estimates
         ]
         # Made before the first episode: what is wrong with any of them shows at once.
         players = {
-            name: [player_of(resolved, conditions, settings) for conditions in each]
-            for name, each in resolved.filters.items()
+            view.name: [player_of(view.resolved, parts, settings) for parts in view.filters]
+            for view in self._views
         }
         config = {**resolved.config(), "episodes": spec.episodes, "repeats": spec.repeats}
-        recorded = resolved.names if settings.record else ()
+        config["filters"] = [view.described for view in self._views]
+        recorded = [view.name for view in self._views] if settings.record else ()
         trajectories = {name: Trajectories(resolved.problem, spec.episodes) for name in recorded}
         rows, timings, safe, visited = [], [], {}, {}
         kept = KeptEpisodes() if self._keeps else None
@@ -190,15 +203,16 @@ class _Runner:
             if settings.episodes_out is not None:
                 path = Path(settings.episodes_out)
                 sinks.append(opened.enter_context(episodes_file(path, resolved.problem.dt)))
-            for name in resolved.names:
-                averagers = [self._averager(of) for of in bounded[name]]
+            for view in self._views:
+                name = view.name
+                averagers = [self._averager(of, view) for of in bounded[name]]
                 totals, seconds = self._simulated(
                     name, list(zip(players[name], averagers, strict=True)), trajectories, sinks
                 )
-                rows.append(self._row(name, totals, averagers, config["policy"]["name"]))
+                rows.append(self._row(view, totals, averagers, config["policy"]["name"]))
                 safe[name] = [each.safe for each in totals]
                 visited[name] = [each.visited for each in totals]
-                timings.append(self._timing(name, totals, players[name][0], seconds))
+                timings.append(self._timing(view, totals, players[name][0], seconds))
         del tables
         best, rows = chained(best, rows)
         return Evaluation(
@@ -221,22 +235,24 @@ class _Runner:
         """Return how safe any policy can be, if it is asked for or known already."""
         resolved = self._resolved
         if self._spec.best:
-            return best_for(resolved.problem, self._work.part())
+            return best_for(resolved.truth, self._work.part())
         third_party = resolved.target.filter_spec is not None
         if self._spec.best is False or third_party or self._spec.monitoring == "continuous":
             return None
-        return best_at_hand(resolved.problem)
+        return best_at_hand(resolved.truth)
 
-    def _bounded(self, name: str) -> list[FilteredPolicy]:
+    def _bounded(self, view: View) -> list[FilteredPolicy]:
         """Return what the bounds of a filter are of, for each identification."""
-        spec, problem = self._spec, self._resolved.problem
+        spec = self._spec
         # The name of an object says nothing.
         policy = spec.policy if isinstance(spec.policy, str) else ""
         given = (spec.knowledge, policy, spec.objective, spec.closed_loop)
-        return [FilteredPolicy(problem, parts, *given) for parts in self._resolved.filters[name]]
+        return [FilteredPolicy(view.resolved.truth, parts, *given) for parts in view.filters]
 
-    def _averager(self, of: FilteredPolicy) -> BoundAverager:
-        return BoundAverager(of, self._spec.monitoring, self._why_no_bound)
+    def _averager(self, of: FilteredPolicy, view: View) -> BoundAverager:
+        asked = None if self._spec.bounds else "it was not asked for"
+        why_not = view.resolved.target.why_no_bound or asked or view.why_no_bound
+        return BoundAverager(of, self._spec.monitoring, why_not)
 
     def _simulated(
         self,
@@ -246,12 +262,12 @@ class _Runner:
         sinks: Sequence[EpisodeSink],
     ) -> tuple[list[EpisodeStatistics], float]:
         """Run the episodes under a filter, with each identification, and take the time in s."""
-        resolved, episodes = self._resolved, self._spec.episodes
+        problem, episodes = self._resolved.problem, self._spec.episodes
         found = []
         # The search for bounds is over: what is timed are episodes.
         begun = time.perf_counter()
         for repeat, (player, averager) in enumerate(played):
-            statistics = EpisodeStatistics(resolved.problem)
+            statistics = EpisodeStatistics(problem)
             recorded = trajectories.get(name) if repeat == 0 else None
             for sink in sinks:
                 sink.begin(name, repeat)
@@ -266,31 +282,35 @@ class _Runner:
 
     def _row(
         self,
-        name: str,
+        view: View,
         totals: Sequence[EpisodeStatistics],
         averagers: Sequence[BoundAverager],
         policy: str,
     ) -> EvaluationRow:
-        conditions = [conditions_of(each) for each in self._resolved.filters[name]]
-        summaries = [each.summary(self._spec.confidence) for each in totals]
+        conditions, spec = [conditions_of(each) for each in view.filters], self._spec
+        summaries = [each.summary(spec.confidence) for each in totals]
         bounds = [a.summary(t.visited) for a, t in zip(averagers, totals, strict=True)]
         learning = describe(
             conditions,
             [each.safety_rate for each in summaries],
-            self._resolved.problem,
-            self._spec.knowledge,
+            view.resolved.truth,
+            spec.knowledge,
         )
-        pool = pooled(summaries, self._spec.confidence)
         row = EvaluationRow(
-            filter=name, policy=policy, learning=learning, **vars(pool), **vars(together(bounds))
+            filter=view.name,
+            policy=policy,
+            learning=learning,
+            estimation=view.estimation([each.estimation for each in totals], spec.confidence),
+            **vars(pooled(summaries, spec.confidence)),
+            **vars(together(bounds)),
         )
         return judged(row, row.ci_high, sure_high(row))
 
     def _timing(
-        self, name: str, totals: Sequence[EpisodeStatistics], player: Player, seconds: float
+        self, view: View, totals: Sequence[EpisodeStatistics], player: Player, seconds: float
     ) -> FilterTiming:
         steps = sum(each.steps for each in totals)
-        learning = seconds_of([conditions_of(each) for each in self._resolved.filters[name]])
+        learning = seconds_of([conditions_of(each) for each in view.filters])
         return FilterTiming(
-            name, seconds, steps, steps / seconds, learning, player.engine, player.jobs
+            view.name, seconds, steps, steps / seconds, learning, player.engine, player.jobs
         )

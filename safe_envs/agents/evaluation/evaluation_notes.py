@@ -5,6 +5,7 @@ from __future__ import annotations
 from safe_envs.agents.evaluation.best_text import best_notes
 from safe_envs.agents.evaluation.bound_notes import bound_notes
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
+from safe_envs.agents.evaluation.estimation_notes import estimation_notes
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData
 from safe_envs.agents.evaluation.learned_notes import learned_notes
 from safe_envs.agents.evaluation.rows import EvaluationRow
@@ -18,6 +19,7 @@ def evaluation_notes(evaluation: EvaluationData) -> list[str]:
     """
     steps = evaluation.problem.steps
     notes = [note for row in evaluation.rows for note in (*_of_starts(row), *_of_violations(row))]
+    notes += estimation_notes(evaluation.rows)
     notes += bound_notes(evaluation.rows)
     notes += best_notes(evaluation.best)
     notes += learned_notes(evaluation.rows, evaluation.problem)

@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 from safe_envs.agents.evaluation.best_text import attainable_text, times_column
 from safe_envs.agents.evaluation.bound_text import bound_text, continuous_text, held_text
 from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.estimation import EstimationSummary
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData, FilterTiming
 from safe_envs.agents.evaluation.rate_text import percent, percent_in, points_in
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.text_lines import visible
 from safe_envs.text_tables import Column, FittedTable, arranged, without_empty
+from safe_envs.wrappers.estimation.consistency import Consistency
 
 _NONE = "-"
-_SAFETY, _BEHAVIOR, _TIMING = range(3)
+_SAFETY, _BEHAVIOR, _ESTIMATES, _TIMING = range(4)
 _SHORT = ("bound, held input", "safe", "violations", "bound, continuous", "intervened")
 _SHORT += ("infeasible", "return", "worst ident.", "bound, posterior")
 _LEAST_P = 1e-10
@@ -67,7 +69,7 @@ def evaluation_table(evaluation: EvaluationData, timing: bool = False) -> Evalua
     columns, empty = without_empty(columns, _NONE)
     facts = [f"attainable by any policy: {each}" for each in attainable_text(best)]
     facts += [f"{title}: none of these has one" for title in empty]
-    columns += _behavior(rows)
+    columns += _behavior(rows) + _estimates(rows)
     if timing:
         columns += _timing(evaluation.timing.rows)
     # The end of a line in the name of a file is no end of a line of the table.
@@ -137,6 +139,41 @@ def _behavior(rows: Sequence[EvaluationRow]) -> list[Column]:
         "return": (f"{row.return_mean:.4g}" for row in rows),
     }
     return [Column(title, tuple(each), part=_BEHAVIOR) for title, each in cells.items()]
+
+
+def _estimates(rows: Sequence[EvaluationRow]) -> list[Column]:
+    """Return the columns on estimates; none where all rows are at the true state."""
+    if not any(row.estimation for row in rows):
+        return []
+    of = [row.estimation for row in rows]
+    cells = {
+        "NEES (ex­pected)": [_consistency(each and each.nees) for each in of],
+        "NIS (ex­pected)": [_consistency(each and each.nis) for each in of],
+        "lost": [_NONE if each is None else percent(each.lost_rate) for each in of],
+        "h_B < 0 somewhere": [_outside(each) for each in of],
+        "unsafe at most": [_unsafe_at_most(each) for each in of],
+    }
+    columns = [Column(title, tuple(each), part=_ESTIMATES) for title, each in cells.items()]
+    return [column for column in columns if set(column.cells) != {_NONE}]
+
+
+def _consistency(found: Consistency | None) -> str:
+    if found is None:
+        return _NONE
+    return f"{found.mean:.3g} [{found.low:.3g}, {found.high:.3g}] ({found.expected:.3g})"
+
+
+def _outside(found: EstimationSummary | None) -> str:
+    if found is None or found.outside_rate is None:
+        return _NONE
+    low, high = found.outside_low or 0.0, found.outside_high or 0.0
+    return percent_in(found.outside_rate, low, high)
+
+
+def _unsafe_at_most(found: EstimationSummary | None) -> str:
+    if found is None or found.unsafe_at_most is None:
+        return _NONE
+    return f"{percent(found.unsafe_at_most)} {found.bound_word}"
 
 
 def _timing(rows: Sequence[FilterTiming]) -> list[Column]:

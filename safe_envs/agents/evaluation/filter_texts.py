@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
@@ -37,5 +39,5 @@ def checked_filter(name: str, problem: SafetyProblem, known: ControlAffineSDE) -
     conditions = parse_conditions(name, problem)
     # What does not suit a barrier is an error before tables are read, which may take long.
     for condition, barrier in zip(conditions, problem.barriers, strict=True):
-        condition.constraint(known, barrier)
+        replace(condition, belief=None, measurement_error=()).constraint(known, barrier)
     return spec_of(conditions)

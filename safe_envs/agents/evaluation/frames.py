@@ -13,7 +13,7 @@ from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.yardstick import times_unavoidable
 from safe_envs.errors import ConfigurationError
 
-_NESTED = ("curve", "posterior_bound", "learning")
+_NESTED = ("curve", "posterior_bound", "learning", "estimation")
 
 
 def frame_of(columns: Mapping[str, np.ndarray]) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.evaluation.estimation_options import describe_sensor
 from safe_envs.agents.evaluation.filter_texts import checked_filter
 from safe_envs.agents.evaluation.identification import Learning
 from safe_envs.agents.evaluation.spec import (
@@ -28,10 +29,12 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
     Condition,
     SafetyFilterVectorWrapper,
+    StateEstimatorVectorWrapper,
     spec_of,
 )
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.env_wrappers import lone_filters
+from safe_envs.wrappers.estimation import make_estimator
 from safe_envs.wrappers.value.closed_loop import require_few_states
 from safe_envs.wrappers.value.reduction import reduced
 
@@ -44,11 +47,14 @@ class ResolvedEvaluation:
 
     Args:
         spec: what is asked for.
+        learning: of another evaluation with the same learned filters, to share what it learns.
 
     Attributes:
         spec: as given.
         target: what is simulated.
         problem: its problem.
+        truth: the same without a sensor.
+        estimator: of the state, if it is measured and estimated.
         policy: who acts.
         names: of the filters, each once.
         learning: what filters learn.
@@ -59,14 +65,21 @@ class ResolvedEvaluation:
         RelativeDegreeError: A condition does not suit a barrier.
     """
 
-    def __init__(self, spec: EvaluationSpec) -> None:
+    def __init__(self, spec: EvaluationSpec, learning: Learning | None = None) -> None:
         self.spec = spec
         self.target = make_target(spec.problem, spec.options, spec.filter_spec)
         self.problem = self.target.problem
+        self.truth = self.problem.unmeasured
+        self.estimator = (
+            make_estimator(spec.estimator, self.problem, spec.knowledge)
+            if spec.estimator is not None
+            else None
+        )
         if self.target.filter_spec is not None:
             _require_third_party(spec)
+        seen = self.truth if self.estimator and spec.observe == "estimate" else self.problem
         self.policy = make_policy(
-            spec.policy, self.problem, spec.trust, self.target.spaces, self.target.filter_spec
+            spec.policy, seen, spec.trust, self.target.spaces, self.target.filter_spec
         )
         asked = (UNFILTERED, self.target.filter) if spec.filters is None else spec.filters
         filters = {filter_text(each): each for each in asked}
@@ -83,16 +96,18 @@ class ResolvedEvaluation:
         self._in_use: list[lone_filters.LoneFilter] = []
         known = self.problem.plant if spec.knowledge == "plant" else self.problem.model
         self._texts = {name: checked_filter(name, self.problem, known) for name in texts}
-        self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
+        self.learning = learning or Learning(
+            self.truth, texts, spec.learned, spec.repeats, spec.seed
+        )
         if self.target.filter_spec is not None and self.learning.missing():
             raise ConfigurationError(
                 "a filter over a third-party env takes what was learned from a log: NAME:file=FILE"
             )
         self.filters: dict[str, list[FilterParts]] = {}
         if spec.best:
-            reduced(self.problem, "plant")  # What has no table is known at once.
+            reduced(self.truth, "plant")  # What has no table is known at once.
         if spec.closed_loop:
-            require_few_states(self.problem)
+            require_few_states(self.truth)
 
     @property
     def prepares(self) -> bool:
@@ -116,7 +131,7 @@ class ResolvedEvaluation:
             self.learning.learn(method, repeat, part())
         # The envs of the filters find the tables as long as they are in use here.
         self._in_use = [
-            lone_filters.lone_filter_for(self.problem, settings, self.spec.knowledge, part())
+            lone_filters.lone_filter_for(self.truth, settings, self.spec.knowledge, part())
             for settings in self._alone.values()
         ]
         for name in self.names:
@@ -171,6 +186,9 @@ class ResolvedEvaluation:
             env: unfiltered.
             conditions: see `FilterParts`.
         """
+        if self.estimator is not None:
+            spec = self.spec
+            env = StateEstimatorVectorWrapper(env, self.estimator, spec.observe, spec.knowledge)
         if not conditions:
             return env
         return SafetyFilterVectorWrapper(env, conditions, self.spec.knowledge, self.spec.objective)
@@ -180,13 +198,20 @@ class ResolvedEvaluation:
         """Whether nothing is random after the start of an episode."""
         problem, policy = self.problem, self.policy
         noise = Integrator(problem.plant, problem.dt, problem.substeps, "arrays").channels
-        return not noise and (policy.deterministic if isinstance(policy, Policy) else True)
+        exact = self.problem.measurement is None
+        return (
+            exact and not noise and (policy.deterministic if isinstance(policy, Policy) else True)
+        )
 
     @property
     def is_deterministic(self) -> bool:
         """Whether all episodes are one and the same, as far as is known."""
         random_start = self.problem.starts[self.problem.start].uniforms
         return self.target.filter_spec is None and self.is_frozen and not random_start
+
+    def text_of(self, name: str) -> str:
+        """Return the text of a filter with all its parameters, once filters are read."""
+        return self._texts.get(name) or _text_of(self.filters[name][0])
 
     def config(self) -> dict[str, Any]:
         """Return all that determines the result as JSON-able data, once filters are read."""
@@ -199,15 +224,13 @@ class ResolvedEvaluation:
             "filter_spec": filter_spec if named else type(filter_spec).__name__,
             "problem": _describe(self.problem),
             "policy": _describe_policy(spec.policy),
-            "filters": [
-                {"name": name, "spec": self._texts.get(name) or _text_of(self.filters[name][0])}
-                for name in self.names
-            ],
+            "filters": [{"name": name, "spec": self.text_of(name)} for name in self.names],
             "knowledge": spec.knowledge,
             "objective": spec.objective,
             "seed": spec.seed,
             "confidence": spec.confidence,
             "monitoring": spec.monitoring,
+            **describe_sensor(self.problem, spec),
         }
 
 

@@ -88,6 +88,7 @@ def play(
             np.stack(starts, axis=1)[:count],
             batch.touching(world.problem, count),
             batch.watch.visited(count),
+            batch.estimation and batch.estimation.results(count),
         )
 
 
@@ -176,7 +177,7 @@ def _play(
     steps = world.problem.steps
     observation, info = started
     h = smallest(info["barrier"])
-    batch = EpisodeBatch(len(h), count, h, world.components, len(world.problem.inputs))
+    batch = EpisodeBatch(len(h), count, h, world.components, len(world.problem.inputs), info)
     if trajectories:
         trajectories.note(0, first, batch.alive, h, world.components)
     state, start = None, np.ones(len(h), dtype=bool)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from safe_envs.agents.evaluation.estimation import EstimationSummary
 from safe_envs.agents.evaluation.safety_curve import Curve
 
 HeldWord = Literal["proved", "certified", "computed", "withheld", "none"]
@@ -232,14 +233,19 @@ class EvaluationRow(BoundSummary, EpisodeSummary):
         filter: its name, "none" without one.
         policy: name of the policy.
         learning: what was learned for the filter; None where nothing was.
+        estimation: how good the estimates were; None at the true state.
     """
 
     filter: str
     policy: str
     learning: LearningSummary | None = None
+    estimation: EstimationSummary | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as JSON-able data."""
         head = {"filter": self.filter, "policy": self.policy}
         bound = self.posterior_bound
-        return head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
+        found = head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
+        if self.estimation is None:
+            del found["estimation"]
+        return found

@@ -22,6 +22,8 @@ def setting_lines(evaluation: EvaluationData) -> list[str]:
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
     notes += [best_line(best)] if best and best.contradiction else []
     notes += [NOTHING_RANDOM] if evaluation.is_deterministic else []
+    sensor = sensor_text(evaluation.config)
+    lines += [sensor] if sensor else []
     return lines + [note[:1].upper() + note[1:].rstrip(".") for note in notes]
 
 
@@ -37,6 +39,26 @@ def setting_text(config: Mapping[str, Any], problem: SafetyProblem) -> str:
     goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
     return f"{system}{watched}; filters know the {config['knowledge']}{goal}"
+
+
+def sensor_text(config: Mapping[str, Any]) -> str:
+    """Return the sensor and the estimator of an evaluation; "" without a sensor.
+
+    Args:
+        config: of the evaluation.
+    """
+    measured = config.get("measurement")
+    if measured is None:
+        return ""
+    channels = []
+    for c in measured["channels"]:
+        errors = {"sd": c["noise"], "bias": c["bias"], "dropout": c["dropout"]}
+        told = [f"{key} {value:g}" for key, value in errors.items() if value or key == "sd"]
+        channels.append(f"{c['name']} ({', '.join(told)})")
+    late = f", {measured['delay']} control periods late" if measured["delay"] else ""
+    seen = config["estimator"]
+    known = f"; estimator {seen}, policies see the {config['observe']}" if seen else ""
+    return f"sensor: {', '.join(channels)}{late}{known}"
 
 
 def unsafe_starts(share: float) -> list[str]:

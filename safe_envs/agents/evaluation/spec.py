@@ -12,6 +12,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
 from safe_envs.agents.evaluation.episodes_file import require_parquet
+from safe_envs.agents.evaluation.estimation_options import require_estimation
 from safe_envs.agents.evaluation.statistics import require_confidence
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
@@ -68,6 +69,12 @@ class EvaluationSpec:
             for it is in the cache.
         closed_loop: whether to compute certified tables of the closed loops, which bound from below
             how safe each filter is with this policy; None to read only those in the cache.
+        estimator: of the state, over a problem with a measurement: "kf", "ekf" or "ukf", with
+            settings. Then each filter gets rows at the true state and at the estimate; see
+            `safe_envs.agents.evaluation.views`.
+        belief: probability of the rows with belief conditions.
+        observe: what policies see with an estimator, the problem's features at the "estimate", or
+            the "measurement".
 
     Raises:
         ConfigurationError: A value is out of range, or parts do not go together.
@@ -90,6 +97,9 @@ class EvaluationSpec:
     monitoring: str = "discrete"
     best: bool | None = None
     closed_loop: bool | None = None
+    estimator: str | None = None
+    belief: float = 0.05
+    observe: str = "estimate"
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
@@ -121,6 +131,7 @@ class EvaluationSpec:
                 " of the time between them; leave it out, or take monitoring = 'discrete' and"
                 " bounds = True"
             )
+        require_estimation(self.estimator, self.belief, self.observe)
         if not isinstance(self.options or {}, Mapping):
             raise ConfigurationError(f"options = {shown(self.options)}; give a dictionary")
         filters = listed(self.filters)

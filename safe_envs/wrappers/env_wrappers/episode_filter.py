@@ -211,6 +211,8 @@ def episode_filter(
                 f"priorities are of conditions; the {name} filter keeps all barriers together:"
                 " leave them out"
             )
+        # A filter by itself is of true states, and acts at an estimate as if that were one.
+        problem = problem.unmeasured
         if isinstance(given, FilterSettings):
             given.require_fit(problem, objective)
             given = lone_filter_for(problem, given, knowledge)

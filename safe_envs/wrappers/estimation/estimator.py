@@ -52,6 +52,7 @@ class Estimator(ABC):
         text: with its settings.
         n: number of states.
         variances: of the noise of each channel.
+        added: standard deviation of the noise added to each state, per square root of a second.
 
     Args:
         model: that is believed.
@@ -99,14 +100,14 @@ class Estimator(ABC):
         if initial is not None:
             initial.require_states(model.n)
         self.initial = initial
-        self._added = _process_noise(process_noise, model)
+        self.added = _process_noise(process_noise, model)
         self._expected = [model.numeric(c.expression) for c in measurement.channels]
         self.variances = tuple(c.noise**2 for c in measurement.channels)
 
     @property
     def text(self) -> str:
         """The name with the settings."""
-        added = [float(a) for a in self._added]
+        added = [float(a) for a in self.added]
         if not any(added):
             return self.name
         equal = added[:1] if len(set(added)) == 1 else added
@@ -236,7 +237,7 @@ class Estimator(ABC):
     def diffusion_square(self) -> Any:
         """Sigma sigma' with what is added to it, a matrix of expressions of the states."""
         sigma = sp.Matrix(self.model.numeric(self.model.diffusion))
-        added = sp.diag(*[sp.Float(a, 17) ** 2 if a else 0 for a in self._added])
+        added = sp.diag(*[sp.Float(a, 17) ** 2 if a else 0 for a in self.added])
         return sigma * sigma.T + added
 
     @cached_property

@@ -105,7 +105,7 @@ class ExtendedKalmanFilter(Estimator):
         self, flavour: Flavour, mean: Components, covariance: Components, u: Components
     ) -> tuple[Components, Components]:
         rates, n, h = self._rates[flavour], self.n, self.dt / self.substeps
-        noise = [h * a**2 for a in self._added if a]
+        noise = [h * a**2 for a in self.added if a]
         for _ in range(self.substeps):
             stages = [rates(*mean, *u)]
             for length in (h / 2, h / 2, h):
@@ -150,7 +150,7 @@ class ExtendedKalmanFilter(Estimator):
     @cached_property
     def _linear_covariance(self) -> GeneratedFunction:
         every = tuple((i, j) for i in range(self.n) for j in range(self.n))
-        added = tuple((i, i) for i, a in enumerate(self._added) if a)
+        added = tuple((i, i) for i, a in enumerate(self.added) if a)
         return GeneratedFunction(euler_source, self.n, every, added)
 
     @cached_property
