@@ -21,12 +21,13 @@ and z = -Phi^-1(delta/(K + 1)) makes the last term delta; for several barriers t
 them too. Elsewhere, and for an extended Kalman filter, this is a design that is measured.
 
 **The dynamics of the estimate.** From instant to instant x^ moves by the model's step, and jumps by
-K nu, with the innovation's covariance S: dx^ = (f + g u) dt + G dW with G G' = K S K'/dt. P moves
-by its rate (P_(k+1) - P_k)/dt. Both are known before the sample for a linear model, and found at
+K nu, with the innovation's covariance S: dx^ = (f + g u) dt + G dW with G G' = K S K'/dt. P
+grows by the positive part of (P_(k+1) - P_k)/dt: where it shrinks, h_B rises by itself, and a
+condition that only forbids h_B to fall would let h fall instead. Both are known before the sample for a linear model, and found at
 the estimate for an extended filter; they are signals of the system, given at each decision. A
 condition derives its chain for this system. For a half-space and Euler's steps the stochastic CBF
 then keeps E[h_B at k + 1 | y_0..y_k] >= h_B at k: the mean of x^ moves by dt (f + g u), and the
-root is concave in P, so that its tangent is above it.
+root is concave and monotone in P, so that its tangent along what P grows is above it.
 
 Source: Clark, Control barrier functions for stochastic systems, Automatica 2021, for barriers of
     the estimate.

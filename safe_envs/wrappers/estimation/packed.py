@@ -35,6 +35,23 @@ def unpacked(components: Sequence[Any], n: int) -> np.ndarray:
     return np.moveaxis(table[index], (0, 1), (-2, -1))
 
 
+def positive_part(components: Sequence[Any], n: int) -> list[Any]:
+    """Return the smallest positive semidefinite matrix above a symmetric one, by components.
+
+    Its eigenvalues are those of the other, or 0 in the place of negative ones.
+
+    Args:
+        components: floats or arrays (B,).
+        n: number of rows.
+    """
+    if n == 1:
+        return [np.maximum(components[0], 0.0)]
+    values, vectors = np.linalg.eigh(unpacked(components, n))
+    scaled = vectors * np.maximum(values, 0.0)[..., None, :]
+    found = scaled @ np.swapaxes(vectors, -1, -2)
+    return [found[..., i, j] for i, j in pairs(n)]
+
+
 def cholesky(components: Sequence[Any], n: int) -> list[list[Any]]:
     """Return L with L L' = P, a row a list, of a positive semidefinite P.
 

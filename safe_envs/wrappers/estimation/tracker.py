@@ -13,7 +13,7 @@ from safe_envs.dynamics.codegen import Flavour
 from safe_envs.envs.sensor import Sample
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.wrappers.estimation.estimator import Components, Estimator
-from safe_envs.wrappers.estimation.packed import cholesky
+from safe_envs.wrappers.estimation.packed import cholesky, positive_part
 
 
 class BeliefTracker:
@@ -118,8 +118,9 @@ class BeliefTracker:
     def believed(self, u: Components) -> list[Any]:
         """Return what a belief filter is given at run time; see `belief.belief_symbols`.
 
-        These are P, its rate (P at the next instant less P)/dt, and the lower triangle G, row by
-        row, of G G' = K S K'/dt.
+        These are P, its growth, and the lower triangle G, row by row, of G G' = K S K'/dt. The
+        growth is the positive part of (P at the next instant less P)/dt: what a belief loses in
+        uncertainty is no licence to approach the edge.
 
         Args:
             u: m components of the input that is proposed.
@@ -127,10 +128,11 @@ class BeliefTracker:
         dt, n = self.estimator.dt, self.estimator.n
         after, gained = self.ahead(u)
         rates = [(a - p) / dt for a, p in zip(after, self.covariance, strict=True)]
+        rates = positive_part(rates, n)
         rows = cholesky([g / dt for g in gained], n)
         lower = [rows[i][j] for i in range(n) for j in range(i + 1)]
         if self._num_envs is None:
-            lower = [float(entry) for entry in lower]
+            rates, lower = ([float(entry) for entry in part] for part in (rates, lower))
         return [*self.covariance, *rates, *lower]
 
     def snapshot(self) -> dict[str, np.ndarray]:
