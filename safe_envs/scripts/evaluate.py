@@ -29,6 +29,9 @@ def evaluate(
     seed: text_options.Seed = 0,
     knowledge: text_options.Knowledge = "model",
     objective: of.Objective = "nearest",
+    estimator: of.Estimator = None,
+    belief: of.Belief = 0.05,
+    observe: of.Observe = "estimate",
     learned: of.Learned = None,
     repeats: of.Repeats = 1,
     confidence: of.Confidence = 0.95,
@@ -82,6 +85,7 @@ def evaluate(
             "--plot": plot,
             "--latex": latex,
             "--best": best,
+            "--estimator": estimator,
             "--closed-loop": closed_loop,
             "--policy best": policy == "best",
             "--episodes-out": episodes_out,
@@ -100,7 +104,8 @@ def evaluate(
         )
     third_party = filter_spec and env.env_id and not env.system
     common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "best": best}
-    common |= {"closed_loop": closed_loop}
+    common |= {"closed_loop": closed_loop, "estimator": estimator, "belief": belief}
+    common |= {"observe": observe}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id

@@ -17,6 +17,9 @@ from safe_envs.scripts.options import completion
 
 _UNFILTERED = "none"
 
+AT_STATE = "@state"
+"""What the name of a filter at the true state ends with."""
+
 
 def known_filters(texts: list[str] | None) -> list[str] | None:
     """Return the values of --filter, all of which begin with the name or place of a filter."""
@@ -35,11 +38,25 @@ def known_filter(text: str | None) -> str | None:
     from safe_envs.wrappers.conditions.text_parts import require_known, require_parameters
 
     # An empty text, as of a shell's variable that is not set, is no filter.
-    if text is not None and text != _UNFILTERED:
-        if _UNFILTERED in text.split("+"):
-            raise unfiltered_in_sum(text)
-        require_known(text, _UNFILTERED)
-        require_parameters(text)
+    filtered = None if text is None else text.removesuffix(AT_STATE)
+    if filtered is not None and filtered != _UNFILTERED:
+        if _UNFILTERED in filtered.split("+"):
+            raise unfiltered_in_sum(filtered)
+        require_known(filtered, _UNFILTERED)
+        require_parameters(filtered)
+    return text
+
+
+def known_estimator(text: str | None) -> str | None:
+    """Return the value of --estimator if there is such an estimator.
+
+    Raises:
+        ConfigurationError: There is none, or it has no such setting.
+    """
+    from safe_envs.wrappers.estimation.names import settings_of
+
+    if text is not None:
+        settings_of(text)
     return text
 
 

@@ -123,7 +123,7 @@ class EnvOptions:
         # Where rates are limited, they are the inputs, and the degree is another one.
         if "rate_limit" not in arguments:
             for text in filters:
-                require_degrees(text, summary.degree)
+                require_degrees(text.removesuffix("@state"), summary.degree)
 
     def evaluate_command(self, *words: str) -> str:
         """Return a command line that evaluates something in the same env, quoted for a shell.

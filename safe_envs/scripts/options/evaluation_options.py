@@ -57,6 +57,35 @@ FilterSpecPlace = Annotated[
         ),
     ),
 ]
+Estimator = Annotated[
+    str | None,
+    typer.Option(
+        metavar="kf|ekf|ukf",
+        callback=early_checks.known_estimator,
+        help=(
+            "With --measurement: estimate the state; ekf:process_noise=.1 for what the model does"
+            " not know. Each filter then has rows at the true state (NAME@state), at the estimate,"
+            " and with the belief (NAME:belief=P)."
+        ),
+    ),
+]
+Belief = Annotated[
+    float,
+    typer.Option(
+        metavar="P",
+        callback=early_checks.between_0_and_1("belief"),
+        help="Probability with which errors of the estimate exceed the margin of those rows.",
+    ),
+]
+Observe = Annotated[
+    str,
+    typer.Option(
+        metavar="estimate|measurement",
+        callback=early_checks.one_of("observe", ("estimate", "measurement")),
+        help="What policies see with --estimator: the env's features at the estimate, or the"
+        " measurement.",
+    ),
+]
 Objective = Annotated[
     str,
     typer.Option(

@@ -8,7 +8,7 @@ PANELS: dict[str, str] = {
         " x lines backend address"
     ),
     "Time, start and bounds": "dt substeps horizon start box rate-limit barrier",
-    "Filters": "filter knowledge objective learned",
+    "Filters": "filter knowledge objective learned estimator belief observe",
     "Noise and mismatch": (
         "noise plant model delay model-delay slew-limit measurement sensor-noise"
     ),
@@ -39,6 +39,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "safe-envs evaluate DubinsDisk-v0 --noise 0.2 --plant v=1.2 --plot out.pdf",
         "safe-envs evaluate Pendulum-v0 --policy my_policy.py:Policy --json out.json",
         "safe-envs evaluate --system my_system.py:problem --monitoring continuous",
+        "safe-envs evaluate Pendulum-v0 --measurement default --estimator ekf",
     ),
     "identify": (
         "safe-envs identify Scalar-v0 --method bayesian --out learned.npz",

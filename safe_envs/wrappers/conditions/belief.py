@@ -23,9 +23,10 @@ them too. Elsewhere, and for an extended Kalman filter, this is a design that is
 **The dynamics of the estimate.** From instant to instant x^ moves by the model's step, and jumps by
 K nu, with the innovation's covariance S: dx^ = (f + g u) dt + G dW with G G' = K S K'/dt. P
 grows by the positive part of (P_(k+1) - P_k)/dt: where it shrinks, h_B rises by itself, and a
-condition that only forbids h_B to fall would let h fall instead. Both are known before the sample for a linear model, and found at
-the estimate for an extended filter; they are signals of the system, given at each decision. A
-condition derives its chain for this system. For a half-space and Euler's steps the stochastic CBF
+condition that only forbids h_B to fall would let h fall instead. Both are known before the sample
+for a linear model, and found at the estimate for an extended filter; they are signals of the
+system, given at each decision. A condition derives its chain for this system. For a half-space and
+Euler's steps the stochastic CBF
 then keeps E[h_B at k + 1 | y_0..y_k] >= h_B at k: the mean of x^ moves by dt (f + g u), and the
 root is concave and monotone in P, so that its tangent along what P grows is above it.
 

@@ -1,11 +1,19 @@
-"""State estimators of models with sensors."""
+"""State estimators of models with sensors.
 
-from safe_envs.wrappers.estimation.estimator import Estimator
-from safe_envs.wrappers.estimation.initial_belief import InitialBelief, initial_belief
-from safe_envs.wrappers.estimation.kalman import ExtendedKalmanFilter, KalmanFilter
-from safe_envs.wrappers.estimation.registry import make_estimator
-from safe_envs.wrappers.estimation.tracker import BeliefTracker
-from safe_envs.wrappers.estimation.unscented import UnscentedKalmanFilter
+What is named here is imported when it is first used: a command checks names before.
+"""
+
+from typing import TYPE_CHECKING
+
+from safe_envs.lazy_attributes import lazy_attributes
+
+if TYPE_CHECKING:
+    from safe_envs.wrappers.estimation.estimator import Estimator
+    from safe_envs.wrappers.estimation.initial import InitialBelief, initial_belief
+    from safe_envs.wrappers.estimation.kalman import ExtendedKalmanFilter, KalmanFilter
+    from safe_envs.wrappers.estimation.registry import make_estimator
+    from safe_envs.wrappers.estimation.tracker import BeliefTracker
+    from safe_envs.wrappers.estimation.unscented import UnscentedKalmanFilter
 
 __all__ = [
     "BeliefTracker",
@@ -17,3 +25,17 @@ __all__ = [
     "initial_belief",
     "make_estimator",
 ]
+
+_HERE = "safe_envs.wrappers.estimation"
+_MODULES = {
+    "BeliefTracker": f"{_HERE}.tracker",
+    "Estimator": f"{_HERE}.estimator",
+    "ExtendedKalmanFilter": f"{_HERE}.kalman",
+    "InitialBelief": f"{_HERE}.initial",
+    "KalmanFilter": f"{_HERE}.kalman",
+    "UnscentedKalmanFilter": f"{_HERE}.unscented",
+    "initial_belief": f"{_HERE}.initial",
+    "make_estimator": f"{_HERE}.registry",
+}
+
+__getattr__, __dir__ = lazy_attributes(__name__, _MODULES, globals())

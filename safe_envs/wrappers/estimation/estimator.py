@@ -17,7 +17,7 @@ from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_
 from safe_envs.number_text import finite_number
 from safe_envs.problem.measurement import Measurement
 from safe_envs.validators import numbers_in
-from safe_envs.wrappers.estimation.initial_belief import InitialBelief
+from safe_envs.wrappers.estimation.initial import InitialBelief
 from safe_envs.wrappers.estimation.packed import unpacked
 
 Components = Sequence[Any]

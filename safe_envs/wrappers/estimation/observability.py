@@ -8,7 +8,7 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.errors import SystemDefinitionError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.estimation.estimator import Estimator
-from safe_envs.wrappers.estimation.initial_belief import InitialBelief
+from safe_envs.wrappers.estimation.initial import InitialBelief
 from safe_envs.wrappers.estimation.packed import unpacked
 
 _TRIES = 5

@@ -10,7 +10,7 @@ from safe_envs.problem.actuators import require_direct
 from safe_envs.problem.measurement import Measurement
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.estimation.estimator import Estimator
-from safe_envs.wrappers.estimation.initial_belief import initial_belief
+from safe_envs.wrappers.estimation.initial import initial_belief
 from safe_envs.wrappers.estimation.kalman import ExtendedKalmanFilter, KalmanFilter
 from safe_envs.wrappers.estimation.names import settings_of
 from safe_envs.wrappers.estimation.observability import require_observable

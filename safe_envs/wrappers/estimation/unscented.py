@@ -20,7 +20,7 @@ from safe_envs.wrappers.estimation.estimator import (
     Update,
     packed_entries,
 )
-from safe_envs.wrappers.estimation.initial_belief import InitialBelief
+from safe_envs.wrappers.estimation.initial import InitialBelief
 from safe_envs.wrappers.estimation.packed import cholesky, pairs
 
 
