@@ -102,7 +102,7 @@ def measurement_of(problem: Any, given: Any, factor: float | None = None) -> Any
     elif isinstance(given, Measurement):
         found = given
     else:
-        found = _read(problem, _listed(given))
+        found = _read(problem, items_of(given))
     if factor is None:
         return found
     if found is None:
@@ -113,8 +113,15 @@ def measurement_of(problem: Any, given: Any, factor: float | None = None) -> Any
     return replace(found, channels=tuple(scaled))
 
 
-def _listed(given: Any) -> list[str]:
-    """Return what options may give as a list of items."""
+def items_of(given: Any) -> list[str]:
+    """Return what options give as a list of items, of the form that `read_items` checks.
+
+    Args:
+        given: a text, a list of texts, or settings or standard deviations by name.
+
+    Raises:
+        ConfigurationError: It is something else, or an item is not of the form.
+    """
     if isinstance(given, Mapping):
         items = []
         for name, value in given.items():

@@ -66,6 +66,11 @@ def test_every_option_can_be_varied_by_a_sweep():
     fixed = {"env": "Pendulum-v0", "filter": "scbf"}
     _, found, _ = sections({"fixed": fixed, "grid": grid}, "a sweep")
     assert repr(found) == repr(grid | {"slew_limit": [[-1.0, 1.0]]})
+    forms = ["default", ["default", "delay=2"], {"theta": 0.1, "delay": 1}]
+    listed = sections({"fixed": fixed, "grid": {"measurement": forms}}, "a sweep")[1]["measurement"]
+    assert listed == [["default"], ["default", "delay=2"], ["theta:noise=0.1", "delay=1"]]
+    with pytest.raises(ConfigurationError, match="a sweep: fixed: measurement = 3; give 'default'"):
+        sections({"fixed": fixed | {"measurement": 3}}, "a sweep")
     with pytest.raises(ConfigurationError, match=r"delay = -1; give a whole number from 0"):
         sections({"fixed": fixed | {"delay": -1}}, "a sweep")
     assert {*ENV_OPTIONS, *PARAMETER_GROUPS} == {"system", *OPTION_NAMES}

@@ -11,6 +11,7 @@ from typing import Any, get_type_hints
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
+from safe_envs.problem.measurement_text import items_of
 from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS, WHOLE_OPTIONS
 from safe_envs.registry import full_id
 
@@ -169,6 +170,11 @@ def _value(name: str, value: Any, what: str) -> Any:
     if _KINDS.get(name) is int:
         require_whole(f"{what}: {name}", value, WHOLE_OPTIONS.get(name, int(name != "seed")))
         return value
+    if name == "measurement":
+        try:
+            return items_of(value)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{what}: {error}") from error
     if isinstance(value, list):
         return [_value(name, entry, what) for entry in value]
     return _number(name, value, what)
