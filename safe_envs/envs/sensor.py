@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from statistics import NormalDist
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +14,14 @@ from safe_envs.dynamics.philox import SENSOR, Key
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream, NoiseStreams
 from safe_envs.envs.seeding import EpisodeStreams
+from safe_envs.envs.sensor_arithmetic import (
+    loss_quantile,
+    value_or_nan,
+    wrapped,
+    wrapped_batch,
+)
 from safe_envs.envs.spaces import observation_box
-from safe_envs.problem.measurement import Channel, Measurement
+from safe_envs.problem.measurement import Measurement
 from safe_envs.problem.problem import SafetyProblem
 
 
@@ -50,7 +55,7 @@ class _Sensor:
         self._formulas = [plant.numeric(channel.expression) for channel in channels]
         self._measure = compile_function(plant.states, self._formulas, flavour)
         # A sample is lost where its second normal number is below the quantile.
-        self._lost_below = [_quantile(channel.dropout) for channel in channels]
+        self._lost_below = [loss_quantile(channel) for channel in channels]
         box = observation_box(problem)
         self._low, self._high = box.low, box.high
         nearest = np.clip(0.0, self._low.astype(float), self._high.astype(float))
@@ -99,7 +104,7 @@ class Sensor(_Sensor):
         """Take a sample of a state, and return the observation, float32 (k,)."""
         draws, k = self._noise.next(), len(self._channels)
         values = [
-            _wrapped(c, value + c.bias + c.noise * v)
+            wrapped(c, value + c.bias + c.noise * v)
             for c, value, v in zip(self._channels, self._readings(x), draws[:k], strict=True)
         ]
         received = [
@@ -123,7 +128,7 @@ class Sensor(_Sensor):
         try:
             return self._measure(*x)
         except (ArithmeticError, ValueError):
-            return [_value_or_nan(measure, x) for measure in self._apart]
+            return [value_or_nan(measure, x) for measure in self._apart]
 
     def _restart(self) -> None:
         self.sample = self._nothing
@@ -231,7 +236,7 @@ class BatchSensor(_Sensor):
         k = len(self._channels)
         with np.errstate(all="ignore"):
             values = [
-                _wrapped_batch(c, filled(value, self._shape) + c.bias + c.noise * v)
+                wrapped_batch(c, filled(value, self._shape) + c.bias + c.noise * v)
                 for c, value, v in zip(self._channels, self._measure(*x), draws[:k], strict=True)
             ]
         received = [
@@ -239,18 +244,6 @@ class BatchSensor(_Sensor):
             for d, low, value in zip(draws[k:], self._lost_below, values, strict=True)
         ]
         return Sample(values, received)
-
-
-def _value_or_nan(measure: Callable[..., Sequence[float]], x: Sequence[float]) -> float:
-    try:
-        return measure(*x)[0]
-    except (ArithmeticError, ValueError):
-        return math.nan
-
-
-def _quantile(probability: float) -> float:
-    """Return the number below which a standard normal one is with a probability below 1."""
-    return NormalDist().inv_cdf(probability) if probability else -math.inf
 
 
 def sensor_of(problem: SafetyProblem, periods: int) -> Sensor | None:
@@ -292,16 +285,3 @@ def merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
             for pair in zip(one, other, strict=True)
         )
     )
-
-
-def _wrapped(channel: Channel, value: float) -> float:
-    """Return a value within half a period of 0."""
-    period = channel.period
-    if not period or not math.isfinite(value):
-        return value
-    return value - period * math.ceil(value / period - 0.5)
-
-
-def _wrapped_batch(channel: Channel, values: np.ndarray) -> np.ndarray:
-    period = channel.period
-    return values - period * np.ceil(values / period - 0.5) if period else values
