@@ -77,7 +77,7 @@ class Measurement:
         delay: whole control periods after which a sample arrives.
 
     Raises:
-        ConfigurationError: There is no channel, a name is taken twice, or the delay is out of
+        ConfigurationError: There is no `Channel`, a name is taken twice, or the delay is out of
             range.
     """
 
@@ -85,6 +85,11 @@ class Measurement:
     delay: int = 0
 
     def __post_init__(self) -> None:
+        if not all(isinstance(channel, Channel) for channel in self.channels):
+            raise ConfigurationError(
+                f"channels = {shown(self.channels)}; give a Channel for each number that a sensor"
+                " reports, like (Channel('y', x, noise=0.1),)"
+            )
         names = [channel.name for channel in self.channels]
         if not names or len(set(names)) < len(names):
             raise ConfigurationError(

@@ -163,6 +163,8 @@ class SafetyProblem:
         if self.frame is not None:
             self.frame.require_known(plant)
         require_backup(self.backup, plant)
+        if self.sensors:
+            Measurement(self.sensors).require_known(plant)
         if self.measurement is not None:
             self.measurement.require_known(plant)
         for i in self.inputs:

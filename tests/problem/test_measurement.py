@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, SafeEnv, SystemDefinitionError
+from safe_envs.agents.evaluation.attainable import attainable_safety
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.builder import state_problem
 from safe_envs.problem.measurement import Channel, Measurement, default_measurement
 from safe_envs.problem.signals import TIME, Feature
+from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.wrappers.value.settings import ValueSettings
 from tests.conftest import problem_of
+from tests.scripts.own_system import SYSTEM
 
 ACC, SCALAR = "safe_envs/ACC-v0", "safe_envs/Scalar-v0"
 
@@ -153,6 +158,34 @@ def test_a_system_without_ranges_has_a_sensor_of_its_states():
     env = SafeEnv(own_problem().configured(measurement="default"))
     assert np.isfinite(env.observation_space.low).all()
     env.reset(seed=0)
+
+
+def test_a_system_of_ones_own_states_its_sensor(tmp_path):
+    v = sp.Symbol("v", real=True)
+    problem = own_problem(sensors=(Channel("speed", v, 0.3),))
+    found = problem.configured(measurement=["default:bias=1", "x:noise=1"]).measurement
+    assert [(c.name, c.noise, c.bias) for c in found.channels] == [
+        ("speed", 0.3, 1.0),
+        ("x", 1.0, 0.0),
+    ]
+    with pytest.raises(SystemDefinitionError, match="unknown symbol w"):
+        own_problem(sensors=(Channel("speed", sp.Symbol("w"), 0.3),))
+    with pytest.raises(ConfigurationError, match="give a Channel for each number"):
+        own_problem(sensors=(v,))
+    (tmp_path / "own.py").write_text(SYSTEM)
+    place = f"{tmp_path / 'own.py'}:problem"
+    env = gym.make("safe_envs/Custom-v0", system=place, measurement=["default", "delay=1"])
+    observation, _ = env.reset(seed=0)
+    assert observation.tolist() == [0.0, 0.0]
+    assert [c.name for c in env.unwrapped.problem.measurement.channels] == ["x", "v"]
+
+
+def test_tables_of_a_problem_do_not_depend_on_its_sensor():
+    plain, measured = (problem_of(SCALAR, measurement=m) for m in (None, "default"))
+    assert reduced(measured, "plant").fingerprint == reduced(plain, "plant").fingerprint
+    settings = ValueSettings(knowledge="plant", cells=(41,), inputs=5)
+    found = [attainable_safety(p, settings, episodes=0)[0] for p in (plain, measured)]
+    assert (found[0].lower, found[0].upper) == (found[1].lower, found[1].upper)
 
 
 def test_features_of_time_are_no_part_of_a_sensor():
