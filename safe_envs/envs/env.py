@@ -15,7 +15,8 @@ from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions
-from safe_envs.envs.sensor import Sample, sensor_of
+from safe_envs.envs.sample import Sample
+from safe_envs.envs.sensor import sensor_of
 from safe_envs.envs.simulation import Simulation, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import OwnSpec

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from safe_envs.dynamics.codegen import compile_function, filled, stacked
 from safe_envs.dynamics.philox import SENSOR, Key
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream, NoiseStreams
+from safe_envs.envs.sample import Sample, merged
 from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.sensor_arithmetic import (
     loss_quantile,
@@ -23,19 +24,6 @@ from safe_envs.envs.sensor_arithmetic import (
 from safe_envs.envs.spaces import observation_box
 from safe_envs.problem.measurement import Measurement
 from safe_envs.problem.problem import SafetyProblem
-
-
-class Sample(NamedTuple):
-    """What has arrived from a sensor up to a control instant.
-
-    Attributes:
-        values: k components: floats of one env, or arrays (num_envs,) of a batch. Where nothing
-            arrived at this instant, the last value that did.
-        received: which arrived at this instant, bools or arrays of them.
-    """
-
-    values: Sequence[Any]
-    received: Sequence[Any]
 
 
 class _Sensor:
@@ -269,19 +257,3 @@ def batch_sensor_of(
     """
     measured = problem.measurement
     return None if measured is None else BatchSensor(problem, measured, streams, periods)
-
-
-def merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
-    """Return samples of a batch that are one in some envs and another elsewhere.
-
-    Args:
-        where: bool (num_envs,).
-        one: of the envs where it is True.
-        other: of the others.
-    """
-    return Sample(
-        *(
-            [np.where(where, a, b) for a, b in zip(*pair, strict=True)]
-            for pair in zip(one, other, strict=True)
-        )
-    )

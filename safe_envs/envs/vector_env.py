@@ -18,8 +18,8 @@ from safe_envs.envs.compiled_batch import CompiledBatch
 from safe_envs.envs.episode import Episodes, last_of_episode
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions, StartingPoints
+from safe_envs.envs.sample import Sample
 from safe_envs.envs.seeding import Seeds
-from safe_envs.envs.sensor import Sample
 from safe_envs.envs.vector_interface import VectorInterface
 from safe_envs.errors import InvalidInputError, flag, require_whole
 from safe_envs.problem.problem import SafetyProblem

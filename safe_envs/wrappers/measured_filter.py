@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.envs.sensor import Sample
+from safe_envs.envs.sample import Sample
 from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 from safe_envs.validators import real_array
 from safe_envs.wrappers.estimation import BeliefTracker, Estimator

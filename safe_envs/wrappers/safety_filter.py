@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any, Never
 
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import Flavour, compile_function, finite, stacked
+from safe_envs.dynamics.codegen import finite, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import InvalidInputError
 from safe_envs.problem.clf import CLF
@@ -25,13 +24,14 @@ from safe_envs.wrappers.conditions.at_estimate import (
 from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.estimation import Estimator, make_estimator
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
+from safe_envs.wrappers.filter_qp.barrier_values import BarrierValues
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
 from safe_envs.wrappers.filter_qp.problem_arguments import known_for_problem
 from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
 from safe_envs.wrappers.measured_filter import FiltersMeasurements
 
 
-class SafetyFilter(FiltersMeasurements, ComponentFilter):
+class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
     """Chooses the input nearest to a proposed one that every condition allows.
 
     It minimises 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier and to the
@@ -187,31 +187,6 @@ class SafetyFilter(FiltersMeasurements, ComponentFilter):
         _ = self._barriers_floats, self._barriers_arrays
         return self
 
-    @cached_property
-    def _barriers_floats(self) -> Any:
-        return self._compile_barriers("floats")
-
-    @cached_property
-    def _barriers_arrays(self) -> Any:
-        return self._compile_barriers("arrays")
-
-    def _compile_barriers(self, flavour: Flavour) -> Any:
-        # A condition with a belief keeps the barrier of that.
-        kept = [
-            barrier.expression if c.belief is None else constraint.chain[0]
-            for (barrier, c), constraint in zip(self.pairs, self.constraints, strict=True)
-        ]
-        expressions = [self.qp.model.numeric(h) for h in kept]
-        return compile_function(self.qp.symbols, expressions, flavour)
-
-    def barriers_at(self, values: Sequence[Any]) -> Sequence[Any]:
-        """Return the barriers at a batch, as numbers or arrays (B,).
-
-        Args:
-            values: of the symbols of `qp`, arrays (B,).
-        """
-        return self._barriers_arrays(*values)
-
     def filter(
         self,
         x: Any,
@@ -315,9 +290,3 @@ class SafetyFilter(FiltersMeasurements, ComponentFilter):
             u.copy() if proposed is inputs else np.array(proposed),
             np.array(barrier),
         )
-
-    def _require_values(self, barrier: np.ndarray, x: Sequence[Any]) -> None:
-        """Raise NumericalError where a barrier (B, k) at states is not finite."""
-        bad = np.flatnonzero(~np.isfinite(barrier).all(axis=1))
-        if bad.size:
-            raise self.undefined("the barrier", [float(np.atleast_1d(c)[bad[0]]) for c in x])

@@ -8,8 +8,9 @@ from typing import Any
 
 from safe_envs.agents.evaluation.frontier_episodes import FrontierEpisodes
 from safe_envs.agents.evaluation.frontier_results import Frontier
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, Progress
+from safe_envs.agents.evaluation.work_parts import WorkParts
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.frontier import price_violations

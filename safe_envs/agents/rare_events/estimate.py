@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, listed
 from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.work_parts import WorkParts
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, optimal_tilt
 from safe_envs.agents.rare_events.particles import PathPlayer

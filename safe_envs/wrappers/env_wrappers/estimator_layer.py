@@ -14,7 +14,7 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.estimation import BeliefTracker, Estimator, make_estimator
-from safe_envs.wrappers.estimation.estimator import nees
+from safe_envs.wrappers.estimation.consistency import nees
 from safe_envs.wrappers.estimation.packed import unpacked
 
 OBSERVATIONS = ("estimate", "measurement")

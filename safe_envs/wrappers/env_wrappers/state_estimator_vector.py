@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from safe_envs.dynamics.codegen import stacked
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, VectorStep, with_masks
-from safe_envs.envs.sensor import merged
+from safe_envs.envs.sample import merged
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.env_wrappers.estimator_layer import EstimatorLayer
 from safe_envs.wrappers.env_wrappers.state_layer import state_layer

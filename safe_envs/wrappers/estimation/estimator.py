@@ -246,9 +246,6 @@ class Estimator(ABC):
         return sp.Matrix(self._expected).jacobian(list(self.model.states))
 
 
-_ROUNDING = 1e-9
-"""Standard deviation, in parts of the mean, below which a state counts as known."""
-
 _FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
 
 
@@ -266,41 +263,6 @@ def nonzero(matrix: Any, upper: bool = False) -> tuple[tuple[int, int], ...]:
         for j in range(columns)
         if matrix[i, j] != 0 and not (upper and i > j)
     )
-
-
-def nees(
-    estimator: Estimator, x: np.ndarray, mean: np.ndarray, covariance: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normalized estimation error squared, e' P^-1 e, and its degrees of freedom.
-
-    Where P is singular, its pseudo-inverse takes the place of the inverse, and its rank that of n.
-    Errors of states that are measured modulo a period are taken modulo that.
-
-    Args:
-        estimator: whose belief it is.
-        x: true states, shape (B, n).
-        mean: shape (B, n).
-        covariance: shape (B, n, n).
-
-    Returns:
-        Values (B,) and whole numbers (B,).
-    """
-    error = x - mean
-    for i, period in enumerate(estimator.periods):
-        if period:
-            error[:, i] -= period * np.ceil(error[:, i] / period - 0.5)
-    scale = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
-    # What is less than the rounding of the mean is exactly known.
-    scale = np.where(scale > _ROUNDING * np.maximum(abs(mean), _ROUNDING), scale, 0.0)
-    safe = np.where(scale > 0.0, scale, 1.0)
-    # In units of standard deviations no state's unit decides what counts as singular.
-    live = (scale > 0.0).astype(float)
-    correlation = covariance / (safe[:, :, None] * safe[:, None, :])
-    values, vectors = np.linalg.eigh(correlation * live[:, :, None] * live[:, None, :])
-    known = values > 1e-10 * np.maximum(values[:, -1:], 1e-300)
-    along = np.einsum("bij,bi->bj", vectors, error / safe)
-    parts = np.where(known, along**2 / np.where(known, values, 1.0), 0.0)
-    return parts.sum(axis=1), known.sum(axis=1)
 
 
 def packed_entries(matrix: Any) -> tuple[tuple[tuple[int, int], ...], list[Any]]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import Flavour
-from safe_envs.envs.sensor import Sample
+from safe_envs.envs.sample import Sample
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.wrappers.estimation.estimator import Components, Estimator
 from safe_envs.wrappers.estimation.packed import cholesky, positive_part

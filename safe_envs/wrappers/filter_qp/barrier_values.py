@@ -1,0 +1,55 @@
+"""The values of the barriers that a filter keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Flavour, compile_function
+from safe_envs.errors import NumericalError
+from safe_envs.wrappers.conditions import AffineConstraint
+from safe_envs.wrappers.filter_qp.arguments import Pairs
+from safe_envs.wrappers.filter_qp.qp import FilterQP
+
+
+class BarrierValues:
+    """The part of a `SafetyFilter` that evaluates its barriers."""
+
+    pairs: Pairs
+    constraints: tuple[AffineConstraint, ...]
+    qp: FilterQP
+    undefined: Callable[..., NumericalError]
+
+    @cached_property
+    def _barriers_floats(self) -> Any:
+        return self._compile_barriers("floats")
+
+    @cached_property
+    def _barriers_arrays(self) -> Any:
+        return self._compile_barriers("arrays")
+
+    def _compile_barriers(self, flavour: Flavour) -> Any:
+        # A condition with a belief keeps the barrier of that.
+        kept = [
+            barrier.expression if c.belief is None else constraint.chain[0]
+            for (barrier, c), constraint in zip(self.pairs, self.constraints, strict=True)
+        ]
+        expressions = [self.qp.model.numeric(h) for h in kept]
+        return compile_function(self.qp.symbols, expressions, flavour)
+
+    def barriers_at(self, values: Sequence[Any]) -> Sequence[Any]:
+        """Return the barriers at a batch, as numbers or arrays (B,).
+
+        Args:
+            values: of the symbols of `qp`, arrays (B,).
+        """
+        return self._barriers_arrays(*values)
+
+    def _require_values(self, barrier: np.ndarray, x: Sequence[Any]) -> None:
+        """Raise NumericalError where a barrier (B, k) at states is not finite."""
+        bad = np.flatnonzero(~np.isfinite(barrier).all(axis=1))
+        if bad.size:
+            raise self.undefined("the barrier", [float(np.atleast_1d(c)[bad[0]]) for c in x])
