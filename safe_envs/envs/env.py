@@ -227,8 +227,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         """Draw the state, with the trail of the episode and what a filter decided.
 
         Returns:
-            uint8 of shape (height, width, 3) in the mode "rgb_array"; None in the mode "human",
-            which draws to its window.
+            uint8 (height, width, 3) in the mode "rgb_array"; None in "human", which has a window.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.

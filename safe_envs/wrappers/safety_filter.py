@@ -28,7 +28,7 @@ from safe_envs.wrappers.filter_qp.barrier_values import BarrierValues
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
 from safe_envs.wrappers.filter_qp.problem_arguments import known_for_problem
 from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
-from safe_envs.wrappers.measured_filter import FiltersMeasurements
+from safe_envs.wrappers.measurement_filter import FiltersMeasurements
 
 
 class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):

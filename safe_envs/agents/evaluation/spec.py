@@ -69,12 +69,13 @@ class EvaluationSpec:
             for it is in the cache.
         closed_loop: whether to compute certified tables of the closed loops, which bound from below
             how safe each filter is with this policy; None to read only those in the cache.
-        estimator: of the state, over a problem with a measurement: "kf", "ekf" or "ukf", with
-            settings. Then each filter gets rows at the true state and at the estimate; see
-            `safe_envs.agents.evaluation.views`.
+        estimator: of the state of a measured problem: "kf", "ekf" or "ukf", with settings. Then
+            each filter gets several rows; see `safe_envs.agents.evaluation.views`.
         belief: probability of the rows with belief conditions.
         observe: what policies see with an estimator, the problem's features at the "estimate", or
             the "measurement".
+        compare_estimates: with an estimator, whether a filter that is named gets rows at the true
+            state and with its belief too.
 
     Raises:
         ConfigurationError: A value is out of range, or parts do not go together.
@@ -100,6 +101,7 @@ class EvaluationSpec:
     estimator: str | None = None
     belief: float = 0.05
     observe: str = "estimate"
+    compare_estimates: bool = True
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
@@ -108,7 +110,7 @@ class EvaluationSpec:
             value = getattr(self, name)
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
-        for name in ("trust", "bounds"):
+        for name in ("trust", "bounds", "compare_estimates"):
             if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ConfigurationError(
                     f"{name} = {shown(getattr(self, name))}; give True or False"
@@ -150,7 +152,10 @@ class EvaluationSpec:
             ("learned", tuple(learned)),
             ("policy", str(self.policy) if isinstance(self.policy, Path) else self.policy),
             *((name, int(getattr(self, name))) for name in ("episodes", "seed", "repeats")),
-            *((name, bool(getattr(self, name))) for name in ("trust", "bounds")),
+            *(
+                (name, bool(getattr(self, name)))
+                for name in ("trust", "bounds", "compare_estimates")
+            ),
             ("confidence", float(self.confidence)),
         ):
             object.__setattr__(self, name, value)

@@ -27,11 +27,8 @@ from safe_envs.agents.evaluation.spec import (
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
-from safe_envs.wrappers.conditions.names import PARAMETERS
+from safe_envs.wrappers.conditions.names import AT_STATE, PARAMETERS
 from safe_envs.wrappers.conditions.text_parts import parts_of
-
-AT_STATE = "@state"
-"""What the name of a row at the true state ends with."""
 
 AT_ESTIMATES = "it decides at an estimate, and these bounds are of filters at the true state"
 """Why filters at an estimate have no bounds of true states."""
@@ -129,7 +126,9 @@ def _named(spec: EvaluationSpec) -> list[tuple[str, Filter, bool]]:
         target = make_target(spec.problem, spec.options, spec.filter_spec)
         asked = (UNFILTERED, target.filter)
     # Who names one row at the true state names all.
-    explicit = any(isinstance(each, str) and each.endswith(AT_STATE) for each in asked)
+    explicit = not spec.compare_estimates or any(
+        isinstance(each, str) and each.endswith(AT_STATE) for each in asked
+    )
     found: dict[str, tuple[str, Filter, bool]] = {}
     for each in asked:
         for row in [_stated(each)] if explicit else _expanded(each, spec.belief):

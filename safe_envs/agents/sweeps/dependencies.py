@@ -12,12 +12,15 @@ from typing import Any
 
 from safe_envs.agents.policies.names import absolute_policy, policy_file, policy_module
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
+from safe_envs.wrappers.conditions.names import AT_STATE
 from safe_envs.wrappers.conditions.text_parts import files_of, modules_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a cell with paths that mean the same in every process."""
-    found = {**settings, "filter": with_absolute_paths(settings["filter"])}
+    text = settings["filter"]
+    at = AT_STATE if text.endswith(AT_STATE) else ""
+    found = {**settings, "filter": with_absolute_paths(text.removesuffix(AT_STATE)) + at}
     found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
@@ -32,7 +35,7 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     """
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
-    yield from files_of(settings["filter"])
+    yield from files_of(settings["filter"].removesuffix(AT_STATE))
     policy = policy_file(settings["policy"])
     if policy is not None and os.path.exists(policy):
         yield policy
@@ -43,7 +46,8 @@ def installed(settings: Mapping[str, Any]) -> Iterator[Path]:
 
     All files of a package count, but not what it imports from others. Nothing is run.
     """
-    modules = (*modules_of(settings["filter"]), policy_module(settings["policy"]))
+    named = modules_of(settings["filter"].removesuffix(AT_STATE))
+    modules = (*named, policy_module(settings["policy"]))
     for top in dict.fromkeys(module.split(".")[0] for module in modules if module):
         try:
             spec = importlib.util.find_spec(top)

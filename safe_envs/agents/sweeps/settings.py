@@ -23,13 +23,14 @@ _OTHERWISE = ("problem", "filters", "options", "filter_spec", "learned", "trust"
 
 EVALUATION_DEFAULTS: dict[str, Any] = {
     field.name: field.default for field in fields(EvaluationSpec) if field.name not in _OTHERWISE
-} | {"bounds": False, "best": False, "closed_loop": False}
+} | {"bounds": False, "best": False, "closed_loop": False, "compare_estimates": False}
 """Settings that are fields of an `EvaluationSpec`, with the values of a cell without them."""
 
 _SECTIONS = ("fixed", "grid", "cells")
 _KINDS = get_type_hints(EvaluationSpec) | {
     **dict.fromkeys(WHOLE_OPTIONS, int),
     "policy": str,
+    "estimator": str,
     "best": bool,
     "closed_loop": bool,
 }

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.views import views_of
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.sweeps.cell import Cell, Sweep, versions
 from safe_envs.agents.sweeps.dependencies import absolute, installed, read_by, with_imported
@@ -172,8 +172,10 @@ def _check(sweep: Sweep, what: str) -> None:
 
 
 def _check_cell(cell: Cell, derive: bool) -> None:
-    found = ResolvedEvaluation(cell.spec)
-    (name,) = found.names
+    ((_, name, found),) = views_of(cell.spec)
     needs_learning = any(part.split(":")[0] in LEARNED for part in name.split("+"))
     if derive and name != UNFILTERED and not (needs_learning or name_by_itself(name)):
-        SafetyFilter.for_problem(found.problem, name, cell.spec.knowledge, cell.spec.objective)
+        spec = cell.spec
+        SafetyFilter.for_problem(
+            found.problem, name, spec.knowledge, spec.objective, estimator=found.estimator
+        )

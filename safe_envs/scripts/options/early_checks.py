@@ -17,9 +17,6 @@ from safe_envs.scripts.options import completion
 
 _UNFILTERED = "none"
 
-AT_STATE = "@state"
-"""What the name of a filter at the true state ends with."""
-
 
 def known_filters(texts: list[str] | None) -> list[str] | None:
     """Return the values of --filter, all of which begin with the name or place of a filter."""
@@ -34,7 +31,7 @@ def known_filter(text: str | None) -> str | None:
     Raises:
         ConfigurationError: It begins otherwise.
     """
-    from safe_envs.wrappers.conditions.names import unfiltered_in_sum
+    from safe_envs.wrappers.conditions.names import AT_STATE, unfiltered_in_sum
     from safe_envs.wrappers.conditions.text_parts import require_known, require_parameters
 
     # An empty text, as of a shell's variable that is not set, is no filter.

@@ -110,6 +110,7 @@ class EnvOptions:
         """
         from safe_envs.registry import require_own
         from safe_envs.systems.summary import summaries
+        from safe_envs.wrappers.conditions.names import AT_STATE
         from safe_envs.wrappers.conditions.text_parts import require_degrees
 
         env_id, arguments = self.full_id, self.arguments
@@ -123,7 +124,7 @@ class EnvOptions:
         # Where rates are limited, they are the inputs, and the degree is another one.
         if "rate_limit" not in arguments:
             for text in filters:
-                require_degrees(text.removesuffix("@state"), summary.degree)
+                require_degrees(text.removesuffix(AT_STATE), summary.degree)
 
     def evaluate_command(self, *words: str) -> str:
         """Return a command line that evaluates something in the same env, quoted for a shell.

@@ -58,8 +58,8 @@ Symbols = tuple[sp.Symbol, ...]
 def belief_symbols(n: int) -> tuple[Symbols, Symbols, Symbols]:
     """Return the symbols of P, of its rate, and of G, in the order of `BeliefTracker.believed`.
 
-    P and its rate are the upper triangles of symmetric matrices, row by row; G is the lower
-    triangle of its matrix, row by row.
+    P and its growth are upper triangles of symmetric matrices, (1, 1), (1, 2), .., (1, n), (2, 2),
+    and so on; G is a lower triangle, (1, 1), (2, 1), (2, 2), (3, 1) and so on.
 
     Args:
         n: number of states.

@@ -46,6 +46,10 @@ RESERVED = ("none", *BY_THEMSELVES)
 """Names that no condition can have: "none" stands for the unfiltered env."""
 
 
+AT_STATE = "@state"
+"""What the name of a filter ends with that is evaluated at the true state of a measured env."""
+
+
 def is_built_in(name: str) -> bool:
     """Return whether a name is that of a condition of this project."""
     return name in _BUILT_IN

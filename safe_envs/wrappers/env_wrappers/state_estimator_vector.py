@@ -23,7 +23,7 @@ from safe_envs.wrappers.estimation import Estimator
 class StateEstimatorVectorWrapper(EstimatorLayer, gym.vector.VectorWrapper):
     """`StateEstimatorWrapper` for a batch: same arguments, same info with the batch in front.
 
-    Estimators begin anew with the episodes of their envs, in every mode of autoreset.
+    Estimators restart with the episodes of their envs, in every mode of autoreset.
 
     Attributes:
         last_states: with same-step autoreset, the estimates at the end of the episodes that ended

@@ -91,7 +91,7 @@ def euler_source(n: int, slopes: Pattern, noise: Pattern) -> str:
 
 
 def runge_kutta_source(n: int, slopes: Pattern, h: float) -> str:
-    """Return code for F - I of a step of Runge and Kutta, all n n entries, row by row.
+    """Return code for F - I of a step of Runge and Kutta: (1, 1), (1, 2), ..., (n, n).
 
     With the slopes A_1..A_4 at the stages: K_1 = A_1, K_2 = A_2 (I + h/2 K_1), K_3 = A_3 (I + h/2
     K_2), K_4 = A_4 (I + h K_3), F = I + h/6 (K_1 + 2 K_2 + 2 K_3 + K_4).
@@ -119,7 +119,7 @@ def runge_kutta_source(n: int, slopes: Pattern, h: float) -> str:
     return _function(lines, [(name, len(slopes)) for name in "abcd"], found)
 
 
-def update_source(n: int, rows: tuple[tuple[int, ...], ...], variances: tuple[float, ...]) -> str:
+def update_source(n: int, slopes: tuple[tuple[int, ...], ...], variances: tuple[float, ...]) -> str:
     """Return code for the update by one channel after the other, in Joseph's form.
 
     All are linearised at the same point, so that their order makes no difference: of channel i the
@@ -128,18 +128,18 @@ def update_source(n: int, rows: tuple[tuple[int, ...], ...], variances: tuple[fl
 
         d <- d + K e,    P <- (I - K h') P (I - K h')' + r K K'
 
-    The function takes the entries of P, those of the rows h, the innovations nu, and 1.0 or 0.0 for
-    received and lost samples. It returns d, P, and the sum of e^2/s over what was received.
+    The function takes the entries of P, those of the gradients h, the innovations nu, and 1.0 or
+    0.0 for received and lost samples. It returns d, P, and the sum of e^2/s over what was received.
 
     Args:
         n: number of states.
-        rows: for each channel the states that it depends on.
+        slopes: for each channel the states that it depends on.
         variances: r of each channel.
     """
     lines, p = _Lines(), _symmetric(n)
     change: list[str | None] = [None] * n
     index, squares = 0, []
-    for channel, (row, r) in enumerate(zip(rows, variances, strict=True)):
+    for channel, (row, r) in enumerate(zip(slopes, variances, strict=True)):
         h = {j: f"h{index + place}" for place, j in enumerate(row)}
         index += len(row)
         b = [lines.let(" + ".join(f"{p[i, j]} * {c}" for j, c in h.items())) for i in range(n)]
@@ -168,7 +168,7 @@ def update_source(n: int, rows: tuple[tuple[int, ...], ...], variances: tuple[fl
         for i, j in pairs(n):
             p[i, j] = p[j, i] = lines.let(f"{m[i, j]} + {left[i]} * {gain[j]}")
     found = [*(str(d) for d in change), *(p[pair] for pair in pairs(n)), " + ".join(squares)]
-    groups = [("p", len(pairs(n))), ("h", index), ("v", len(rows)), ("g", len(rows))]
+    groups = [("p", len(pairs(n))), ("h", index), ("v", len(slopes)), ("g", len(slopes))]
     return _function(lines, groups, found)
 
 

@@ -168,7 +168,15 @@ class Estimator(ABC):
         return after, [b - a for b, a in zip(before, after, strict=True)]
 
     def expected(self, flavour: Flavour, mean: Components) -> Components:
-        """Return what a sensor without noise measures of a state."""
+        """Return what a sensor without noise measures of a state.
+
+        Args:
+            flavour: see `predict`.
+            mean: n components of the state.
+
+        Returns:
+            k components.
+        """
         return self._functions[flavour](*mean)
 
     @cached_property

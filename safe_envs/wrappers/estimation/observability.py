@@ -21,8 +21,8 @@ def require_observable(
 ) -> None:
     """Check that a sensor determines all of the state that is uncertain.
 
-    Along trajectories from some starts, under random inputs, the rows H F_k .. F_1 of what is
-    measured are linearised. A direction of the state that none of them sees, from any start, is
+    Along trajectories from some starts, under random inputs, what is measured is linearised, H F_k
+    .. F_1. A direction of the state that none of them sees, from any start, is
     allowed only if nothing makes it uncertain: neither the initial belief nor the noise.
 
     Args:
@@ -61,7 +61,7 @@ def require_observable(
 def _along(
     estimator: Estimator, problem: SafetyProblem, initial: InitialBelief
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that trajectories see, and the largest covariance without any sample."""
+    """Return the directions that trajectories see, and the largest covariance without samples."""
     n, model = estimator.n, estimator.model
     rng = np.random.default_rng(0)
     measured = compile_function(model.states, list(estimator.output_jacobian), "floats")

@@ -1,4 +1,4 @@
-"""Symmetric matrices as components: the upper triangle, row by row."""
+"""Symmetric matrices as components: the upper triangle, (1, 1), (1, 2), .., (1, n), (2, 2), ..."""
 
 from __future__ import annotations
 
@@ -29,7 +29,15 @@ def packed(matrix: Any) -> list[float]:
 
 
 def unpacked(components: Sequence[Any], n: int) -> np.ndarray:
-    """Return a matrix (n, n) of components, or matrices (B, n, n) of those of a batch."""
+    """Return the matrix of components.
+
+    Args:
+        components: n (n + 1)/2 numbers, or arrays (B,).
+        n: order of the matrix.
+
+    Returns:
+        Shape (n, n), or (B, n, n).
+    """
     index = np.array([[places(n)[i, j] for j in range(n)] for i in range(n)])
     table = np.stack([np.asarray(c, dtype=float) for c in components])
     return np.moveaxis(table[index], (0, 1), (-2, -1))
@@ -42,7 +50,7 @@ def positive_part(components: Sequence[Any], n: int) -> list[Any]:
 
     Args:
         components: floats or arrays (B,).
-        n: number of rows.
+        n: order of the matrix.
     """
     if n == 1:
         return [np.maximum(components[0], 0.0)]
@@ -53,13 +61,13 @@ def positive_part(components: Sequence[Any], n: int) -> list[Any]:
 
 
 def cholesky(components: Sequence[Any], n: int) -> list[list[Any]]:
-    """Return L with L L' = P, a row a list, of a positive semidefinite P.
+    """Return L with L L' = P, L_ij as entry j of list i, of a positive semidefinite P.
 
     Where a pivot is not positive, its column is 0: then L L' leaves out what rounding alone makes.
 
     Args:
         components: of P, floats or arrays (B,).
-        n: number of rows.
+        n: order of the matrix.
     """
     at, zero = places(n), np.zeros(np.shape(components[0]))
     rows: list[list[Any]] = [[zero] * n for _ in range(n)]

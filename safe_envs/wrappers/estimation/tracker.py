@@ -118,9 +118,9 @@ class BeliefTracker:
     def believed(self, u: Components) -> list[Any]:
         """Return what a belief filter is given at run time; see `belief.belief_symbols`.
 
-        These are P, its growth, and the lower triangle G, row by row, of G G' = K S K'/dt. The
-        growth is the positive part of (P at the next instant less P)/dt: what a belief loses in
-        uncertainty is no licence to approach the edge.
+        These are P, its growth, and the lower triangle of G, (1, 1), (2, 1), (2, 2) and so on, with
+        G G' = K S K'/dt. The growth is the positive part of (P at the next instant less P)/dt: what
+        a belief loses in uncertainty is no licence to approach the edge.
 
         Args:
             u: m components of the input that is proposed.

@@ -17,7 +17,7 @@ from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.runtime import doubles
 
 
-class MeasuredFilter:
+class MeasurementFilter:
     """A `SafetyFilter` at the estimate of an estimator, from measurement to measurement.
 
     Each call of `filter` stands for a control period: it takes in a measurement and decides the
@@ -190,10 +190,10 @@ class MeasuredFilter:
 class FiltersMeasurements:
     """The part of a `SafetyFilter` that is given measurements."""
 
-    _measured: MeasuredFilter | None = None
+    _measured: MeasurementFilter | None = None
 
     @property
-    def measured(self) -> MeasuredFilter:
+    def measured(self) -> MeasurementFilter:
         """The filter of measurements, which remembers its belief.
 
         Raises:
@@ -206,7 +206,7 @@ class FiltersMeasurements:
         return self._measured
 
     def filter_measurement(self, y: Any, u_nominal: Any, **given: Any) -> FilterDecision:
-        """Decide at the estimate of the state; see `MeasuredFilter.filter`.
+        """Decide at the estimate of the state; see `MeasurementFilter.filter`.
 
         Args:
             y: what was measured just now, shape (k,) or (..., k).
@@ -219,4 +219,4 @@ class FiltersMeasurements:
         return self.measured.filter(y, u_nominal, **given)
 
     def _measure_by(self, estimator: Estimator | None) -> None:
-        self._measured = None if estimator is None else MeasuredFilter(self, estimator)
+        self._measured = None if estimator is None else MeasurementFilter(self, estimator)
