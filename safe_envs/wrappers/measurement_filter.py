@@ -31,12 +31,6 @@ class MeasurementFilter:
     """
 
     def __init__(self, safety_filter: Any, estimator: Estimator) -> None:
-        if not isinstance(estimator, Estimator):
-            raise ConfigurationError(
-                f"estimator = {shown(estimator)}; give an Estimator, such as"
-                " ExtendedKalmanFilter(model, measurement, dt), or take SafetyFilter.for_problem"
-                " with its text"
-            )
         if estimator.model.states != safety_filter.model.states:
             raise ConfigurationError(
                 "the estimator is of other states than the filter; make both for one system"
@@ -185,6 +179,26 @@ class MeasurementFilter:
         if values.ndim == 1:
             return values.tolist()
         return list(np.array(values.reshape(-1, values.shape[-1]).T, order="C"))
+
+
+def certain_states(estimator: Any) -> tuple[int, ...]:
+    """Return the places of the states without any uncertainty.
+
+    Args:
+        estimator: as users give it; None for none.
+
+    Raises:
+        ConfigurationError: It is no estimator.
+    """
+    if estimator is None:
+        return ()
+    if not isinstance(estimator, Estimator):
+        raise ConfigurationError(
+            f"estimator = {shown(estimator)}; give an Estimator, such as"
+            " ExtendedKalmanFilter(model, measurement, dt), or take SafetyFilter.for_problem"
+            " with its text"
+        )
+    return estimator.certain
 
 
 class FiltersMeasurements:

@@ -28,7 +28,7 @@ from safe_envs.wrappers.filter_qp.barrier_values import BarrierValues
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
 from safe_envs.wrappers.filter_qp.problem_arguments import known_for_problem
 from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
-from safe_envs.wrappers.measurement_filter import FiltersMeasurements
+from safe_envs.wrappers.measurement_filter import FiltersMeasurements, certain_states
 
 
 class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
@@ -109,8 +109,7 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
         known = arguments.with_adjustable(system, adjustable)
         self.pairs = arguments.read_pairs(known, barriers, conditions)
         arguments.require_goal(clf, weights)
-        certain = () if estimator is None else estimator.certain
-        settings = EstimateSettings(dt, instants, region, certain)
+        settings = EstimateSettings(dt, instants, region, certain_states(estimator))
         self.constraints = tuple(
             constraint_at_estimate(c, known, barrier, settings, len(self.pairs))
             for barrier, c in self.pairs

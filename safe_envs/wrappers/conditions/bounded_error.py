@@ -106,7 +106,7 @@ def largest_slope(expression: sp.Expr, symbols: Sequence[sp.Symbol], region: Reg
         halves = _halved(boxes[chosen], finite, width)
         boxes = np.concatenate([boxes[rest], halves])
         bound = np.concatenate([bound[rest], _sizes(function, halves)])
-    return float(np.nan_to_num(bound, nan=math.inf).max())
+    return float(np.where(np.isnan(bound), math.inf, bound).max())
 
 
 def _halved(boxes: np.ndarray, finite: Sequence[int], width: Sequence[float]) -> np.ndarray:
