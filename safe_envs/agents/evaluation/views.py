@@ -180,7 +180,14 @@ def _without_sensor(spec: EvaluationSpec, filters: Sequence[Filter]) -> Evaluati
     if isinstance(problem, SafetyProblem):
         problem = problem.unmeasured
     options = {name: value for name, value in spec.options.items() if name not in _OF_SENSOR}
-    return replace(spec, problem=problem, options=options, estimator=None, filters=tuple(filters))
+    return replace(
+        spec,
+        problem=problem,
+        options=options,
+        estimator=None,
+        observe="estimate",
+        filters=tuple(filters),
+    )
 
 
 def _refuse_true_state(filters: Iterable[str | Condition | Sequence[Condition]]) -> None:
