@@ -99,3 +99,13 @@ def test_commands_take_a_system_of_ones_own(command, options, tmp_path, monkeypa
         )
     else:
         assert system in result.output
+
+
+def test_beliefs_keep_what_a_radar_sees_safer():
+    found = runpy.run_path(str(EXAMPLES / "range_bearing.py"))
+    for evaluation in (found["vehicle"](120), found["car"](120)):
+        at_state, equivalent, belief = evaluation.rows
+        assert at_state.filter.endswith("@state")
+        assert belief.safety_rate >= equivalent.safety_rate
+        nees = belief.estimation.nees
+        assert abs(nees.mean - nees.expected) < 0.25 * nees.expected
