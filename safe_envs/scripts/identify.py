@@ -115,7 +115,10 @@ def identify(
         seed=seed,
         source=None if data is None or transitions is None else DataFile(data, transitions),
         out=out,
-        use=env.evaluate_command("--filter", _filter_of(method), "--learned", str(out)),
+        use=env.evaluate_command(
+            *("--filter", _filter_of(method), "--learned", str(out)),
+            *([] if problem.measurement is None else ["--estimator", "ekf"]),
+        ),
     )
     print_report(stdout(), found)
     write_result(json, found.document)

@@ -23,7 +23,8 @@ SETTINGS = {
     ),
     "bayesian": (
         "starts=1000, steps=1, repetitions=100, degree=1 to 3 or more (by default by the number of"
-        " rows), prior=10.0, diffusion_degree=0, alpha=1.0, beta=1.0"
+        " rows), prior=10.0, diffusion_degree=0, alpha=1.0, beta=1.0, errors_in_variables=True (with"
+        " a sensor)"
     ),
 }
 """What `--set` takes for each method, for the help: importing the functions would take too long."""
@@ -105,6 +106,13 @@ def _of_kind(name: str, value: float | str, hint: Any) -> Any:
             raise ConfigurationError(
                 f"--set {given}: give whole numbers with commas between, such as {name}=100,30"
             ) from error
+    if hint is bool:
+        words = {"true": True, "false": False}
+        if str(value).lower() not in words:
+            raise ConfigurationError(
+                f"--set {shortened(name)}={shortened(value)}: give true or false"
+            )
+        return words[str(value).lower()]
     if isinstance(value, str):
         raise ConfigurationError(
             f"--set {shortened(name)}={shortened(value)}: {shown(value)} is not a number"

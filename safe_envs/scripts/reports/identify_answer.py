@@ -18,6 +18,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning import LearnedModel
 from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.wrappers.learning.data.measured import sensor_deviations
 from safe_envs.wrappers.learning.data.transitions import Transitions
 
 STATES = 1000
@@ -141,7 +142,25 @@ class IdentifyAnswer:
         """Notes needed to read the numbers."""
         return [
             *self.learned.record.warnings,
+            *self._of_sensor,
             *([self.functions] if isinstance(self.functions, str) else []),
+        ]
+
+    @property
+    def _of_sensor(self) -> list[str]:
+        """What the errors of a sensor do to what is learned."""
+        if self.problem.measurement is None:
+            return []
+        sizes = sensor_deviations(self.problem)
+        states = zip(self.problem.plant.states, sizes, strict=True)
+        seen = "states were measured with the standard deviations " + ", ".join(
+            f"{s.name} {size:g}" for s, size in states
+        )
+        if self.learned.record.settings.get("errors_in_variables"):
+            return [f"{seen}; the bias of that is corrected, as far as the errors are Gaussian"]
+        return [
+            f"{seen}, and nothing corrects the bias of that: it is part of the errors above. The"
+            " method bayesian corrects it (errors in variables), for polynomials of the states"
         ]
 
     def document(self) -> dict[str, Any]:

@@ -19,9 +19,11 @@ from safe_envs.wrappers.learning.checks import (
     require_problem,
 )
 from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.data.measured import sensor_deviations
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.drift_checks import region_warnings
+from safe_envs.wrappers.learning.errors_in_variables import corrected_fit
 from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, misfits, weaknesses
 from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.distributions import Gaussian, require_prior
@@ -47,6 +49,7 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
     diffusion_degree: int = 0,
     alpha: float = 1.0,
     beta: float = 1.0,
+    errors_in_variables: bool = True,
     data: Transitions | None = None,
     seed: int = 0,
     step: Step | None = None,
@@ -71,6 +74,8 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
             constant noise.
         alpha: shape of the inverse-gamma prior of a constant sigma.
         beta: its scale, in the units of sigma.
+        errors_in_variables: whether to correct the bias that the errors of the problem's sensor
+            make, if it has one; see `safe_envs.wrappers.learning.errors_in_variables`.
         data: to learn from, instead of collecting any.
         seed: of all randomness.
         step: how the system is stepped; None for the plant.
@@ -112,8 +117,19 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
     largest = abs(rows.u).max(axis=0)
     scale = 1.0 / np.where(largest > 0, largest, 1.0)
     design, believed = rows.design(features, scale), Prior(prior * half**2, alpha, beta)
-    errors = _held_out(data, features, scale, varying, believed)
-    found = fit(rows, design, varying, believed)
+    deviations = sensor_deviations(problem)
+    if errors_in_variables and deviations.any():
+        if varying is not None:
+            raise ConfigurationError(
+                f"diffusion_degree = {diffusion_degree}: noise that varies is not told from that of"
+                " the sensor; leave it out, or give errors_in_variables=False"
+            )
+        # What was left out is measured with errors too, and says little.
+        errors = {}
+        found = corrected_fit(rows, features, scale, deviations, believed)
+    else:
+        errors = _held_out(data, features, scale, varying, believed)
+        found = fit(rows, design, varying, believed)
     names = [u.name for u in problem.plant.inputs]
     warned = (
         *weaknesses(
@@ -141,6 +157,7 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
         "prior": prior,
         "alpha": alpha,
         "beta": beta,
+        **({"errors_in_variables": errors_in_variables} if deviations.any() else {}),
         # Of data from elsewhere it is not known how finely a step was integrated: see
         # `safe_envs.wrappers.verification.step_bias`.
         **({"substeps": problem.substeps} if collected and step is None else {}),

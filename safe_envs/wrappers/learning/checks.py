@@ -33,6 +33,7 @@ class Purpose(IntEnum):
     STATES = 1003
     TRAINING = 1004
     HELD_OUT = 1005
+    SENSOR = 1006
 
 
 def random_stream(seed: int, purpose: Purpose) -> np.random.Generator:

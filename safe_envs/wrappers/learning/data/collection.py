@@ -18,6 +18,7 @@ from safe_envs.wrappers.learning.checks import (
     require_problem,
     require_room,
 )
+from safe_envs.wrappers.learning.data.measured import measured
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step, period_of, plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions
@@ -80,6 +81,8 @@ def collect(  # noqa: PLR0913 - the friendly keyword form
 ) -> Transitions:
     """Collect one-step data where a problem is explored, under each of some inputs.
 
+    Of a problem with a measurement the states are those that its sensor sees.
+
     With several steps, trajectories are followed. Each goes on with the first successor under one
     of the inputs, chosen at random, and restarts from a fresh state where it leaves the region or a
     barrier is not positive.
@@ -137,11 +140,17 @@ def collect(  # noqa: PLR0913 - the friendly keyword form
         x[k] = np.repeat(states, len(tried), axis=0)
         _repeat(step, x[k], u, noise, successors[k], lambda part, k=k: tell((k + part) / steps))
     every = steps * rows
+    seen = measured(
+        problem,
+        x.reshape(every, n),
+        successors.reshape(every, repetitions, n),
+        random_stream(seed, Purpose.SENSOR),
+    )
     return Transitions(
         signature,
-        x.reshape(every, n),
+        seen[0],
         np.tile(u, (steps, 1)),
-        successors.reshape(every, repetitions, n),
+        seen[1],
         np.full(every, period),
         seed,
     )
@@ -196,7 +205,7 @@ def collect_paths(
     paths[:, 0] = begin
     for k in range(steps):
         paths[:, k + 1] = _stepped(step, paths[:, k], held, noise)
-    return paths
+    return measured(problem, begin, paths, random_stream(seed, Purpose.SENSOR))[1]
 
 
 def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
