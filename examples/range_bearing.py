@@ -1,13 +1,14 @@
-"""Filters that see an obstacle by a noisy radar: a vehicle with range and bearing, a car with a gap.
+"""Filters that see by noisy sensors: a vehicle with range and bearing, a car with a radar.
 
-A Dubins vehicle knows its own place from a positioning system and a compass, and the obstacle by its
-range and its bearing from the heading. One range and one bearing leave the vehicle's own place open:
-turned around the obstacle, it would measure the same. So all five numbers are needed for the five
-states. A car in adaptive cruise control has a radar for the gap and the relative speed to its lead.
+A Dubins vehicle knows its own place from a positioning system and a compass, and the obstacle by
+its range and its bearing from the heading. One range and one bearing leave the vehicle's own place
+open: turned around the obstacle, it would measure the same. So all five numbers are needed for the
+five states. A car in adaptive cruise control has a radar for the gap and the relative speed to its
+lead.
 
-Each filter is shown at the true state, at the estimate of an extended or unscented Kalman filter as
-if that were true (certainty equivalence), and with the belief of the estimator, on the same noise of
-the plant.
+Each filter is shown at the true state, at the estimate of an extended or unscented Kalman filter
+as if that were true (certainty equivalence), and with the belief of the estimator, on the same
+noise of the plant.
 
     python examples/range_bearing.py
 """
@@ -56,12 +57,12 @@ def main() -> None:
     for title, found in (("range and bearing", vehicle()), ("gap and relative speed", car())):
         print(f"{title}: {found.title}, {found.about}")
         for row in found.rows:
-            rate = f"{100 * row.safety_rate:.1f} % [{100 * row.ci_low:.1f}, {100 * row.ci_high:.1f}]"
+            rate, low, high = (100 * x for x in (row.safety_rate, row.ci_low, row.ci_high))
             seen = row.estimation
             honest = ""
             if seen is not None and seen.nees is not None:
                 honest = f", NEES {seen.nees.mean:.2f} (expected {seen.nees.expected:.2f})"
-            print(f"  {row.filter:20} safe {rate}{honest}")
+            print(f"  {row.filter:20} safe {rate:.1f} % [{low:.1f}, {high:.1f}]{honest}")
 
 
 if __name__ == "__main__":

@@ -157,9 +157,9 @@ def require_full_state(problem: Any, what: str) -> None:
     """
     if problem.measurement is not None:
         raise ConfigurationError(
-            f"{what} act on the full state, and {problem.name} is measured; give an estimator, by"
-            " --estimator ekf or as StateEstimatorWrapper with policies of problem.unmeasured, or"
-            " leave the measurement out"
+            f"{what} act on the full state, and {problem.name} is measured; give an estimator"
+            " (safe-envs evaluate --estimator ekf, or StateEstimatorWrapper with policies of"
+            " problem.unmeasured), or leave the measurement out"
         )
 
 

@@ -131,8 +131,11 @@ def _named(spec: EvaluationSpec) -> list[tuple[str, Filter, bool]]:
     )
     found: dict[str, tuple[str, Filter, bool]] = {}
     for each in asked:
-        for row in [_stated(each)] if explicit else _expanded(each, spec.belief):
-            found.setdefault(row[0], row)
+        rows = [_stated(each)] if explicit else _expanded(each, spec.belief)
+        for row in rows:
+            # At the true state nothing is measured that a policy could see.
+            if explicit or not row[2] or spec.observe == "estimate":
+                found.setdefault(row[0], row)
     return list(found.values())
 
 

@@ -12,7 +12,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+from safe_envs.wrappers import (
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    StateEstimatorVectorWrapper,
+)
 
 _OF_ONE_ENV = {
     "observation_space": "single_observation_space",
@@ -32,7 +36,9 @@ class NativeVecEnv(VecEnv):
         env: see above.
     """
 
-    def __init__(self, env: SafeVectorEnv | SafetyFilterVectorWrapper) -> None:
+    def __init__(
+        self, env: SafeVectorEnv | SafetyFilterVectorWrapper | StateEstimatorVectorWrapper
+    ) -> None:
         self.env = env
         self._native: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAttributeAccessIssue]
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)

@@ -21,7 +21,7 @@ from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.registry import env_class, full_id
-from safe_envs.wrappers import SafetyFilterVectorWrapper
+from safe_envs.wrappers import SafetyFilterVectorWrapper, StateEstimatorVectorWrapper
 from safe_envs.wrappers.conditions import Condition
 
 _TRUNCATED = "TimeLimit.truncated"
@@ -29,8 +29,10 @@ _PENALTY = "intervention_penalty"
 
 Filter = Condition | Sequence[Condition] | str | None
 
+_NATIVE = (SafeVectorEnv, SafetyFilterVectorWrapper, StateEstimatorVectorWrapper)
 
-def make_sb3_env(
+
+def make_sb3_env(  # noqa: PLR0913  (all but env_id have defaults)
     env_id: str,
     num_envs: int = 8,
     filter: Filter = None,  # noqa: A002  (the word of the whole project)
@@ -40,6 +42,8 @@ def make_sb3_env(
     intervention_penalty: float = 0.0,
     seed: int | None = None,
     engine: str = "numpy",
+    estimator: str | None = None,
+    observe: str = "estimate",
     **options: Any,
 ) -> SafeVecEnv:
     """Make the `VecEnv` of a registered env for the algorithms of Stable-Baselines3.
@@ -55,6 +59,8 @@ def make_sb3_env(
         seed: Env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later
             and replaces it.
         engine: "numpy", "compiled" or "auto"; see `SafeVectorEnv`.
+        estimator: of the state, for envs with a `measurement`; see `StateEstimatorWrapper`.
+        observe: what the agent sees with an estimator; see there.
         **options: arguments of `gym.make`, also `terminate_on_violation`; those that are None are
             left out.
 
@@ -78,6 +84,8 @@ def make_sb3_env(
         engine=engine,
         **given,
     )
+    if estimator is not None:
+        env = StateEstimatorVectorWrapper(env, estimator, observe, knowledge)
     if filter is not None and filter != UNFILTERED:
         env = SafetyFilterVectorWrapper(env, filter, knowledge, objective)
     result = SafeVecEnv(env, intervention_penalty)
@@ -118,7 +126,7 @@ class SafeVecEnv(NativeVecEnv):
     """
 
     def __init__(self, env: gym.vector.VectorEnv, intervention_penalty: float = 0.0) -> None:
-        if not isinstance(env, SafeVectorEnv | SafetyFilterVectorWrapper):
+        if not isinstance(env, _NATIVE):
             raise ConfigurationError(
                 f"{env} is neither one of this project's vector envs nor a filter over one; use"
                 " make_sb3_env"

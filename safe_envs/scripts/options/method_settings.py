@@ -23,7 +23,7 @@ SETTINGS = {
     ),
     "bayesian": (
         "starts=1000, steps=1, repetitions=100, degree=1 to 3 or more (by default by the number of"
-        " rows), prior=10.0, diffusion_degree=0, alpha=1.0, beta=1.0, errors_in_variables=True (with"
+        " rows), prior=10.0, diffusion_degree=0, alpha=1.0, beta=1.0, errors_in_variables=True (of"
         " a sensor)"
     ),
 }

@@ -11,7 +11,7 @@ import sympy as sp
 from safe_envs.atomic_io import write_atomically, writing
 from safe_envs.bounded_reading import open_regular
 from safe_envs.dynamics.declarations import declared_sign
-from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.errors import ConfigurationError, NotCompilableError, shortened, shown
 from safe_envs.wrappers.export.build_files import cmake_text, readme_text
 from safe_envs.wrappers.export.c_header import MARK, header_text
 from safe_envs.wrappers.export.c_numbers import DOUBLE, SINGLE
@@ -113,6 +113,11 @@ def sources(
         ConfigurationError: The name is no name of C.
         NotCompilableError: Something in the filter has no form in C.
     """
+    if safety_filter.belief_places:
+        raise NotCompilableError(
+            "conditions with belief need an estimator, which is not exported; export certainty"
+            " equivalence (the condition without belief), or measurement_error"
+        )
     program = filter_program(safety_filter)
     size = len(program.data.array())
     if size > LARGEST_TABLE:

@@ -100,7 +100,7 @@ def test_policies_may_see_the_measurement():
     assert set(seen) == {4}
     seen.clear()
     evaluate("safe_envs/StochasticDubins-v0", policy, ["none"], observe="measurement", **given)
-    assert set(seen) == {3, 4}  # the row at the true state sees the features
+    assert set(seen) == {3}
 
 
 def test_conditions_as_objects_have_views_too():
