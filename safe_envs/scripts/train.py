@@ -119,6 +119,14 @@ def train(
         ),
     ] = None,
     knowledge: text_options.Knowledge = "model",
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="kf|ekf|ukf",
+            callback=early_checks.known_estimator,
+            help="With --measurement: the agent and the filter act at an estimate of the state.",
+        ),
+    ] = None,
     eval_freq: Annotated[
         int | None,
         typer.Option(
@@ -163,6 +171,7 @@ def train(
         filter=filters[0] if filters else None,
         options=env.arguments,
         knowledge=knowledge,
+        estimator=estimator,
         n_timesteps=n_timesteps,
         num_envs=num_envs,
         settings=read_hyperparameters(settings or []),
@@ -196,6 +205,7 @@ def train(
     filter_name = training.filter or "none"
     print_evaluations(stdout(), filter_name, rows)
     known = [f"--knowledge={knowledge}"] if knowledge != "model" else []
+    known += [] if estimator is None else [f"--estimator={estimator}"]
     command = env.evaluate_command("--policy", str(out), "--filter", filter_name, *known)
     say(stdout(), f"\nTo evaluate the policy: {command}")
     config = json.loads((out / "config.json").read_text())

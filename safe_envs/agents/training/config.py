@@ -50,7 +50,9 @@ class Training:
         eval_freq: steps between evaluations, at each of which a checkpoint is kept.
         filter: text of the filter in the loop; None for the unfiltered env.
         options: arguments of `gym.make`.
-        knowledge: of the filter, "model" or "plant".
+        knowledge: of the filter and the estimator, "model" or "plant".
+        estimator: of the state, for envs with a `measurement`; agents see the env's features at
+            the estimate, at which the filter decides, too. None for none.
         seed: of everything random.
         action: on which an off-policy algorithm learns; see
             `safe_envs.agents.training.replay_buffer`.
@@ -82,6 +84,7 @@ class Training:
     filter: str | None = None
     options: dict[str, Any] = field(default_factory=dict)
     knowledge: str = "model"
+    estimator: str | None = None
     seed: int = 0
     action: str = ACTIONS[0]
     intervention_penalty: float = 0.0

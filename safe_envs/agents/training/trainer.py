@@ -20,8 +20,8 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecMonitor
 
-from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.evaluate import run_evaluation
+from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, RunSettings
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.store import make_folder
 from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
@@ -135,7 +135,8 @@ class TrainingSession:
     def __init__(self, training: Training, folder: Path, resume: bool = False) -> None:
         self.seconds = 0.0
         self._training, self._folder = training, folder
-        self._problem = make_problem(training.env_id, **training.options)
+        problem = make_problem(training.env_id, **training.options)
+        self._problem = problem if training.estimator is None else problem.unmeasured
         self._figures = SafetyFigures()
         envs = VecMonitor(
             make_sb3_env(
@@ -145,6 +146,7 @@ class TrainingSession:
                 knowledge=training.knowledge,
                 intervention_penalty=training.intervention_penalty,
                 engine=engine_for(training.engine, training.n_timesteps),
+                estimator=training.estimator,
                 **training.env_options,
             )
         )
@@ -217,7 +219,6 @@ class TrainingSession:
             return True  # anything else would end the training
 
         callbacks = [self._figures, ConvertCallback(note)]
-
         # Schedules refer to the whole training, not to its part.
         of_part = model._update_current_progress_remaining
         model._update_current_progress_remaining = lambda done, _: of_part(
@@ -260,19 +261,22 @@ class TrainingSession:
         """Evaluate a checkpoint, and keep its policy if its return is the best so far."""
         training, model = self._training, self._model
         seed = _child_seed(training.seed, _OF_EVALUATIONS)
-        found = evaluate(
+        spec = EvaluationSpec(
             training.env_id,
             str(checkpoint),
-            [training.filter or UNFILTERED],
+            (training.filter or UNFILTERED,),
             options=training.options,
             episodes=training.eval_episodes,
             seed=seed,
             knowledge=training.knowledge,
             bounds=False,
             best=False,
-            # Policies that cannot be compiled can be trained behind compiled envs.
-            engine="numpy" if training.engine == "numpy" else "auto",
+            estimator=training.estimator,
+            compare_estimates=False,
         )
+        # Policies that cannot be compiled can be trained behind compiled envs.
+        engine = "numpy" if training.engine == "numpy" else "auto"
+        found = run_evaluation(spec, RunSettings(engine=engine))
         row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
         entry = {
             "timesteps": model.num_timesteps,

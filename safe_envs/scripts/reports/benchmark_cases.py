@@ -12,8 +12,10 @@ import sympy as sp
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.sample import Sample
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.registry import make_problem
 from safe_envs.scripts.reports.hand_written_loop import LIMIT, step_by_hand
 from safe_envs.wrappers import (
@@ -23,6 +25,7 @@ from safe_envs.wrappers import (
     SafetyFilterVectorWrapper,
     SafetyFilterWrapper,
 )
+from safe_envs.wrappers.estimation import BeliefTracker, ExtendedKalmanFilter, InitialBelief
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 NUM_ENVS = 1024
@@ -125,6 +128,43 @@ def several_constraints() -> dict[str, Case]:
             lambda: limits.filter(flying, rotors), NUM_ENVS
         ),
     }
+
+
+def estimator_steps() -> dict[str, Case]:
+    """Return steps of an extended Kalman filter: a prediction and the update with a sample."""
+    return {
+        f"extended Kalman filter, four states, {title}": estimator_step(batch)
+        for batch, title in ((None, "1 robot"), (NUM_ENVS, f"{NUM_ENVS} robots"))
+    }
+
+
+def estimator_step(batch: int | None) -> Case:
+    """Return a step of a filter of robots with an own speed, whose places are measured.
+
+    Args:
+        batch: how many robots; None for one, in plain floats.
+    """
+    x, y, theta, v, turn, push = sp.symbols("x y theta v omega a", real=True)
+    robot = ControlAffineSDE(
+        (x, y, theta, v),
+        (turn, push),
+        [v * sp.cos(theta), v * sp.sin(theta), 0, 0],
+        [[0, 0], [0, 0], [1, 0], [0, 1]],
+        [0.05, 0.05, 0.05, 0.1],
+    )
+    sensor = Measurement((Channel("x", x, 0.1), Channel("y", y, 0.1)))
+    initial = InitialBelief.of([0.0, 0.0, 0.5, 1.0], 0.1 * np.eye(4))
+    tracker = BeliefTracker(ExtendedKalmanFilter(robot, sensor, 0.02, initial=initial), batch)
+    if batch is None:
+        u, sample = (0.1, 0.0), Sample((0.01, -0.02), (True, True))
+    else:
+        drawn = np.random.default_rng(0).normal(0.0, 0.1, (4, batch))
+        u, sample = (drawn[0], drawn[1]), Sample(drawn[2:], np.full((2, batch), True))
+    return Case(
+        lambda: tracker.advance(u, sample),
+        batch or 1,
+        prepare=lambda: tracker.begin(sample),
+    )
 
 
 def scalar_steps() -> dict[str, Case]:

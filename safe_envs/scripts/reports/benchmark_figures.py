@@ -17,6 +17,7 @@ from safe_envs.scripts.reports.benchmark_cases import (
     ENV_ID,
     NUM_ENVS,
     Case,
+    estimator_steps,
     filter_calls,
     fused_loop,
     hand_written_loop,
@@ -80,7 +81,8 @@ def parts() -> list[Part]:
 
 def _calls_and_envs() -> Figures:
     """Return microseconds for each state, and the ratios that matter."""
-    cases = {**filter_calls(), **several_constraints(), **scalar_steps(), **vector_steps()}
+    calls = {**filter_calls(), **several_constraints(), **estimator_steps()}
+    cases = {**calls, **scalar_steps(), **vector_steps()}
     compiled = _compiled_cases() if is_available() else {}
     times = _times({**cases, FUSED: fused_loop(), **compiled})
     return {

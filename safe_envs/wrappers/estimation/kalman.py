@@ -59,7 +59,7 @@ class ExtendedKalmanFilter(Estimator):
         Returns:
             The mean and the covariance.
         """
-        if self.model.noise_channels:
+        if self._noisy:
             return self._euler(flavour, mean, covariance, u)
         return self._runge_kutta(flavour, mean, covariance, u)
 
@@ -118,6 +118,10 @@ class ExtendedKalmanFilter(Estimator):
                 for x, a, b, c, d in zip(mean, *(stage[:n] for stage in stages), strict=True)
             ]
         return mean, covariance
+
+    @cached_property
+    def _noisy(self) -> bool:
+        return self.model.noisy  # Which goes through symbols at each call.
 
     @cached_property
     def _slopes(self) -> tuple[tuple[int, int], ...]:

@@ -51,9 +51,11 @@ class BeliefTracker:
         self._flavour: Flavour = "floats" if num_envs is None else "arrays"
         self._delay = estimator.measurement.delay
         k = len(estimator.measurement.channels)
-        # The belief that the next sample corrects, and the inputs since.
+        # The belief that the next sample corrects.
         self._base: tuple[Components, Components] = self._start
-        self._since: deque[Components] = deque()
+        # Of the last periods, as many as samples are late; before an episode's first they are idle.
+        idle = [self._each(0.0)] * estimator.model.m
+        self._since: deque[Components] = deque([idle] * self._delay)
         self._age = self._each(0)
         self.mean, self.covariance = self._base
         self.innovation: Components = [self._each(0.0)] * k
@@ -86,10 +88,8 @@ class BeliefTracker:
         """
         self._since.append(tuple(u))
         self._age = self._age + 1
-        if len(self._since) > self._delay:
-            oldest = self._since.popleft()
-            moved = self.estimator.predict(self._flavour, *self._base, oldest)
-            self._base = self._where(self._age > self._delay, moved, self._base)
+        moved = self.estimator.predict(self._flavour, *self._base, self._since.popleft())
+        self._base = self._where(self._age > self._delay, moved, self._base)
         self._correct(sample, True)
         self._look_ahead()
 
@@ -103,12 +103,9 @@ class BeliefTracker:
         if not self._delay:
             return estimator.gained(flavour, *self._base, u)
         _, before = estimator.predict(flavour, self.mean, self.covariance, u)
-        since = [*self._since, tuple(u)]
-        mean, covariance = self._base
-        if len(since) > self._delay:
-            moved = estimator.predict(flavour, mean, covariance, since[0])
-            mean, covariance = self._where(self._age >= self._delay, moved, (mean, covariance))
-            since = since[1:]
+        oldest, *since = *self._since, tuple(u)
+        moved = estimator.predict(flavour, *self._base, oldest)
+        mean, covariance = self._where(self._age >= self._delay, moved, self._base)
         y = estimator.expected(flavour, mean)
         arrives = self._age + 1 >= self._delay
         after = estimator.update(flavour, mean, covariance, y, [arrives] * len(y))
@@ -148,7 +145,8 @@ class BeliefTracker:
         }
         found = {f"belief_{name}": np.stack(part, axis=-1) for name, part in parts.items()}
         inputs = [np.stack(u, axis=-1) for u in self._since]
-        found["belief_inputs"] = np.stack(inputs, axis=-2) if inputs else np.zeros((self._size, 0))
+        empty = np.zeros((self._size, 0, self.estimator.model.m))
+        found["belief_inputs"] = np.stack(inputs, axis=-2) if inputs else empty
         counters = {"age": self._age, "lost": self.lost, "nis": self.nis}
         return found | {f"belief_{name}": np.array(value) for name, value in counters.items()}
 
@@ -163,8 +161,7 @@ class BeliefTracker:
         self.innovation, self.received = columns("innovation"), columns("received")
         inputs = np.array(snapshot["belief_inputs"])
         self._since = deque(
-            tuple(np.moveaxis(inputs[:, i], -1, 0).copy())
-            for i in range(inputs.shape[1] if inputs.ndim == 3 else 0)
+            tuple(np.moveaxis(inputs[:, i], -1, 0).copy()) for i in range(inputs.shape[1])
         )
         self._age, self.lost, self.nis = (
             np.array(snapshot[f"belief_{name}"]) for name in ("age", "lost", "nis")
