@@ -171,17 +171,18 @@ def one_of(option: str, allowed: Sequence[str]) -> Callable[[Any], Any]:
     return check
 
 
-def between_0_and_1(option: str) -> Callable[[Any], Any]:
+def between_0_and_1(option: str, example: float) -> Callable[[Any], Any]:
     """Return the check of an option that is a number above 0 and below 1.
 
     Args:
         option: its name without dashes, for the message.
+        example: a usual value, likewise.
     """
 
     def check(given: float | None) -> float | None:
         if given is not None and not 0 < given < 1:
             raise ConfigurationError(
-                f"{option} = {given}; give a number above 0 and below 1, such as 0.95"
+                f"{option} = {given}; give a number above 0 and below 1, such as {example}"
             )
         return given
 

@@ -73,7 +73,7 @@ Belief = Annotated[
     float,
     typer.Option(
         metavar="P",
-        callback=early_checks.between_0_and_1("belief"),
+        callback=early_checks.between_0_and_1("belief", 0.05),
         help="Probability with which errors of the estimate exceed the margin of those rows.",
     ),
 ]
@@ -118,7 +118,7 @@ Confidence = Annotated[
     float,
     typer.Option(
         metavar="C",
-        callback=early_checks.between_0_and_1("confidence"),
+        callback=early_checks.between_0_and_1("confidence", 0.95),
         help="Of all intervals, above 0 and below 1.",
     ),
 ]
