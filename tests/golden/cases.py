@@ -154,6 +154,18 @@ def cases() -> dict[str, Case]:
             for env_id in ("QuadrotorLimits-v0", "DubinsDisk-v0", "ACCGap-v0")
         )
     )
+    found["evaluate/sensors"] = Case(
+        (
+            "evaluate Scalar-v0 --measurement default --estimator kf --episodes 20 --seed 2",
+            "evaluate Pendulum-v0 --measurement default:dropout=0.2 --measurement delay=2"
+            " --estimator ekf:process_noise=0.1 --filter scbf --filter scbf:measurement_error=0.01"
+            " --episodes 5 --horizon 1 --seed 2",
+            "evaluate DubinsReach-v0 --measurement default --sensor-noise 2 --estimator ukf"
+            " --episodes 5 --horizon 2 --seed 2",
+            "identify Scalar-v0 --method bayesian --measurement default --set starts=400 --seed 3"
+            " --out corrected.npz",
+        )
+    )
     found["leaderboard/Scalar-v0"] = Case(
         ("leaderboard Scalar-v0 --quick --episodes 5 --out board",)
     )

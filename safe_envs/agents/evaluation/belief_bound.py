@@ -24,12 +24,15 @@ def delta_of(conditions: Sequence[Condition]) -> float | None:
     return max(given) if given and len(given) == len(conditions) else None
 
 
-def why_not_proved(problem: SafetyProblem, estimator: Estimator) -> str | None:
+def why_not_proved(
+    problem: SafetyProblem, estimator: Estimator, monitoring: str = "discrete"
+) -> str | None:
     """Return why the bound is measured and not proved; None where it is proved.
 
     Args:
         problem: that is simulated.
         estimator: of its state.
+        monitoring: where violations are looked for; the bound is of the control instants.
     """
     nonlinear = nonlinearity(estimator)
     states = problem.plant.states
@@ -47,6 +50,7 @@ def why_not_proved(problem: SafetyProblem, estimator: Estimator) -> str | None:
         "the estimator has noise that the plant has not": any(estimator.added),
         "the start is not known": bool(problem.starts[problem.start].uniforms),
         "the sensor is biased": any(c.bias for c in channels),
+        "violations between the control instants count too": monitoring != "discrete",
         "the sensor is periodic": any(c.period for c in channels),
         f"{', '.join(bent)} is no half-space": bool(bent),
     }

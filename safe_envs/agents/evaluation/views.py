@@ -86,7 +86,8 @@ class View(NamedTuple):
         if estimator is None or not parts:
             return None
         delta = delta_of(conditions_of(self.filters[0]))
-        why_not = why_not_proved(self.resolved.problem, estimator) if delta else None
+        monitoring = self.resolved.spec.monitoring
+        why_not = why_not_proved(self.resolved.problem, estimator, monitoring) if delta else None
         return summary_of(EstimationResults.joined(parts), confidence, delta, why_not)
 
 

@@ -178,3 +178,13 @@ def test_a_bound_is_proved_of_a_known_linear_system_alone():
         assert words in why_not_proved(other, make_estimator("kf", other))
     assert "noise" in why_not_proved(problem, make_estimator("kf:process_noise=0.1", problem))
     assert "ukf" in why_not_proved(problem, make_estimator("ukf", problem))
+    assert "between" in why_not_proved(problem, make_estimator("kf", problem), "continuous")
+    given = {"options": {"measurement": "default", "horizon": 0.3, "start": "origin"}}
+    for monitoring, word in (("discrete", "proved"), ("continuous", "designed")):
+        found = evaluate(
+            "Scalar-v0",
+            filters=["scbf:belief=0.1"],
+            **SHORT | given,
+            monitoring=monitoring,
+        )
+        assert found.rows[0].estimation.bound_word == word
