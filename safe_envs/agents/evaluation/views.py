@@ -158,8 +158,11 @@ def _expanded(given: Filter, belief: float) -> list[tuple[str, Filter, bool]]:
 
 
 def _with_belief(given: Filter, belief: float) -> Filter | None:
-    """Return a filter whose conditions know the belief; None where they cannot, or do already."""
-    if _has_belief(given):
+    """Return a filter whose conditions know the belief; None where they cannot, or do already.
+
+    A bound of the error, `measurement_error`, leaves the belief no place.
+    """
+    if _has_belief(given) or _has_bound(given):
         return None
     if isinstance(given, str):
         parts = [] if given == UNFILTERED else parts_of(given)
@@ -176,6 +179,12 @@ def _has_belief(given: Filter) -> bool:
     if isinstance(given, str):
         return ":belief=" in given
     return any(condition.belief is not None for condition in conditions_in(given))
+
+
+def _has_bound(given: Filter) -> bool:
+    if isinstance(given, str):
+        return ":measurement_error=" in given
+    return any(condition.measurement_error for condition in conditions_in(given))
 
 
 def _without_sensor(spec: EvaluationSpec, filters: Sequence[Filter]) -> EvaluationSpec:

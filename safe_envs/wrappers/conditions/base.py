@@ -111,6 +111,11 @@ class Condition(ABC):
                 f"measurement_error = {shown(given)}; give a number >= 0, or one for each state"
             )
         object.__setattr__(self, "measurement_error", tuple(map(float, errors)))
+        if self.belief is not None and self.measurement_error:
+            raise ConfigurationError(
+                f"belief = {self.belief} and measurement_error = {shown(given)} are two answers to"
+                " the same error of the state; give one"
+            )
 
     @property
     def derivative(self) -> Derivative:

@@ -108,6 +108,14 @@ def test_conditions_as_objects_have_views_too():
     assert [row.filter for row in found.rows] == ["scbf@state", "scbf", "scbf:belief=0.2"]
 
 
+def test_a_bound_of_the_error_takes_the_place_of_the_belief():
+    found = evaluate(ENV, filters=["scbf:measurement_error=0.01"], **SHORT)
+    name = "scbf:measurement_error=0.01"
+    assert [row.filter for row in found.rows] == [f"{name}@state", name]
+    found = evaluate(ENV, filters=[SCBF(measurement_error=0.01)], **SHORT)
+    assert len(found.rows) == 2
+
+
 def test_named_views_are_the_only_ones():
     found = evaluate(ENV, filters=["scbf@state", "szcbf"], **SHORT)
     assert [row.filter for row in found.rows] == ["scbf@state", "szcbf"]

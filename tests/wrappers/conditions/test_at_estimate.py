@@ -150,6 +150,19 @@ def test_one_input_loses_nothing_where_the_constraint_is_affine():
     assert decision.action[0] == pytest.approx(1 - 2 * 0.6, abs=1e-9)
 
 
+def test_the_errors_of_all_states_add_up():
+    # -2 u + x - 3 y + 1 >= 0, at the worst corner x = .1, y = .3.
+    known = SafetyFilter(
+        PLANE,
+        1 - x - 2 * y,
+        CBF(1.0, measurement_error=(0.1, 0.2)),
+        bounds=(-9, 9),
+        region=[(-1, 1), (-1, 1)],
+    )
+    decision = known.filter(np.array([0.2, 0.1]), np.array([5.0]))
+    assert decision.action[0] == pytest.approx((0.1 - 3 * 0.3 + 1) / 2, abs=1e-9)
+
+
 def test_no_error_is_the_plain_constraint():
     found = SafetyFilter(LINE, 1 - x, SCBF(measurement_error=0.0), bounds=(-9, 9), region=[(-2, 2)])
     plain = SafetyFilter(LINE, 1 - x, SCBF(), bounds=(-9, 9))
@@ -206,6 +219,7 @@ def test_texts_come_back(text):
         (lambda: SCBF(belief=1.5), "probability above 0 and below 1"),
         (lambda: SCBF(belief="much"), "probability"),
         (lambda: SCBF(measurement_error=-1.0), "number >= 0"),
+        (lambda: SCBF(belief=0.1, measurement_error=0.1), "give one"),
         (lambda: SafetyFilter(LINE, 1 - x, SCBF(belief=0.1), bounds=(-1, 1)), "instants="),
         (
             lambda: SafetyFilter(LINE, 1 - x**2, CBF(1.0, measurement_error=0.1), bounds=(-1, 1)),

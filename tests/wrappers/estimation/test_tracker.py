@@ -77,6 +77,25 @@ def test_a_batch_is_many_trackers_whenever_their_episodes_begin(delay):
             np.testing.assert_allclose(several, believed, atol=1e-8)
 
 
+def test_what_shrinks_of_a_belief_does_not_count():
+    tracker = tracked(start="uniform")
+    n, dt = tracker.estimator.n, tracker.estimator.dt
+    first, *rest = samples(60)
+    tracker.begin(first)
+    shrinks = []
+    for each in rest:
+        after, _ = tracker.ahead([0.0])
+        change = unpacked([(a - p) / dt for a, p in zip(after, tracker.covariance, strict=True)], n)
+        upper = n * (n + 1) // 2
+        growth = unpacked([float(v) for v in tracker.believed([0.0])[upper : 2 * upper]], n)
+        values, vectors = np.linalg.eigh(change)
+        expected = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        np.testing.assert_allclose(growth, expected, atol=1e-9 * abs(change).max())
+        shrinks.append(values[0] < 0.0)
+        tracker.advance([0.0], each)
+    assert any(shrinks)
+
+
 def test_values_that_are_no_numbers_are_lost():
     one, other = tracked(), tracked()
     one.begin(Sample([0.1, np.nan], [True, True]))
