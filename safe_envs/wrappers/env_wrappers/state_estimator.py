@@ -47,7 +47,7 @@ class StateEstimatorWrapper(
         observe: str = "estimate",
         knowledge: str = "model",
     ) -> None:
-        inner = state_layer(env, (SafeEnv,), vector=False)
+        inner = state_layer(env, (SafeEnv,), vector=False, wrapper="StateEstimator")
         self.attach(inner, estimator, observe, knowledge)
         gym.utils.RecordConstructorArgs.__init__(
             self, estimator=self.estimator.text, observe=observe, knowledge=knowledge

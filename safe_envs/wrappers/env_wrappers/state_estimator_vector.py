@@ -38,7 +38,7 @@ class StateEstimatorVectorWrapper(EstimatorLayer, gym.vector.VectorWrapper):
         observe: str = "estimate",
         knowledge: str = "model",
     ) -> None:
-        inner = state_layer(env, (SafeVectorEnv,), vector=True)
+        inner = state_layer(env, (SafeVectorEnv,), vector=True, wrapper="StateEstimator")
         self.attach(inner, estimator, observe, knowledge, env.num_envs)
         gym.vector.VectorWrapper.__init__(self, env)
         if self._sees_estimate:

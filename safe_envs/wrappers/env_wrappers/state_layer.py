@@ -1,4 +1,4 @@
-"""The layer of an env from which a filter reads the state."""
+"""The layer of an env from which a filter reads the state, or an estimator what is measured."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from safe_envs.envs.env import SafeEnv
 from safe_envs.errors import ConfigurationError
 
 
-def state_layer(env: Any, kinds: tuple[type, ...], vector: bool) -> Any:
-    """Return the layer of an env from which a filter reads the state.
+def state_layer(
+    env: Any, kinds: tuple[type, ...], vector: bool, wrapper: str = "SafetyFilter"
+) -> Any:
+    """Return the layer of an env from which a wrapper reads the state.
 
     Args:
         env: an env, possibly wrapped.
         kinds: classes of layers that show the state.
-        vector: whether the filter is for a batch.
+        vector: whether the wrapper is for a batch.
+        wrapper: name of its class, for messages: without "Wrapper" or "VectorWrapper".
 
     Raises:
         ConfigurationError: There is none.
@@ -28,20 +31,23 @@ def state_layer(env: Any, kinds: tuple[type, ...], vector: bool) -> Any:
     ):
         layer = layer.env
     if not isinstance(layer, kinds):
-        raise _unreadable(layer, vector)
+        raise _unreadable(layer, vector, wrapper)
     return layer
 
 
-def _unreadable(env: Any, vector: bool) -> ConfigurationError:
+def _unreadable(env: Any, vector: bool, wrapper: str) -> ConfigurationError:
     if isinstance(env, gym.vector.VectorEnv) != vector:
-        kind, wrapper = ("single", "") if vector else ("vector", "Vector")
-        return ConfigurationError(
-            f"{env} is a {kind} env; put SafetyFilter{wrapper}Wrapper over it"
-        )
+        kind, other = ("single", "") if vector else ("vector", "Vector")
+        return ConfigurationError(f"{env} is a {kind} env; put {wrapper}{other}Wrapper over it")
     if vector and any(isinstance(each.unwrapped, SafeEnv) for each in getattr(env, "envs", [])):
         return ConfigurationError(
             f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many"
             " times faster too"
+        )
+    if wrapper == "StateEstimator":
+        return ConfigurationError(
+            f"{env} is not one of this project's envs, which alone have the option measurement;"
+            " take filter_measurement of a SafetyFilter with an estimator"
         )
     return ConfigurationError(
         f"{env} is not one of this project's envs, so that a filter cannot read its state; give"

@@ -191,7 +191,11 @@ def test_filters_by_themselves_act_at_estimates():
             lambda: SafetyFilterVectorWrapper(gym.make_vec(ID, num_envs=2, **SENSOR), "scbf"),
             "estimator='ekf'",
         ),
-        (lambda: StateEstimatorVectorWrapper(gym.make(ID, **SENSOR)), "single env"),
+        (
+            lambda: StateEstimatorVectorWrapper(gym.make(ID, **SENSOR)),
+            "put StateEstimatorWrapper over it",
+        ),
+        (lambda: StateEstimatorWrapper(gym.make("Pendulum-v1")), "option measurement"),
     ],
 )
 def test_what_cannot_be_is_refused(make, words):
