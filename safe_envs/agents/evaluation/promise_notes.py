@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from safe_envs.wrappers.conditions.names import AT_STATE
 from safe_envs.wrappers.conditions.text_parts import names_promise
 from safe_envs.wrappers.value.promise_text import PromiseSettings
 
@@ -23,7 +24,8 @@ def computed_notes(names: Iterable[str]) -> list[str]:
         " the filter keeps for every policy up to the horizon, in the floating-point numbers of its"
         " table."
     ]
-    tasks = [name for name in found if PromiseSettings.of_text(name).specification]
+    settings = {name: PromiseSettings.of_text(name.removesuffix(AT_STATE)) for name in found}
+    tasks = [name for name, each in settings.items() if each.specification]
     if tasks:
         notes.append(
             f"what {' and '.join(tasks)} keeps is the probability of meeting the specification,"

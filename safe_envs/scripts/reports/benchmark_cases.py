@@ -159,7 +159,7 @@ def estimator_step(batch: int | None) -> Case:
         u, sample = (0.1, 0.0), Sample((0.01, -0.02), (True, True))
     else:
         drawn = np.random.default_rng(0).normal(0.0, 0.1, (4, batch))
-        u, sample = (drawn[0], drawn[1]), Sample(drawn[2:], np.full((2, batch), True))
+        u, sample = (drawn[0], drawn[1]), Sample([*drawn[2:]], [np.full(batch, True)] * 2)
     return Case(
         lambda: tracker.advance(u, sample),
         batch or 1,

@@ -90,7 +90,7 @@ class Estimator(ABC):
                 " make each a state, with its rate in the drift (1 for the time)"
             )
         measurement.require_known(model)
-        exact = [c.name for c in measurement.channels if not c.noise > 0.0]
+        exact = [c.name for c in measurement.channels if not c.noise > _LEAST_NOISE]
         if exact:
             raise ConfigurationError(
                 f"{', '.join(exact)}: measured without noise, for which the gain of an estimator is"
@@ -253,6 +253,9 @@ class Estimator(ABC):
         """H = dc/dx, a matrix of expressions of the states."""
         return sp.Matrix(self._expected).jacobian(list(self.model.states))
 
+
+_LEAST_NOISE = 1e-150
+"""Standard deviation whose square is still a number above 0."""
 
 _FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
 

@@ -69,12 +69,14 @@ class UnscentedKalmanFilter(Estimator):
             finite_number(name, value)
             for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa))
         )
-        if not (self.alpha > 0.0 and model.n + self.kappa > 0.0):
+        n = model.n
+        scale = min(self.alpha, 1e9) ** 2 * min(n + self.kappa, 1e9)
+        # Below, weights of 1/scale cancel each other.
+        if not (self.alpha > 0.0 and n + self.kappa > 0.0 and 1e-8 <= scale <= 1e8):
             raise ConfigurationError(
-                f"alpha = {self.alpha:g}, kappa = {self.kappa:g}; alpha is positive, and kappa"
-                f" above -{model.n}, the number of states"
+                f"alpha = {self.alpha:g}, kappa = {self.kappa:g}; alpha is positive, kappa above"
+                f" -{n}, for n = {n} states, and alpha^2 (n + kappa) from 1e-8 to 1e8"
             )
-        n, scale = model.n, self.alpha**2 * (model.n + self.kappa)
         others = 0.5 / scale
         first = 1.0 - n / scale
         self._spread = scale**0.5

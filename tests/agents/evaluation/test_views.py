@@ -8,6 +8,7 @@ import pytest
 from safe_envs import SafeVectorEnv
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.belief_bound import why_not_proved
+from safe_envs.agents.evaluation.promise_notes import computed_notes
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, StateEstimatorVectorWrapper
@@ -128,6 +129,11 @@ def test_a_filter_by_itself_has_no_belief():
         **SHORT | {"options": {"measurement": "default", "horizon": 0.5}, "knowledge": "plant"},
     )
     assert [row.filter for row in found.rows] == ["backup@state", "backup"]
+
+
+def test_bounds_of_promise_filters_are_noted_at_the_true_state():
+    (note,) = computed_notes(["scbf@state", "promise:p=0.9@state"])
+    assert "the bound of promise:p=0.9@state is computed" in note
 
 
 def test_documents_and_tables_tell_of_sensors():
