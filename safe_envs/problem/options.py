@@ -15,6 +15,9 @@ from safe_envs.number_text import finite_number, named_values, numbers
 from safe_envs.problem.measurement_text import read_items
 from safe_envs.problem.option_errors import refused_noise
 
+SENSOR_OPTIONS = ("measurement", "sensor_noise")
+"""Names of the options that put a sensor between the state and the observation."""
+
 Reader = Callable[[str, Any], Any]
 """From the name of an option and its text (texts, where it is repeatable) to its value."""
 

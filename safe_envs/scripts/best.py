@@ -12,10 +12,10 @@ from safe_envs.errors import require_whole
 from safe_envs.scripts.options import figure_options, text_options, value_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
-from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 
-@with_env
+@with_env_at_state
 def best(
     env: EnvOptions,
     leaving: value_options.Leaving = "violation",

@@ -14,7 +14,7 @@ from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
-from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 
 
-@with_env
+@with_env_at_state
 def certify(
     env: EnvOptions,
     degree: Annotated[

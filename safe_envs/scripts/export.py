@@ -11,7 +11,7 @@ from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
-from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from safe_envs.wrappers.value.promise_text import PromiseSettings
 
 
-@with_env
+@with_env_at_state
 def export(
     out: Annotated[
         Path,

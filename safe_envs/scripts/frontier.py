@@ -18,7 +18,7 @@ from safe_envs.scripts.options import (
 )
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
-from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
@@ -29,7 +29,7 @@ PROMISES = ("promise:p=0.9", "promise:p=0.99", "promise:p=0.999")
 _BEST = "best"
 
 
-@with_env
+@with_env_at_state
 def frontier(
     env: EnvOptions,
     filters: Annotated[

@@ -15,14 +15,14 @@ from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_fi
 from safe_envs.scripts.options import early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
-from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
     from safe_envs.agents.evaluation.resolved import FilterParts
     from safe_envs.problem.problem import SafetyProblem
 
 
-@with_env
+@with_env_at_state
 def render(
     out: Annotated[
         Path,

@@ -61,6 +61,13 @@ def test_mistakes_end_with_status_2(safe_envs_command, given, message):
     assert len(error) < 700
 
 
+@pytest.mark.parametrize("command", ["best", "certify", "export", "frontier", "render", "verify"])
+def test_commands_of_true_states_ignore_no_sensor(safe_envs_command, command):
+    status, _, error = safe_envs_command(command, DUBINS, "--measurement", "default")
+    assert status == 2
+    assert "unknown option '--measurement'" in " ".join(error.split())
+
+
 def test_training_and_the_evaluation_of_its_policy_take_an_estimator(safe_envs_command, tmp_path):
     status, out, _ = safe_envs_command(
         *("train", "Scalar-v0", "--algo", "ppo", "--filter", "scbf", "--out", tmp_path / "run"),

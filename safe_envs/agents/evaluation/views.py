@@ -25,6 +25,7 @@ from safe_envs.agents.evaluation.spec import (
     filter_text,
 )
 from safe_envs.errors import ConfigurationError, shown
+from safe_envs.problem.options import SENSOR_OPTIONS
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
 from safe_envs.wrappers.conditions.names import AT_STATE, PARAMETERS
@@ -32,8 +33,6 @@ from safe_envs.wrappers.conditions.text_parts import parts_of
 
 AT_ESTIMATES = "it decides at an estimate, and these bounds are of filters at the true state"
 """Why filters at an estimate have no bounds of true states."""
-
-_OF_SENSOR = ("measurement", "sensor_noise")
 
 
 class View(NamedTuple):
@@ -192,7 +191,7 @@ def _without_sensor(spec: EvaluationSpec, filters: Sequence[Filter]) -> Evaluati
     problem: Any = spec.problem
     if isinstance(problem, SafetyProblem):
         problem = problem.unmeasured
-    options = {name: value for name, value in spec.options.items() if name not in _OF_SENSOR}
+    options = {name: value for name, value in spec.options.items() if name not in SENSOR_OPTIONS}
     return replace(
         spec,
         problem=problem,

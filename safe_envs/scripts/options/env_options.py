@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from safe_envs.problem.options import ProblemOptions
+from safe_envs.problem.options import SENSOR_OPTIONS, ProblemOptions
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.console import with_signature
 from safe_envs.systems import ENV_IDS
@@ -173,3 +173,7 @@ def with_env(command: Callable[..., None], without: Sequence[str] = ()) -> Calla
         ]
         found += of_env if parameter.name == "env" else [parameter]
     return with_signature(wrapped, found)
+
+
+with_env_at_state = functools.partial(with_env, without=SENSOR_OPTIONS)
+"""`with_env` for commands that know the true state, to which a sensor would make no difference."""

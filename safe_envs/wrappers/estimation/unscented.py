@@ -70,12 +70,12 @@ class UnscentedKalmanFilter(Estimator):
             for name, value in (("alpha", alpha), ("beta", beta), ("kappa", kappa))
         )
         n = model.n
-        scale = min(self.alpha, 1e9) ** 2 * min(n + self.kappa, 1e9)
-        # Below, weights of 1/scale cancel each other.
+        scale = self.alpha * self.alpha * (n + self.kappa)
+        # If it is too small, the weights of 1/scale cancel each other.
         if not (self.alpha > 0.0 and n + self.kappa > 0.0 and 1e-8 <= scale <= 1e8):
             raise ConfigurationError(
                 f"alpha = {self.alpha:g}, kappa = {self.kappa:g}; alpha is positive, kappa above"
-                f" -{n}, for n = {n} states, and alpha^2 (n + kappa) from 1e-8 to 1e8"
+                f" -n, and alpha^2 (n + kappa) from 1e-8 to 1e8, with n = {n} states"
             )
         others = 0.5 / scale
         first = 1.0 - n / scale
