@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import sympy as sp
 
+from safe_envs.dynamics.declarations import formula
 from safe_envs.errors import (
     ConfigurationError,
     SystemDefinitionError,
@@ -14,6 +16,7 @@ from safe_envs.errors import (
     shortened,
     shown,
 )
+from safe_envs.problem.angle_jumps import angle_jumps, are_multiples, words_of
 from safe_envs.problem.option_errors import LONGEST_DELAY
 
 _DEFAULT_NOISE = 0.01
@@ -36,11 +39,14 @@ class Channel:
         noise: standard deviation of the error, in the unit of the expression.
         bias: constant error in that unit, of which no estimator knows.
         dropout: probability that a sample is lost, independently of all others.
-        period: the values are known modulo this number, and lie in (-period/2, period/2], such as
-            2 pi for a bearing; 0 for values that are not periodic.
+        period: the values are known modulo this number, and lie in (-period/2, period/2]; 0 for
+            values that are not periodic. By default the size of the expression's own jumps, such as
+            2 pi |a| of a atan2(y, x) + b; see `safe_envs.problem.angle_jumps`.
 
     Raises:
-        ConfigurationError: A number is not finite or out of range.
+        SystemDefinitionError: The expression is none.
+        ConfigurationError: A number is not finite or out of range, or the expression jumps by no
+            multiple of the period.
     """
 
     name: str
@@ -48,9 +54,12 @@ class Channel:
     noise: float
     bias: float = 0.0
     dropout: float = 0.0
-    period: float = 0.0
+    period: float = None  # pyright: ignore[reportAssignmentType]  (a number from here on)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "expression", formula(f"measurement {self.name}", self.expression))
+        if self.period is None:
+            object.__setattr__(self, "period", self._derived_period())
         allowed = {
             "noise": (0.0, _LARGEST, f"a number from 0, below {_LARGEST:g}"),
             "bias": (-_LARGEST, _LARGEST, f"a number between -{_LARGEST:g} and {_LARGEST:g}"),
@@ -66,6 +75,25 @@ class Channel:
                     f"{setting} = {shown(value)} of the measurement {self.name}; give {words}"
                 )
             object.__setattr__(self, setting, float(value))
+        # What is no number here may be one with the parameters of a model.
+        jumps = [j for j in angle_jumps(self.expression) or () if math.isfinite(j)]
+        if self.period and not are_multiples(jumps, self.period):
+            raise ConfigurationError(
+                f"period = {self.period:g} of the measurement {self.name}, which jumps"
+                f" {words_of(tuple(jumps))} after a turn; leave the period out, or give one of"
+                " which that is a multiple"
+            )
+
+    def _derived_period(self) -> float:
+        jumps = angle_jumps(self.expression)
+        period = jumps[0] if jumps else 0.0
+        if jumps is None or not are_multiples(jumps, period):
+            raise ConfigurationError(
+                f"the period of the measurement {self.name} does not follow from"
+                f" {shortened(self.expression)}, which jumps {words_of(jumps)} after a turn of its"
+                " angles; give period=..., the number modulo which it is known, or 0 for none"
+            )
+        return period
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,12 @@ Each item names what is measured, with settings after colons:
     delay=D                                     control periods, of all that is measured
 
 EXPR is arithmetic of states and parameters; the name of a feature stands for its expression. EXPR
-may be the name of a channel of the default sensor too, which brings its settings along. What holds
-`atan2` is known modulo 2 pi by default.
+may be the name of a channel of the default sensor too, which brings its settings along. The period
+is by default that of the angles in EXPR; see `Channel.period`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -214,8 +213,6 @@ def _read(problem: Any, items: Sequence[str]) -> Any:
 
 
 def _channel(problem: Any, known: Sequence[Any], head: str, settings: Mapping[str, float]) -> Any:
-    import sympy as sp
-
     from safe_envs.dynamics.expression_text import SENSOR_FUNCTIONS, read_expression
     from safe_envs.problem.measurement import Channel
 
@@ -248,5 +245,4 @@ def _channel(problem: Any, known: Sequence[Any], head: str, settings: Mapping[st
             f"{where} depends on {', '.join(map(str, unknown)) or 'no state'}; give an expression"
             f" of the states {states}"
         )
-    period = 2.0 * math.pi if expression.has(sp.atan2) else 0.0
-    return Channel(name.strip(), expression, **{"period": period, **settings})
+    return Channel(name.strip(), expression, **settings)

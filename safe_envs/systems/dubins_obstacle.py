@@ -112,7 +112,7 @@ def obstacle_sensors(x_i: sp.Expr, y_i: sp.Expr, suffix: str = "") -> tuple[Chan
     """
     return (
         Channel(f"range{suffix}", sp.sqrt((x_i - x) ** 2 + (y_i - y) ** 2), 0.1),
-        Channel(f"bearing{suffix}", sp.atan2(y_i - y, x_i - x) - theta, 0.05, period=2.0 * math.pi),
+        Channel(f"bearing{suffix}", sp.atan2(y_i - y, x_i - x) - theta, 0.05),
     )
 
 

@@ -91,6 +91,21 @@ def test_what_closes_in_continuous_time_only_is_refused():
     assert names(turning(2.4 + 0.6 * angle, noise=0.0)) == ("x", "y")
 
 
+def test_a_period_is_one_of_the_law():
+    own = disk()
+    distance, phi = own.frame.coordinates
+    degrees = tuple(e * 180 / sp.pi for e in (own.frame.values[1], 1))
+    for half, used in ((180.0, True), (math.pi, False)):
+        frame = replace(
+            own.frame,
+            coordinates=(distance, Variable(phi.symbol, -half, half, "deg")),
+            values=(own.frame.values[0], degrees[0]),
+            section=(distance.symbol, sp.Integer(0), phi.symbol / degrees[1]),
+            periods=(0.0, 2 * half),
+        )
+        assert ("law" in reduced(replace(own, frame=frame)).note) is not used
+
+
 def test_barriers_and_goals_that_are_no_functions_of_the_coordinates_are_refused():
     for problem in (
         turning(2.4, barriers=1 - x**2 - 2 * y**2),

@@ -19,6 +19,7 @@ from safe_envs.problem.measurement import Measurement
 from safe_envs.validators import numbers_in
 from safe_envs.wrappers.estimation.initial import InitialBelief
 from safe_envs.wrappers.estimation.packed import unpacked
+from safe_envs.wrappers.estimation.periods import continuous_output, periods_of_states
 
 Components = Sequence[Any]
 """Floats of one state, or arrays (B,) of a batch."""
@@ -101,7 +102,7 @@ class Estimator(ABC):
             initial.require_states(model.n)
         self.initial = initial
         self.added = _process_noise(process_noise, model)
-        self._expected = [model.numeric(c.expression) for c in measurement.channels]
+        self._expected = [continuous_output(c, model) for c in measurement.channels]
         self.variances = tuple(c.noise**2 for c in measurement.channels)
 
     @property
@@ -209,9 +210,8 @@ class Estimator(ABC):
 
     @cached_property
     def periods(self) -> tuple[float, ...]:
-        """The period of each state that is measured by itself modulo one; 0 of the others."""
-        known = {c.expression: c.period for c in self.measurement.channels if c.period}
-        return tuple(known.get(s, 0.0) for s in self.model.states)
+        """The number modulo which the sensor tells each state; 0 of those that it tells in full."""
+        return periods_of_states(self)
 
     @cached_property
     def certain(self) -> tuple[int, ...]:

@@ -19,6 +19,7 @@ from safe_envs.wrappers.estimation import (
     UnscentedKalmanFilter,
     make_estimator,
 )
+from safe_envs.wrappers.estimation.consistency import nees
 from safe_envs.wrappers.estimation.packed import cholesky, packed, positive_part, unpacked
 
 
@@ -231,6 +232,73 @@ def test_periodic_innovations_are_short():
     found = estimator.update("floats", mean, covariance, [0.0, 0.0, -0.05], [True] * 3)
     assert found.innovation[2] == pytest.approx(2 * np.pi - 0.05 - 6.2)
     assert 6.2 < found.mean[2] < 6.3
+
+
+def car(*sensors: Channel, k: float = 57.3):
+    """Return a car that stands left of the origin, and its position with other channels."""
+    x, y, heading, u, scale = sp.symbols("x y theta u k", real=True)
+    rate = [sp.cos(heading), sp.sin(heading), u]
+    system = ControlAffineSDE.from_rate((x, y, heading), (u,), rate, parameters={scale: k})
+    return system, Measurement((Channel("x", x, 0.1), Channel("y", y, 0.1), *sensors))
+
+
+X, Y, THETA, K = sp.symbols("x y theta k", real=True)
+BEARING = sp.atan2(Y, X)
+
+
+@pytest.mark.parametrize("kind", [ExtendedKalmanFilter, UnscentedKalmanFilter])
+@pytest.mark.parametrize(
+    ("channel", "size"),
+    [
+        (Channel("b", BEARING, 0.01), 1.0),
+        (Channel("b", 180 / sp.pi * BEARING, 0.01 * 180 / np.pi), 180 / np.pi),
+        (Channel("b", sp.Mod(BEARING, 2 * sp.pi), 0.01), 1.0),
+        (Channel("b", K * BEARING, 0.573, period=2 * np.pi * 57.3), 57.3),
+    ],
+)
+def test_bearings_jump_in_no_unit(kind, channel, size):
+    # Measured just below the cut, expected just above: .06 rad apart. The answer is that of the
+    # same scene with x and the bearing mirrored, where there is no cut.
+    (left, mirrored), p = ([-5.0, 0.1, 0.0], [5.0, 0.1, 0.0]), packed(np.diag([0.04, 0.04, 0.01]))
+    system, sensor = car(channel)
+    y = [-5.0, 0.1, size * (-np.pi + 0.04)]
+    found = kind(system, sensor, 0.1).update("floats", left, p, y, [True] * 3)
+    assert found.innovation[2] == pytest.approx(size * (0.04 + np.arctan2(0.1, 5.0)), rel=1e-2)
+    plain = kind(*car(Channel("b", BEARING, 0.01)), 0.1)
+    right = plain.update("floats", mirrored, p, [5.0, 0.1, -0.04], [True] * 3)
+    np.testing.assert_allclose(np.array(found.mean) * [-1, 1, 1], right.mean, atol=1e-9)
+    assert found.nis == pytest.approx(right.nis, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [
+        (Channel("b", BEARING, 0.01, period=0), "jumps by 6.28319 .* its period is 0"),
+        (Channel("b", X * BEARING, 0.01, period=6.0), "jumps by no one number"),
+        (Channel("b", K * BEARING, 0.01, period=100.0), "jumps by 360.027"),
+    ],
+)
+def test_jumps_that_no_period_takes_away_are_refused(channel, words):
+    with pytest.raises(ConfigurationError, match=words):
+        UnscentedKalmanFilter(*car(channel), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("channels", "turn"),
+    [
+        ([Channel("t", THETA, 0.1, period=6.0)], 6.0),
+        ([Channel("t", 180 / sp.pi * THETA, 1.0, period=360)], 2 * np.pi),
+        ([Channel("b", 180 / sp.pi * (sp.atan2(2 - Y, X) - THETA), 1.0)], 2 * np.pi),
+        ([Channel("t", THETA, 0.1, period=6.0), Channel("h", THETA / 2, 0.1, period=6.0)], 12.0),
+        ([Channel("t", THETA, 0.1, period=6.0), Channel("full", THETA, 0.1)], 0.0),
+    ],
+)
+def test_errors_of_a_state_count_modulo_what_is_measured_of_it(channels, turn):
+    estimator = ExtendedKalmanFilter(*car(*channels), 0.1)
+    assert estimator.periods == pytest.approx((0.0, 0.0, turn))
+    mean, covariance = np.array([[0.1, 0.2, 0.3]]), np.eye(3)[None]
+    error = np.array([[0.0, 0.0, 0.01 + turn]])
+    assert nees(estimator, mean + error, mean, covariance)[0][0] == pytest.approx(1e-4)
 
 
 def test_gained_is_what_a_sample_takes_away():
