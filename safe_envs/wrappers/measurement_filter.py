@@ -11,7 +11,9 @@ import numpy as np
 from safe_envs.envs.sample import Sample
 from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 from safe_envs.validators import real_array
+from safe_envs.wrappers.conditions.belief import belief_symbols
 from safe_envs.wrappers.estimation import BeliefTracker, Estimator
+from safe_envs.wrappers.estimation.autonomy import require_fixed
 from safe_envs.wrappers.estimation.packed import unpacked
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.filter_qp.runtime import doubles
@@ -35,6 +37,10 @@ class MeasurementFilter:
             raise ConfigurationError(
                 "the estimator is of other states than the filter; make both for one system"
             )
+        adjustable = set(safety_filter.qp.runtime).intersection(estimator.model.parameters)
+        require_fixed(estimator.model, estimator.measurement, adjustable)
+        symbols = [s.name for group in belief_symbols(estimator.n) for s in group]
+        self._believed = {symbols[place]: place for place in safety_filter.belief_places}
         self._filter: Any = safety_filter
         self.estimator = estimator
         # Shows at once whether the estimator has a belief to begin with.
@@ -107,11 +113,9 @@ class MeasurementFilter:
         self._take_in(values, batch)
         self._waiting = True
         given = dict(parameters or {})
-        if self._filter.belief_places:
-            believed = self._known.believed(self._components(u))
-            symbols = [s for s in self._filter.qp.runtime if s.name.startswith("belief_")]
-            chosen = [believed[place] for place in self._filter.belief_places]
-            given |= {s.name: np.reshape(v, batch) for s, v in zip(symbols, chosen, strict=True)}
+        if self._believed:
+            found = self._known.believed(self._components(u))
+            given |= {name: np.reshape(found[at], batch) for name, at in self._believed.items()}
         decision = self._filter.filter(self.mean, u, bounds=bounds, parameters=given or None, t=t)
         self._sent, self._waiting = self._components(decision.action), False
         return decision

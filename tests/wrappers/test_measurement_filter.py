@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+import sympy as sp
+from scipy import stats
 
-from safe_envs import SafeVectorEnv
-from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs import ControlAffineSDE, SafeVectorEnv
+from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError
+from safe_envs.problem.measurement import Channel, Measurement
+from safe_envs.problem.signals import TIME
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper
 from safe_envs.wrappers.estimation import ExtendedKalmanFilter, InitialBelief
@@ -110,3 +114,83 @@ def test_errors_of_making_one():
     ready = SafetyFilter.for_problem(problem, "scbf", estimator="ekf")
     with pytest.raises(ConfigurationError, match="nothing was measured"):
         _ = ready.measured.mean
+
+
+X, V, U, LEAD, LEAD_SPEED, GUST = sp.symbols("x v u lead lead_speed belief_gust", real=True)
+MASS = sp.Symbol("mass", positive=True)
+
+
+def follower(**changed):
+    """Return a car of known mass behind a lead that is measured at run time, and its estimator."""
+    given = {
+        "rate": [V, U / MASS],
+        "diffusion": [0, 0.1],
+        "signals": {LEAD: LEAD_SPEED, LEAD_SPEED: GUST, GUST: 0},
+        "seen": X,
+        **changed,
+    }
+    seen = Measurement((Channel("seen", given.pop("seen"), 0.05),))
+    car = ControlAffineSDE.from_rate((X, V), (U,), parameters={MASS: 2.0}, **given)
+    initial = InitialBelief.of([0.1, 0.4], [0.02, 0.03])
+    return car, ExtendedKalmanFilter(car, seen, 0.05, initial=initial)
+
+
+@pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.parametrize("condition", ["hocbf:p=1,2", "szcbf:alphas=2,2"])
+def test_what_moves_is_part_of_barriers_at_an_estimate(condition, batch):
+    car, estimator = follower()
+    h = (LEAD - X) ** 2 - 1 - TIME / 10
+    measured, exact = (
+        SafetyFilter(car, h, condition, bounds=(-90, 90), estimator=e) for e in (estimator, None)
+    )
+    for k in range(4):
+        given = {"parameters": {"lead": 2.0 + k, "lead_speed": -1.0, "belief_gust": 0.3}, "t": k}
+        y, u = ([[0.1 * k]] * 2, [[60.0]] * 2) if batch else ([0.1 * k], [60.0])
+        found = measured.filter_measurement(y, u, **given)
+        right = exact.filter(measured.measured.mean, u, **given)
+        assert np.all(found.cause == 0)
+        for name in ("action", "barrier", "feasible"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(right, name))
+
+
+def test_the_belief_of_a_moving_barrier_is_the_one_by_hand():
+    # h_B = lead - x^ - z sqrt(P_11 + ..), whose rate is that of the lead, x^ and the root.
+    car, estimator = follower(rate=[U, -V], diffusion=[0.2, 0])
+    given = {"bounds": (-90, 90), "dt": 0.05, "instants": 100, "estimator": estimator}
+    measured = SafetyFilter(car, LEAD - X, "cbf:alpha=3:belief=0.1", **given)
+    runtime = {"lead": 2.0, "lead_speed": -1.0, "belief_gust": 5.0}
+    found = measured.filter_measurement([0.2], [60.0], parameters=runtime)
+    session, z = measured.measured, stats.norm.isf(0.1 / 100)
+    q = session.covariance[0, 0] + 0.05 / 4 * 0.2**2
+    growth = session.tracker.believed([60.0])[3]
+    h = 2.0 - session.mean[0] - z * np.sqrt(q)
+    assert found.barrier[0] == pytest.approx(h, rel=1e-9)
+    assert found.action[0] == pytest.approx(-1.0 - z * growth / (2 * np.sqrt(q)) + 3 * h, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"rate": [V, U + LEAD]}, "the drift depends on the signal lead"),
+        ({"rate": [V, U + TIME]}, "the drift depends on the time"),
+        ({"rate": [V, U * (2 + sp.sin(LEAD))]}, "the input matrix depends on the signal lead"),
+        ({"diffusion": [0, LEAD]}, "the diffusion depends on the signal lead"),
+        ({"seen": LEAD - X}, "the measurement seen depends on the signal lead"),
+        ({"seen": TIME + X}, "the measurement seen depends on the time"),
+    ],
+)
+def test_no_estimator_predicts_what_it_is_not_given(changed, words):
+    with pytest.raises(SystemDefinitionError, match=f"{words}.*Barriers may hold signals"):
+        follower(**changed)
+
+
+def test_parameters_of_the_prediction_are_not_adjustable():
+    car, estimator = follower()
+    given = {"bounds": (-9, 9), "estimator": estimator, "adjustable": ("mass",)}
+    with pytest.raises(ConfigurationError, match="input matrix of the estimator depends on mass"):
+        SafetyFilter(car, LEAD - X, "hocbf:p=1,2", **given)
+    car, estimator = follower(rate=[V, U])
+    found = SafetyFilter(car, LEAD - X - MASS, "hocbf:p=1,2", **{**given, "estimator": estimator})
+    runtime = {"lead": 2.0, "lead_speed": -1.0, "belief_gust": 0.0, "mass": 0.5}
+    decision = found.filter_measurement([0.2], [0.0], parameters=runtime)
+    assert decision.barrier[0] == pytest.approx(2.0 - 0.5 - found.measured.mean[0])

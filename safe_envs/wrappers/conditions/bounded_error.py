@@ -136,6 +136,14 @@ def _error(
         slope = sp.diff(known, state)
         if not size or slope == 0:
             continue
+        moving = sorted(s.name for s in slope.free_symbols.difference(model.states))
+        if moving:
+            raise ConfigurationError(
+                f"measurement_error: how fast the constraint changes with {state} depends on"
+                f" {', '.join(moving)}, whose values come in at each call and have no range; take"
+                " belief=..., a barrier of which the slopes do not depend on them, or make each a"
+                " state"
+            )
         bound = largest_slope(slope, model.states, box)
         if not math.isfinite(bound):
             names = [

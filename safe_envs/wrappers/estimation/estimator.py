@@ -13,10 +13,11 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Flavour, compile_function
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_whole, shown
+from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.number_text import finite_number
 from safe_envs.problem.measurement import Measurement
 from safe_envs.validators import numbers_in
+from safe_envs.wrappers.estimation.autonomy import require_state_alone
 from safe_envs.wrappers.estimation.initial import InitialBelief
 from safe_envs.wrappers.estimation.packed import unpacked
 from safe_envs.wrappers.estimation.periods import continuous_output, periods_of_states
@@ -66,8 +67,10 @@ class Estimator(ABC):
         initial: belief before the first sample, if it is known.
 
     Raises:
-        SystemDefinitionError: Something unknown is measured.
-        ConfigurationError: A number is out of range, or something is measured without noise.
+        SystemDefinitionError: Something unknown is measured, or the model or the sensor depends on
+            signals or the time.
+        ConfigurationError: A number is out of range, or something is measured without noise or with
+            jumps that its period does not take away.
     """
 
     name: ClassVar[str]
@@ -85,11 +88,7 @@ class Estimator(ABC):
         self.dt, self.substeps = finite_number("dt", dt), int(substeps)
         if not self.dt > 0.0:
             raise ConfigurationError(f"dt = {self.dt} s; a control period is positive")
-        if model.signals or model.uses_time:
-            raise SystemDefinitionError(
-                "an estimator predicts with the model, which may hold neither signals nor the time;"
-                " make each a state, with its rate in the drift (1 for the time)"
-            )
+        require_state_alone(model, measurement)
         measurement.require_known(model)
         exact = [c.name for c in measurement.channels if not c.noise > _LEAST_NOISE]
         if exact:

@@ -1,6 +1,7 @@
 """Conditions at an estimate: belief barriers and bounded errors."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -232,6 +233,16 @@ def test_texts_come_back(text):
             "one for each of the 1 states",
         ),
         (lambda: SCBF(belief=0.1).constraint(LINE, Barrier(1 - x)), "of true states"),
+        (
+            lambda: SafetyFilter(
+                replace(LINE, signals={y: 0}),
+                1 - (x - y) ** 2,
+                CBF(1.0, measurement_error=0.1),
+                bounds=(-1, 1),
+                region=[(-1, 1)],
+            ),
+            "changes with x depends on y, whose values come in at each call",
+        ),
         (
             lambda: SafetyFilter.for_problem(
                 make_problem("Scalar-v0"), "srcbf:measurement_error=.1"
