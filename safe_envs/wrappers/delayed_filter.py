@@ -71,6 +71,11 @@ class DelayedFilter:
                 f"safety_filter = {shown(safety_filter)}; give a SafetyFilter, which decides at the"
                 " predicted state"
             )
+        if safety_filter.of_measurements:
+            raise ConfigurationError(
+                f"the filter has {safety_filter.of_measurements}, and a DelayedFilter predicts from"
+                " states that it is given: leave that out, and give it the estimate as the state"
+            )
         require_delay("delay", delay)
         require_whole("substeps", substeps, 1)
         period = finite_number("dt", dt)

@@ -208,6 +208,7 @@ def certain_states(estimator: Any) -> tuple[int, ...]:
 class FiltersMeasurements:
     """The part of a `SafetyFilter` that is given measurements."""
 
+    belief_places: list[int]
     _measured: MeasurementFilter | None = None
 
     @property
@@ -222,6 +223,13 @@ class FiltersMeasurements:
                 "the filter has no estimator; make it with estimator=..., or give filter() states"
             )
         return self._measured
+
+    @property
+    def of_measurements(self) -> str:
+        """What of the filter goes with measurements, for errors; "" of a filter of states."""
+        if self._measured is not None:
+            return f"the estimator {self._measured.estimator.text}"
+        return "conditions with belief" if self.belief_places else ""
 
     def filter_measurement(self, y: Any, u_nominal: Any, **given: Any) -> FilterDecision:
         """Decide at the estimate of the state; see `MeasurementFilter.filter`.

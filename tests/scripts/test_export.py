@@ -26,6 +26,7 @@ def test_the_files_and_the_comparison(export, tmp_path):
     assert "flags that differ" in out
     found = strictly(path)
     assert found["comparison"]["flags_different"] == 0
+    assert (found["filter"], found["barriers"]) == ("scbf for h", {"h": "-x**2 - y**2 + 9.0"})
     assert found["comparison"]["states"] == 2000
     assert [q["unit"] for q in found["states"]] == ["m", "m", "rad"]
     header = (tmp_path / "c" / "filter.h").read_text()

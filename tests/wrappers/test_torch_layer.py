@@ -354,6 +354,16 @@ def test_a_layer_takes_finite_bounds_and_nothing_at_each_call():
         TorchFilter(SafetyFilter(still, 1 - x, "cbf", (-math.inf, 1.0)))
 
 
+def test_a_layer_takes_states():
+    problem = make_problem("safe_envs/Pendulum-v0", measurement="default")
+    for text, estimator, reason in (
+        ("scbf", "ekf", "has the estimator ekf"),
+        ("scbf:belief=0.1", None, "has conditions with belief"),
+    ):
+        with pytest.raises(ConfigurationError, match=reason):
+            TorchFilter(SafetyFilter.for_problem(problem, text, estimator=estimator))
+
+
 def test_the_backup_filter_has_no_gradient_either():
     with pytest.raises(ConfigurationError, match=r"'backup'.*no gradient.*'scbf'"):
         TorchFilter.for_problem(make_problem("safe_envs/DubinsDisk-v0"), "backup")

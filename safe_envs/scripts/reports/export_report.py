@@ -45,6 +45,8 @@ class ExportAnswer:
             "config": self.config,
             "folder": self.folder,
             "name": self.interface.name,
+            "filter": self.interface.title,
+            "barriers": dict(zip(self.interface.barriers, self.interface.formulas, strict=True)),
             "precision": self.interface.precision.type,
             **quantities,
             "constraints": list(self.interface.constraints),

@@ -14,6 +14,7 @@ from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, sho
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.number_text import finite_number
 from safe_envs.problem.signals import TIME
+from safe_envs.wrappers.conditions.belief import belief_symbols
 from safe_envs.wrappers.decision_log.columns import LogColumns
 from safe_envs.wrappers.decision_log.files import path_of, read_log, write_csv, write_parquet
 from safe_envs.wrappers.decision_log.given import (
@@ -54,6 +55,7 @@ class DecisionLog(IndependentCopies):
         self._values = array("d")
         self._bounds: tuple[Sequence[float], Sequence[float]] = ((), ())
         self._defaults: Defaults = []
+        self._believed: frozenset[Any] = frozenset()
         # The columns of the time, the state and the parameters come first.
         self._inputs = 1 + len(columns.states)
 
@@ -62,6 +64,9 @@ class DecisionLog(IndependentCopies):
         cls, safety_filter: SafetyFilter, units: Mapping[Any, str] | None = None
     ) -> DecisionLog:
         """Return an empty log with the names of a filter's states, inputs and barriers.
+
+        Of a filter that is given measurements the state is the estimate. The covariance that
+        conditions with `belief` are given is left out; their h is that of the belief.
 
         Args:
             safety_filter: whose decisions will be added.
@@ -75,12 +80,14 @@ class DecisionLog(IndependentCopies):
                 f"{shown(safety_filter)} is no SafetyFilter; give the one that decides"
             )
         qp, model = safety_filter.qp, safety_filter.model
-        runtime = [symbol for symbol in qp.runtime if symbol != TIME]
+        belief = [s for group in belief_symbols(model.n) for s in group]
+        runtime = [symbol for symbol in qp.runtime if symbol not in (TIME, *belief)]
         names = [barrier.name for barrier, _ in safety_filter.pairs]
         log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
         log._bounds = endless(qp.low), endless(qp.high)
         log._defaults = [(s, s.name, model.parameters.get(s)) for s in runtime]
         log._inputs += len(runtime)
+        log._believed = frozenset(each for s in belief for each in (s, s.name) if s in qp.runtime)
         return log
 
     def add(
@@ -96,7 +103,7 @@ class DecisionLog(IndependentCopies):
 
         Args:
             t: time in s, of a clock that never goes back, such as `time.monotonic`.
-            x: state, shape (n,).
+            x: state, shape (n,); `safety_filter.measured.mean` after a measurement.
             decision: what the filter returned for that one state.
             bounds: as given to the filter; those of its construction by default.
             parameters: as given to the filter.
@@ -106,6 +113,8 @@ class DecisionLog(IndependentCopies):
                 lies before the last one.
         """
         try:
+            if self._believed and parameters:
+                parameters = {k: v for k, v in parameters.items() if k not in self._believed}
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
             intervened = decision.cause >= 0 and action != proposed
             low, high = self._bounds if bounds is None else pairs_of(bounds, len(action))

@@ -69,7 +69,7 @@ def readme_text(interface: Interface) -> str:
     return f"""<!-- {MARK}. -->
 # A safety filter in C
 
-{interface.title}
+{filter_text(interface)}
 
 `filter.c` and `filter.h` are C99 in {interface.precision.type} precision and need nothing but
 `<math.h>`. Nothing is allocated, all loops are bounded, and nothing is kept between calls.
@@ -129,6 +129,22 @@ be compiled with it. Keep `-ffp-contract=off`: fused products round otherwise th
 not let the processor flush small numbers to zero. The golden cases of `selftest.c` are decisions of
 the filter in Python.
 """
+
+
+def filter_text(interface: Interface) -> str:
+    """Return what the filter is, and a table of its barriers."""
+    lines = "\n".join(
+        f"| {_cell(name)} | {_code(h)} |"
+        for name, h in zip(interface.barriers, interface.formulas, strict=True)
+    )
+    return (
+        f"Filter: {_code(interface.title)}\n\n"
+        f"| Barrier | h, safe where not negative |\n|---|---|\n{lines}"
+    )
+
+
+def _code(text: str) -> str:
+    return "`" + " ".join(text.split()).replace("|", "\\|").replace("`", "'") + "`"
 
 
 def _cell(text: str) -> str:

@@ -45,7 +45,7 @@ def header_text(interface: Interface) -> str:
     return wrapped(
         f"""/* {MARK}: the interface of a safety filter.
  *
- * {interface.title}
+ * {interface.about}
  */
 #ifndef {macro}_FILTER_H
 #define {macro}_FILTER_H

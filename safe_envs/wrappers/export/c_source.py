@@ -55,7 +55,7 @@ def source_text(interface: Interface, program: FilterProgram) -> str:
     return wrapped(
         f"""/* {MARK}: a safety filter.
  *
- * {interface.title}
+ * {interface.about}
  *
 {PREAMBLE}
 {translated.text()}

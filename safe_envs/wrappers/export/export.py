@@ -113,10 +113,11 @@ def sources(
         ConfigurationError: The name is no name of C.
         NotCompilableError: Something in the filter has no form in C.
     """
-    if safety_filter.belief_places:
+    if safety_filter.of_measurements:
         raise NotCompilableError(
-            "conditions with belief need an estimator, which is not exported; export certainty"
-            " equivalence (the condition without belief), or measurement_error"
+            f"the filter has {safety_filter.of_measurements}: estimators and beliefs have no form"
+            " in C. Export it without, and give the C your estimate as its state;"
+            " measurement_error=... bounds its error"
         )
     program = filter_program(safety_filter)
     size = len(program.data.array())

@@ -10,6 +10,7 @@ import sympy as sp
 from safe_envs.dynamics.declarations import declared_sign
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.signals import TIME
+from safe_envs.wrappers.conditions import spec_of
 from safe_envs.wrappers.export.c_names import c_name, c_names, comment
 from safe_envs.wrappers.export.c_numbers import Precision
 from safe_envs.wrappers.filter_qp.limits import takes_endless
@@ -48,13 +49,14 @@ class Interface:
 
     Attributes:
         name: with which all public names of C begin.
-        title: what the filter is, in one line.
+        title: what the filter is, in one line: its full text, as for `--filter`.
         precision: of its numbers.
         states: n states, in the order of the model.
         runtime: quantities that are measured at run time.
         inputs: m inputs.
         constraints: names of C of the k constraints.
         barriers: names of their barriers.
+        formulas: h of each barrier.
         low: lower input bounds, if nothing else is known.
         high: upper ones.
         proposes: whether the filter pursues a goal, in place of the proposed input.
@@ -70,6 +72,7 @@ class Interface:
     inputs: tuple[Quantity, ...]
     constraints: tuple[str, ...]
     barriers: tuple[str, ...]
+    formulas: tuple[str, ...]
     low: tuple[float, ...]
     high: tuple[float, ...]
     proposes: bool
@@ -80,6 +83,16 @@ class Interface:
     def macro(self) -> str:
         """The name in capitals."""
         return self.name.upper()
+
+    @property
+    def about(self) -> str:
+        """What the filter is and keeps, for the comment at the head of a file."""
+        lines = [self.title, "Barriers, safe where none is negative:"]
+        lines += [
+            f"{comment(name)} = {comment(h)}"
+            for name, h in zip(self.barriers, self.formulas, strict=True)
+        ]
+        return "\n * ".join(lines)
 
 
 def interface_of(
@@ -105,25 +118,32 @@ def interface_of(
     qp, model = safety_filter.qp, safety_filter.model
     quantities = quantities_of(qp.symbols, {TIME.name: "s", **units}, model.parameters)
     names = [barrier.name for barrier, _ in safety_filter.pairs]
-    conditions = [condition.name for _, condition in safety_filter.pairs]
     of_condition: dict[str, list[str]] = {}
-    for barrier, condition in zip(names, conditions, strict=True):
-        of_condition.setdefault(condition, []).append(barrier)
+    for barrier, condition in safety_filter.pairs:
+        of_condition.setdefault(spec_of(condition), []).append(barrier.name)
+    title = "; ".join(f"{c} for {', '.join(each)}" for c, each in of_condition.items())
+    goal = "" if qp.clf is None else f"; goal V = {formula_text(qp.model.numeric(qp.clf.V))}"
     return Interface(
         name,
-        comment("; ".join(f"{c} for {', '.join(each)}" for c, each in of_condition.items())),
+        comment(title + goal),
         precision,
         quantities[: model.n],
         quantities[model.n :],
         quantities_of(model.inputs, units, {}),
         tuple(c_names(names)),
         tuple(names),
+        tuple(formula_text(barrier.expression) for barrier, _ in safety_filter.pairs),
         tuple(qp.low),
         tuple(qp.high),
         qp.clf is not None,
         takes_endless(qp.constraints, qp.clf),
         scratch,
     )
+
+
+def formula_text(expression: sp.Expr) -> str:
+    """Return an expression as text, without zeros at the end of numbers."""
+    return sp.sstr(expression, full_prec=False)
 
 
 def require_name(name: str) -> None:

@@ -37,7 +37,7 @@ def promise_source_text(interface: Interface, program: PromiseProgram) -> str:
     head = wrapped(
         f"""/* {MARK}: a promise filter.
  *
- * {interface.title}
+ * {interface.about}
  *
 {PREAMBLE}
 {translated.text()}

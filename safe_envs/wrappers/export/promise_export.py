@@ -12,7 +12,12 @@ from safe_envs.wrappers.export.build_files import cmake_text
 from safe_envs.wrappers.export.c_names import comment
 from safe_envs.wrappers.export.c_numbers import DOUBLE
 from safe_envs.wrappers.export.export import ExportOptions, require_own, write_files
-from safe_envs.wrappers.export.interface import Interface, quantities_of, require_name
+from safe_envs.wrappers.export.interface import (
+    Interface,
+    formula_text,
+    quantities_of,
+    require_name,
+)
 from safe_envs.wrappers.export.promise_c_source import promise_source_text
 from safe_envs.wrappers.export.promise_header import promise_header, promise_readme, promise_stack
 from safe_envs.wrappers.export.promise_reference import (
@@ -95,6 +100,7 @@ def promise_sources(
         quantities_of(problem.plant.inputs, units, {}),
         (),
         tuple(b.name for b in problem.barriers),
+        tuple(formula_text(problem.plant.numeric(b.expression)) for b in problem.barriers),
         tuple(map(float, low)),
         tuple(map(float, high)),
         False,

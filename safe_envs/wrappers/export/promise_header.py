@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from safe_envs.wrappers.export.build_files import quantities_table
+from safe_envs.wrappers.export.build_files import filter_text, quantities_table
 from safe_envs.wrappers.export.c_header import MARK, struct_text
-from safe_envs.wrappers.export.c_names import comment
 from safe_envs.wrappers.export.c_program import wrapped
 from safe_envs.wrappers.export.interface import Interface
 
@@ -50,7 +49,7 @@ def promise_header(interface: Interface, steps: int, stack: int) -> str:
     return wrapped(
         f"""/* {MARK}: the interface of a promise filter.
  *
- * {interface.title}
+ * {interface.about}
  */
 #ifndef {macro}_FILTER_H
 #define {macro}_FILTER_H
@@ -132,7 +131,7 @@ def promise_readme(interface: Interface, steps: int) -> str:
     return f"""<!-- {MARK}. -->
 # A promise filter in C
 
-{comment(interface.title)}
+{filter_text(interface)}
 
 `filter.c` and `filter.h` are C99 in double precision and need nothing but `<math.h>`. Nothing is
 allocated, all loops are bounded, and what is kept between calls is in the memory of the caller.

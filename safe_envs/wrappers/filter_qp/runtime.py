@@ -14,6 +14,7 @@ from safe_envs.dynamics.declarations import declared_sign
 from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, shown
 from safe_envs.problem.signals import TIME
 from safe_envs.validators import real_array
+from safe_envs.wrappers.conditions.at_estimate import belief_places
 from safe_envs.wrappers.filter_qp.compiled import Bounds
 from safe_envs.wrappers.filter_qp.limits import WIDEST, require_ends
 from safe_envs.wrappers.filter_qp.qp import FilterQP
@@ -80,7 +81,7 @@ class RuntimeArguments:
         fixed: Sequence[str],
         endless: bool,
     ) -> None:
-        self._inputs, self._symbols = qp.model.inputs, qp.runtime
+        self._inputs, self._symbols, self._n = qp.model.inputs, qp.runtime, qp.model.n
         self._fixed, self._endless = fixed, endless
         self._named = [s for s in qp.runtime if s != TIME]
         self._place: dict[Any, int] = {s.name: i for i, s in enumerate(self._named)}
@@ -158,7 +159,13 @@ class RuntimeArguments:
         return ConfigurationError(f"parameters gives {shown(name)}; {advice}")
 
     def _missing(self, found: Sequence[Any]) -> ConfigurationError:
-        names = [s.name for s, v in zip(self._named, found, strict=True) if v is None]
+        missing = [s for s, v in zip(self._named, found, strict=True) if v is None]
+        if belief_places(missing, self._n):
+            return ConfigurationError(
+                "the conditions with belief have no belief: decide by filter_measurement(y, u) of a"
+                " filter that is made with estimator=..., or leave belief out"
+            )
+        names = [s.name for s in missing]
         given = ", ".join(f"{name!r}: ..." for name in names)
         return ConfigurationError(
             f"the signals {', '.join(names)} have no value; give parameters={{{given}}} at each"

@@ -199,6 +199,11 @@ def _not_differentiable(given: str) -> ConfigurationError:
 
 
 def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
+    if safety_filter.of_measurements:
+        raise ConfigurationError(
+            f"the filter has {safety_filter.of_measurements}, and a torch layer decides at states"
+            " that it is given: leave that out, and give it the estimate as the state"
+        )
     if qp.runtime:
         raise ConfigurationError(
             f"the filter takes {', '.join(map(str, qp.runtime))} at each call, which a torch layer"

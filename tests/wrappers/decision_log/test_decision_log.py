@@ -19,6 +19,7 @@ from safe_envs import (
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, SafetyFilter
 from safe_envs.wrappers.decision_log import LogColumns
+from tests.conftest import problem_of
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 
@@ -76,6 +77,35 @@ def test_headings_have_names_and_units(log):
         *("slack:wall 1", "slack:wall 2", "slack:room"),
         *("intervention", "feasible", "cause"),
     ]
+
+
+def test_a_loop_with_a_belief_is_logged_at_its_estimate():
+    problem = problem_of("safe_envs/Pendulum-v0", measurement="default")
+    found = SafetyFilter.for_problem(problem, "scbf:belief=0.1", estimator="ekf")
+    log = DecisionLog.for_filter(found)
+    assert [h for h in log.columns.headings if h.startswith("parameter")] == []
+    for k in range(3):
+        decision = found.filter_measurement([0.1 * k, 0.0], [1.0])
+        log.add(0.1 * k, found.measured.mean, decision)
+        np.testing.assert_array_equal(log.section("state")[-1], found.measured.mean)
+        np.testing.assert_array_equal(log.section("h")[-1], decision.barrier)
+    # Whoever has an estimator of their own gives the belief, and the log does not ask for it.
+    own = SafetyFilter.for_problem(problem, "scbf:belief=0.1")
+    given = {s.name: 0.01 for s in own.qp.runtime}
+    decision = own.filter([0.1, 0.0], [1.0], parameters=given)
+    log.add(0.3, [0.1, 0.0], decision, parameters=given)
+    with pytest.raises(InvalidInputError, match="parameters has mass"):
+        log.add(0.3, [0.1, 0.0], decision, parameters={**given, "mass": 1.0})
+    with pytest.raises(ConfigurationError, match="decide by filter_measurement"):
+        own.filter([0.1, 0.0], [1.0])
+    moving = ControlAffineSDE.from_rate((x,), (u,), [u], signals={y: w, w: 0})
+    settings = {"dt": 0.1, "instants": 10, "bounds": (-9, 9)}
+    beside = SafetyFilter(moving, y - x, "cbf:belief=0.1", **settings)
+    log = DecisionLog.for_filter(beside, {y: "m"})
+    given = {"y": 2.0, "w": -1.0, **{s.name: 0.01 for s in beside.qp.runtime if s not in (y, w)}}
+    log.add(0.0, [0.5], beside.filter([0.5], [3.0], parameters=given), parameters=given)
+    assert log.section("parameter").tolist() == [[2.0, -1.0]]
+    assert "parameter:y [m]" in log.columns.headings
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE
 from safe_envs.errors import NotCompilableError
+from safe_envs.problem.clf import CLF
 from safe_envs.problem.signals import TIME
-from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
+from safe_envs.wrappers import CBF, DelayedFilter, SafetyFilter, parse_conditions
 from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedHOCBF
 from safe_envs.wrappers.export import CComparison, ExportOptions, compare, export_filter
@@ -104,6 +105,42 @@ def test_signals_parameters_time_and_bounds_at_run_time(bounds: Any, tmp_path: P
     assert "double mass; /* mass, positive */" in header
     assert "double t; /* t, in s, nonnegative */" in header
     assert "input->runtime.drag = 0.3;" in (tmp_path / "filter.c").read_text()
+
+
+def test_files_state_the_whole_filter(tmp_path: Path) -> None:
+    system = ControlAffineSDE.from_rate((x, y), (u,), [y, u - y], signals={p: 0})
+    barriers = [Barrier(sp.Float(0.1) - x + sp.Abs(p), "wall"), Barrier(4 - y, "speed | limit")]
+    conditions = "hocbf:p=2,8:sampling_margin=0.5+cbf:alpha=3"
+    goal = CLF(x**2 + y**2, rate=1.0)
+    export_filter(SafetyFilter(system, barriers, conditions, (-5, 5), clf=goal), tmp_path)
+    title = "hocbf:p=2.0,8.0:sampling_margin=0.5 for wall; cbf:alpha=3.0 for speed | limit"
+    for name in ("filter.h", "filter.c"):
+        head = (tmp_path / name).read_text().split("*/")[0]
+        for line in (f"{title};", "goal V = x**2 + y**2", "* wall = -x + Abs(p) + 0.1 *"):
+            assert line in " ".join(head.split()), (name, line)
+    readme = (tmp_path / "README.md").read_text()
+    assert f"Filter: `{title.replace('|', chr(92) + '|')}; goal V = x**2 + y**2`" in readme
+    assert "| wall | `-x + Abs(p) + 0.1` |\n| speed \\| limit | `4 - y` |" in readme
+
+
+@pytest.mark.parametrize(
+    ("text", "estimator", "words"),
+    [
+        ("scbf", "ekf:process_noise=0.1", "has the estimator ekf:process_noise=0.1: estimators"),
+        ("scbf:belief=0.1", "ekf", "has the estimator ekf: estimators"),
+        ("scbf:belief=0.1", None, "has conditions with belief: estimators"),
+    ],
+)
+def test_no_estimator_is_dropped(
+    text: str, estimator: str | None, words: str, tmp_path: Path
+) -> None:
+    problem = problem_of("safe_envs/Pendulum-v0", measurement="default")
+    safety_filter = SafetyFilter.for_problem(problem, text, estimator=estimator)
+    with pytest.raises(NotCompilableError, match=f"the filter {words} and beliefs have no form"):
+        export_filter(safety_filter, tmp_path)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ConfigurationError, match=words.split(": estimators")[0]):
+        DelayedFilter(safety_filter, 1, 0.01)
 
 
 @NEEDS_COMPILER

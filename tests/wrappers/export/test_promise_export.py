@@ -186,6 +186,15 @@ def test_the_kernels_decide_as_numpy_does(name):
         assert replaced == wanted.replaced[i]
 
 
+def test_files_state_the_promise_and_h(tmp_path):
+    export_promise(filter_of(scalar(), 20), tmp_path)
+    for name in ("filter.h", "filter.c"):
+        head = (tmp_path / name).read_text().split("*/")[0]
+        assert "promise:p=0.9 for scalar" in head
+        assert "* h = x\n" in head
+    assert "| h | `x` |" in (tmp_path / "README.md").read_text()
+
+
 def test_what_has_no_form_in_c_is_refused(tmp_path):
     promise_filter = filter_of(scalar(), 60)
     with pytest.raises(ConfigurationError, match="double precision"):
