@@ -79,7 +79,8 @@ def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
             `safe_envs.problem.problem.TIME`.
         workspace: (low, high) of states; an episode ends when one leaves it. The others are
             unbounded.
-        units: of states and inputs, by symbol. A state in "rad" without bounds is an angle.
+        units: of states and inputs, by symbol: labels, which nothing checks, for numbers and
+            parameters have none. A state in "rad" without bounds is an angle.
         **rest: other attributes of `SafetyProblem`. By default `noise` are the parameters that
             occur in the diffusion alone, `gains` ones for every barrier's relative degree, `filter`
             "szcbf" with noise and "hocbf" without, and `plane` the states if they are two. A

@@ -24,7 +24,8 @@ class Variable:
     """A state or an input with its range.
 
     For a state the range is the workspace: an episode ends when the state leaves it (an infinite
-    range never ends one). For an input it holds the admissible actions, and is finite.
+    range never ends one). For an input it holds the admissible actions, and is finite. The unit is
+    a label.
     """
 
     symbol: sp.Symbol

@@ -37,8 +37,7 @@ class MeasurementFilter:
             raise ConfigurationError(
                 "the estimator is of other states than the filter; make both for one system"
             )
-        adjustable = set(safety_filter.qp.runtime).intersection(estimator.model.parameters)
-        require_fixed(estimator.model, estimator.measurement, adjustable)
+        require_fixed(estimator.model, estimator.measurement, safety_filter.qp.runtime)
         symbols = [s.name for group in belief_symbols(estimator.n) for s in group]
         self._believed = {symbols[place]: place for place in safety_filter.belief_places}
         self._filter: Any = safety_filter

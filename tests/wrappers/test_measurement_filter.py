@@ -1,5 +1,7 @@
 """A safety filter in a control loop that has measurements only."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -189,6 +191,9 @@ def test_parameters_of_the_prediction_are_not_adjustable():
     given = {"bounds": (-9, 9), "estimator": estimator, "adjustable": ("mass",)}
     with pytest.raises(ConfigurationError, match="input matrix of the estimator depends on mass"):
         SafetyFilter(car, LEAD - X, "hocbf:p=1,2", **given)
+    weighed = replace(car, parameters={}, signals={**car.signals, MASS: 0})
+    with pytest.raises(ConfigurationError, match="depends on mass, whose value"):
+        SafetyFilter(weighed, LEAD - X, "hocbf:p=1,2", bounds=(-9, 9), estimator=estimator)
     car, estimator = follower(rate=[V, U])
     found = SafetyFilter(car, LEAD - X - MASS, "hocbf:p=1,2", **{**given, "estimator": estimator})
     runtime = {"lead": 2.0, "lead_speed": -1.0, "belief_gust": 0.0, "mass": 0.5}

@@ -31,18 +31,20 @@ def require_state_alone(model: ControlAffineSDE, measurement: Measurement) -> No
 def require_fixed(
     model: ControlAffineSDE, measurement: Measurement, given: Collection[sp.Symbol]
 ) -> None:
-    """Raise ConfigurationError where a model or a sensor depends on adjustable parameters.
+    """Raise ConfigurationError where a model or a sensor depends on what the filter is told.
 
     Args:
         model: that predicts, with values of its parameters.
         measurement: what is measured.
-        given: symbols whose values the filter is given at each call.
+        given: symbols whose values the filter is given at each call; those of the same names count.
     """
-    for what, symbol in _uses(model, measurement, set(given)):
+    names = {s.name for s in given}
+    known = {p for p in model.parameters if p.name in names}
+    for what, symbol in _uses(model, measurement, known):
         raise ConfigurationError(
-            f"{what} of the estimator depends on {symbol}, which is adjustable in the filter: the"
-            f" estimator predicts with {symbol} = {model.parameters[symbol]:g} always. Leave it out"
-            " of adjustable=..., or make it a state"
+            f"{what} of the estimator depends on {symbol}, whose value the filter is given at each"
+            f" call: the estimator predicts with {symbol} = {model.parameters[symbol]:g} always."
+            " Leave it out of adjustable=... and signals, or make it a state"
         )
 
 

@@ -58,7 +58,7 @@ def periods_of_states(estimator: Estimator) -> tuple[float, ...]:
     for i, state in enumerate(estimator.model.states):
         turns = set()
         for channel, output in zip(estimator.measurement.channels, outputs, strict=True):
-            slope = sp.diff(output, state) if channel.period else sp.S.Zero
+            slope = sp.simplify(sp.diff(output, state)) if channel.period else sp.S.Zero
             if slope.is_number and slope != 0:
                 turns.add(abs(channel.period / float(slope)))
         found.append(next((turn for turn in sorted(turns) if _repeats(estimator, i, turn)), 0.0))

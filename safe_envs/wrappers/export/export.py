@@ -116,8 +116,8 @@ def sources(
     if safety_filter.of_measurements:
         raise NotCompilableError(
             f"the filter has {safety_filter.of_measurements}: estimators and beliefs have no form"
-            " in C. Export it without, and give the C your estimate as its state;"
-            " measurement_error=... bounds its error"
+            " in C. Export it without, and give the C your estimate as its state; a bound of its"
+            " error is measurement_error=... of the condition"
         )
     program = filter_program(safety_filter)
     size = len(program.data.array())

@@ -288,6 +288,7 @@ def test_jumps_that_no_period_takes_away_are_refused(channel, words):
     [
         ([Channel("t", THETA, 0.1, period=6.0)], 6.0),
         ([Channel("t", 180 / sp.pi * THETA, 1.0, period=360)], 2 * np.pi),
+        ([Channel("t", sp.atan2(sp.sin(2 * THETA), sp.cos(2 * THETA)), 1.0)], np.pi),
         ([Channel("b", 180 / sp.pi * (sp.atan2(2 - Y, X) - THETA), 1.0)], 2 * np.pi),
         ([Channel("t", THETA, 0.1, period=6.0), Channel("h", THETA / 2, 0.1, period=6.0)], 12.0),
         ([Channel("t", THETA, 0.1, period=6.0), Channel("full", THETA, 0.1)], 0.0),
