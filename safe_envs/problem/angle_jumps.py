@@ -32,8 +32,9 @@ def angle_jumps(expression: sp.Expr) -> Jumps:
         () for an expression without jumps of angles; NaN for a size that is no number, as that of
         x atan2(y, x); None for pieces, steps and whole numbers of angles, and angles of angles.
     """
-    stand_ins = {angle: sp.Dummy(real=True) for angle in _angles(expression)}
-    rest, found = expression.xreplace(stand_ins), set()
+    stand_ins: dict[Any, Any] = {angle: sp.Dummy(real=True) for angle in _angles(expression)}
+    rest: Any = expression.xreplace(stand_ins)
+    found: set[float] = set()
     if any(part.free_symbols & set(stand_ins.values()) for part in rest.atoms(*_SWITCHING)):
         return None
     for angle, symbol in stand_ins.items():
@@ -46,7 +47,7 @@ def angle_jumps(expression: sp.Expr) -> Jumps:
             for jumps in inner
         ):
             return None
-        size = sp.diff(rest, symbol) * (high - low)
+        size: Any = sp.diff(rest, symbol) * (high - low)
         if size.is_number:
             found.add(abs(float(size)))
         elif not is_zero(rest.subs(symbol, high) - rest.subs(symbol, low)):
@@ -92,7 +93,8 @@ def _angles(expression: Any) -> Iterator[Any]:
 
 def _has_pole(arc: Any) -> bool:
     """Return whether the arc tangent, or cotangent, of something may jump."""
-    argument = 1 / arc.args[0] if isinstance(arc, sp.acot) else arc.args[0]
+    argument: Any = arc.args[0]
+    argument = 1 / argument if isinstance(arc, sp.acot) else argument
     denominator = sp.fraction(sp.together(argument))[1]
     return bool(argument.atoms(*_POLES)) or not (denominator.is_positive or denominator.is_negative)
 

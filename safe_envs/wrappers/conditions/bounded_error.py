@@ -136,7 +136,7 @@ def _error(
         slope = sp.diff(known, state)
         if not size or slope == 0:
             continue
-        moving = sorted(s.name for s in slope.free_symbols.difference(model.states))
+        moving = sorted(map(str, slope.free_symbols.difference(model.states)))
         if moving:
             raise ConfigurationError(
                 f"measurement_error: how fast the constraint changes with {state} depends on"

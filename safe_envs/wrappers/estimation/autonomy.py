@@ -31,7 +31,7 @@ def require_state_alone(model: ControlAffineSDE, measurement: Measurement) -> No
 def require_fixed(
     model: ControlAffineSDE, measurement: Measurement, given: Collection[sp.Symbol]
 ) -> None:
-    """Raise ConfigurationError where a model or a sensor depends on what the filter is told.
+    """Raise ConfigurationError where a model or a sensor depends on what a filter is given.
 
     Args:
         model: that predicts, with values of its parameters.

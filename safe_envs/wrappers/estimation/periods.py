@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -16,9 +16,6 @@ from safe_envs.problem.angle_jumps import (
     words_of,
 )
 from safe_envs.problem.measurement import Channel
-
-if TYPE_CHECKING:
-    from safe_envs.wrappers.estimation.estimator import Estimator
 
 _STATES = 9
 """At which outputs are compared."""
@@ -45,13 +42,13 @@ def continuous_output(channel: Channel, model: ControlAffineSDE) -> sp.Expr:
     return without_remainders(expression) if channel.period else expression
 
 
-def periods_of_states(estimator: Estimator) -> tuple[float, ...]:
+def periods_of_states(estimator: Any) -> tuple[float, ...]:
     """Return the number modulo which a sensor tells each state; 0 of those that it tells in full.
 
     A channel a x_i + b of period T tells x_i modulo T/|a|, if all other channels repeat after that.
 
     Args:
-        estimator: with the model and the sensor.
+        estimator: an `Estimator`.
     """
     outputs = [continuous_output(c, estimator.model) for c in estimator.measurement.channels]
     found = []
@@ -65,7 +62,7 @@ def periods_of_states(estimator: Estimator) -> tuple[float, ...]:
     return tuple(found)
 
 
-def _repeats(estimator: Estimator, i: int, turn: float) -> bool:
+def _repeats(estimator: Any, i: int, turn: float) -> bool:
     """Return whether all that is measured is the same after a turn of a state, at some states."""
     x = list(np.random.default_rng(0).standard_normal((estimator.n, _STATES)))
     turned = [c + turn * (j == i) for j, c in enumerate(x)]

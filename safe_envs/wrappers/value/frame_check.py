@@ -116,12 +116,11 @@ class _Pairs:
         self._random = np.random.default_rng(0)
         symbols, plant = world.symbols, problem.plant
         section = dict(zip(plant.states, frame.section, strict=True))
-        # A period is no claim alone: the state one period away must be a partner too.
-        within = [
-            value - period * sp.ceiling((value - c.high) / period) if period else value
+        # Within their ranges, so that a period that is none of the law shows.
+        at = {
+            c.symbol: value - period * sp.ceiling((value - c.high) / period) if period else value
             for c, period, value in zip(frame.coordinates, frame.periods, frame.values, strict=True)
-        ]
-        at = dict(zip(frame.symbols, within, strict=True))
+        }
         self._section = [section.get(s, s).xreplace(at) for s in symbols]
         self._tested: list[Any] = []
         self._names: list[str] = []
