@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import numbers
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    SystemDefinitionError,
+    SystemDefinitionWarning,
+    shown,
+)
 from safe_envs.number_text import finite_number
 
 TIME = sp.Symbol("t", nonnegative=True)
@@ -91,6 +98,23 @@ def read_matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Im
             )
         )
     )
+
+
+def doubt_shared_noise(given: Any) -> None:
+    """Warn where a diffusion is a flat list with several entries that are not zero.
+
+    Args:
+        given: as users give it to the constructor of a system.
+    """
+    is_list = isinstance(given, list | tuple | np.ndarray)
+    if is_list and sum(isinstance(e, sp.Expr | numbers.Number) and e != 0 for e in given) > 1:
+        warnings.warn(
+            f"diffusion = {shown(given)} is one column: a single Wiener process moves several"
+            " states at once. Give a list for each state: [[a, 0], [0, b]] for independent noises,"
+            " [[a], [b]] for a single one",
+            SystemDefinitionWarning,
+            stacklevel=4,  # past the generated constructor
+        )
 
 
 def written_out(what: str, expression: Any) -> Any:

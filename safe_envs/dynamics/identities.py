@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import random
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import sympy as sp
@@ -37,17 +37,17 @@ def is_zero(expression: Any) -> bool:
         looked into (logarithms, floors, inverse functions), of too many regions, or of points that
         all tell nothing.
     """
-    expression = _rational(expression)
+    expression = rational(expression)
     if expression == 0:
         return True
     if expression.is_number:
         return bool(expression.equals(0))
     if not expression.has(sp.Derivative, sp.Subs, sp.Integral) and _nonzero_somewhere(expression):
         return False
-    return all(not _nonzero_somewhere(piece) for piece in _Pieces(expression))
+    return all(not _nonzero_somewhere(piece) for piece in Pieces(expression))
 
 
-def _rational(expression: Any) -> Any:
+def rational(expression: Any) -> Any:
     """Return the expression with each float as a fraction, so that terms cancel exactly."""
     return expression.xreplace(
         {f: sp.Rational(repr(float(f))) for f in expression.atoms(sp.Float) if f.is_finite}
@@ -95,24 +95,31 @@ def _told_from_zero(value: Any) -> bool:
     return bool(value.is_Float and value.is_finite and value != 0 and value._prec > 1)
 
 
-class _Pieces:
+class Pieces:
     """The analytic functions that an expression consists of, one for each region.
 
     One symbol stands for it where there are too many.
+
+    Args:
+        expression: of real symbols.
+
+    Attributes:
+        signs: a symbol for the sign, 1 or -1, of each expression that switches between functions.
+        whole: the expression by these symbols.
     """
 
     def __init__(self, expression: Any) -> None:
-        self._signs: dict[Any, sp.Dummy] = {}
+        self.signs: dict[Any, sp.Dummy] = {}
         self._unknown: dict[Any, sp.Dummy] = {}
-        self._expression = self._rewritten(expression)
+        self.whole = self._rewritten(expression)
 
     def __iter__(self) -> Iterator[Any]:
-        signs = list(self._signs.values())
+        signs = list(self.signs.values())
         if len(signs) > _MOST_SWITCHES:
             yield sp.Dummy("any")
             return
         for values in itertools.product((sp.S.One, sp.S.NegativeOne), repeat=len(signs)):
-            yield self._expression.xreplace(dict(zip(signs, values, strict=True)))
+            yield self.whole.xreplace(dict(zip(signs, values, strict=True)))
 
     def _rewritten(self, e: Any) -> Any:
         """Replace kinks and jumps by signs of what switches, and the unknown by a symbol."""
@@ -121,7 +128,7 @@ class _Pieces:
         if not e.args:
             return e
         if not isinstance(e, (*_ANALYTIC, *_SWITCHING)):
-            return self._symbol(e)
+            return self._other(e)
         args = [self._rewritten(a) for a in e.args]
         if isinstance(e, sp.Max | sp.Min):
             up = 1 if isinstance(e, sp.Max) else -1
@@ -138,9 +145,17 @@ class _Pieces:
                 else (1 + sign) / 2
             )
         if isinstance(e, sp.Pow) and not (args[1].is_integer or args[0].is_positive):
-            root = args[1].is_Rational and args[1].q == 2
-            return e.func(*args) * self._sign_of(("root", args[0])) if root else self._symbol(e)
+            return self._root(e, args)
         return e.func(*args)
+
+    def _root(self, e: Any, args: list[Any]) -> Any:
+        """Return a power, which has several branches, with its arguments rewritten."""
+        square = args[1].is_Rational and args[1].q == 2
+        return e.func(*args) * self._sign_of(("root", args[0])) if square else self._symbol(e)
+
+    def _other(self, e: Any) -> Any:
+        """Return a function that is not looked into."""
+        return self._symbol(e)
 
     def _of_pieces(self, e: sp.Piecewise) -> Any:
         total, left = sp.S.Zero, sp.S.One
@@ -181,51 +196,7 @@ class _Pieces:
         )
 
     def _sign_of(self, key: Any) -> sp.Dummy:
-        return self._signs.setdefault(key, sp.Dummy("sign"))
+        return self.signs.setdefault(key, sp.Dummy("sign"))
 
     def _symbol(self, key: Any) -> sp.Dummy:
         return self._unknown.setdefault(key, sp.Dummy("unknown"))
-
-
-def pieces_fit(expression: Any, symbols: Sequence[sp.Symbol], order: int) -> bool:
-    """Return whether the pieces of every `Piecewise` meet with equal values and derivatives.
-
-    Sympy differentiates each piece by itself, and says nothing of a jump or a kink between two of
-    them.
-
-    Args:
-        expression: of the symbols.
-        symbols: that the derivatives are taken by.
-        order: of the highest derivative that has to be continuous.
-
-    Returns:
-        True where that is shown, which takes conditions that can be solved for one of the symbols.
-    """
-    return all(_fits(piecewise, symbols, order) for piecewise in expression.atoms(sp.Piecewise))
-
-
-def _fits(piecewise: sp.Piecewise, symbols: Sequence[sp.Symbol], order: int) -> bool:
-    pieces: Any = piecewise.args
-    if pieces[-1].cond != sp.true:
-        return False
-    for i, (value, condition) in enumerate(pieces[:-1]):
-        others = sp.Piecewise(*pieces[i + 1 :])
-        edges: Any = condition.atoms(sp.core.relational.Relational)
-        for edge in edges:
-            difference = edge.lhs - edge.rhs
-            solved = [
-                s
-                for s in symbols
-                if difference.diff(s).is_nonzero and not difference.diff(s).has(s)
-            ]
-            if not solved or isinstance(edge, sp.Eq | sp.Ne):
-                return False
-            s = solved[0]
-            at = s - difference / difference.diff(s)
-            # A function that is zero on the edge has no slope along it.
-            if not all(
-                is_zero((value.diff(s, k) - others.diff(s, k)).subs(s, sp.simplify(at)))
-                for k in range(order + 1)
-            ):
-                return False
-    return True

@@ -15,11 +15,13 @@ from sympy.simplify.fu import TR5
 
 from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.identities import is_zero
+from safe_envs.dynamics.min_max import pieces
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import RelativeDegreeError
 
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
 
+_STEPS = (sp.floor, sp.ceiling, sp.frac, sp.Mod)
 _KINKED = (
     sp.Piecewise,
     sp.Abs,
@@ -28,10 +30,7 @@ _KINKED = (
     sp.sign,
     sp.Heaviside,
     sp.DiracDelta,
-    sp.floor,
-    sp.ceiling,
-    sp.frac,
-    sp.Mod,
+    *_STEPS,
 )
 _LARGEST_TIDIED = 100
 _MOST_TERMS = 200
@@ -50,7 +49,25 @@ def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatri
 @lru_cache(maxsize=512)
 def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.ImmutableMatrix:
     """Differentiate once: drift, input and noise each need the gradient of a chain's link."""
-    return sp.ImmutableMatrix([[sp.diff(expression, s) for s in states]])
+    return sp.ImmutableMatrix([[slope(expression, s) for s in states]])
+
+
+def slope(expression: Any, symbol: sp.Symbol) -> sp.Expr:
+    """Return the derivative of an expression, in which steps count as constant between them.
+
+    Sympy has no derivative of floor, ceiling, frac and Mod.
+
+    Args:
+        expression: phi.
+        symbol: by which it is taken.
+    """
+    if not expression.has(*_STEPS):
+        return sp.diff(expression, symbol)
+    by_floors = expression.replace(sp.Mod, lambda a, b: a - b * sp.floor(a / b))
+    by_floors = by_floors.replace(sp.frac, lambda a: a - sp.floor(a))
+    steps = {step: sp.Dummy() for step in by_floors.atoms(sp.floor, sp.ceiling)}
+    found: Any = sp.diff(by_floors.xreplace(steps), symbol)
+    return found.xreplace({held: step for step, held in steps.items()})
 
 
 def lie_derivative_f(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
@@ -76,7 +93,7 @@ def explicit_rate(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
     """
     used = expression.free_symbols
     rates = {**system.signals, TIME: sp.Integer(1)}
-    return sp.Add(*[sp.diff(expression, s) * rate for s, rate in rates.items() if s in used])
+    return sp.Add(*[slope(expression, s) * rate for s, rate in rates.items() if s in used])
 
 
 def lie_derivative_g(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
@@ -101,9 +118,9 @@ def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
     for i, row_state in enumerate(system.states):
         if all(covariance[i, j] == 0 for j in range(system.n)):
             continue
-        slope = sp.diff(expression, row_state)
+        along = slope(expression, row_state)
         total += sum(
-            covariance[i, j] * sp.diff(slope, s)
+            covariance[i, j] * slope(along, s)
             for j, s in enumerate(system.states)
             if covariance[i, j] != 0
         )
@@ -208,9 +225,25 @@ def relative_degree(
 
     Raises:
         RelativeDegreeError: the input reaches none of the first n derivatives (3 n with the
-            generator), or h does not depend on the states.
+            generator), h does not depend on the states, or it is a minimum or maximum of functions
+            of different degrees.
     """
     system.require_known("the barrier", expression.free_symbols, system.measured)
+    found = pieces(expression)
+    degrees = {h: _degree(system, h, derivative, len(found) > 1) for h in found}
+    if len(set(degrees.values())) > 1:
+        listing = ", ".join(f"{degree} of {h}" for h, degree in degrees.items())
+        raise RelativeDegreeError(
+            f"the pieces of {expression} have different relative degrees ({listing}); give one"
+            " barrier for each of its pieces, each with rates of its own"
+        )
+    return max(degrees.values())
+
+
+def _degree(
+    system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative, is_piece: bool
+) -> int:
+    what = f"{expression}, a piece of the barrier" if is_piece else "the barrier"
     # Differentiation along a flow leaves nothing new after as many orders as there are quantities
     # that change; the Ito term has no such bound.
     timed = TIME in expression.free_symbols or system.uses_time
@@ -222,6 +255,6 @@ def relative_degree(
         expression = derivative(system, expression)
     raise RelativeDegreeError(
         f"no input ({', '.join(map(str, system.inputs))}) appears in the first {orders} derivatives"
-        " of the barrier: it has no relative degree, and no action can keep it positive. Check the"
+        f" of {what}: it has no relative degree, and no action can keep it positive. Check the"
         " barrier and the input matrix"
     )

@@ -12,6 +12,7 @@ import sympy as sp
 from safe_envs.dynamics.declarations import (
     TIME,
     advice_on_unknown,
+    doubt_shared_noise,
     fitting,
     read_matrix,
     require_mappings,
@@ -43,7 +44,8 @@ class ControlAffineSDE:
         drift: f, n x 1 expressions of states, signals, parameters and the time. Lists are read as
             matrices, here and below.
         input_matrix: g, n x m.
-        diffusion: sigma, n x d, for a d-dimensional standard Wiener process W.
+        diffusion: sigma, n x d, for a d-dimensional standard Wiener process W; none by default. A
+            flat list is one column: a single Wiener process.
         parameters: value of every other symbol that occurs.
         signals: the rate of each quantity that is measured at run time, an expression like those of
             the drift; 0 for one that does not change by itself, such as a mass.
@@ -62,7 +64,7 @@ class ControlAffineSDE:
     inputs: tuple[sp.Symbol, ...]
     drift: Any
     input_matrix: Any
-    diffusion: Any
+    diffusion: Any = None
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
     signals: Mapping[sp.Symbol, Any] = field(default_factory=dict)
 
@@ -74,12 +76,14 @@ class ControlAffineSDE:
             raise SystemDefinitionError(
                 f"a system needs a state and an input; given {n} states and {m} inputs"
             )
+        noise = [[0]] * n if self.diffusion is None else self.diffusion
+        doubt_shared_noise(noise)
         fields: dict[str, Any] = {
             "states": tuple(self.states),
             "inputs": tuple(self.inputs),
             "drift": read_matrix("drift", self.drift, (n, 1)),
             "input_matrix": read_matrix("input_matrix", self.input_matrix, (n, m)),
-            "diffusion": read_matrix("diffusion", self.diffusion, (n, None)),
+            "diffusion": read_matrix("diffusion", noise, (n, None)),
             "parameters": FixedDict({p: fitting(p, v) for p, v in self.parameters.items()}),
             "signals": FixedDict({s: signal_rate(s, r) for s, r in self.signals.items()}),
         }
@@ -146,8 +150,7 @@ class ControlAffineSDE:
                     f"the rate of {state} is not affine in the inputs: next to f + g u there is"
                     f" {entry}. Give f and g themselves where a system has several pieces"
                 )
-        noise = [[0]] * len(states) if diffusion is None else diffusion
-        return cls(tuple(states), tuple(inputs), drift, effect, noise, parameters, signals)
+        return cls(tuple(states), tuple(inputs), drift, effect, diffusion, parameters, signals)
 
     def __hash__(self) -> int:
         return hash(

@@ -14,11 +14,11 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.lie import (
     generator,
-    has_kinks,
     lie_derivative_f,
     lie_derivative_g,
     relative_degree,
 )
+from safe_envs.dynamics.min_max import clauses
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import SystemDefinitionError, SystemDefinitionWarning
 from safe_envs.problem.problem import SafetyProblem
@@ -34,10 +34,9 @@ _sound: weakref.WeakValueDictionary[int, SafetyProblem] = weakref.WeakValueDicti
 def require_sound(problem: SafetyProblem) -> None:
     """Look for mistakes in a problem, mostly at its starts; once for each problem.
 
-    Wrong are: an input that nothing depends on; a barrier that no input reaches, or that cannot be
-    differentiated as often as that takes; gains that are not one positive number for each order;
-    functions without a finite value; and starts of which all are outside the safe set (an h of the
-    wrong sign) or the workspace.
+    Wrong are: an input that nothing depends on; a barrier that no input reaches; gains that are not
+    one positive number for each order; functions without a finite value; and starts of which all
+    are outside the safe set (an h of the wrong sign) or the workspace.
 
     Doubtful is what other units than the model's would explain: few of the drawn starts are safe
     (degrees for radians); the nominal controller asks for a hundred times what the input bounds
@@ -58,12 +57,6 @@ def require_sound(problem: SafetyProblem) -> None:
         _require_inputs_used(system)
         for i, barrier in enumerate(problem.barriers):
             degree = degree_of(system, barrier.expression)
-            if degree > 1 and has_kinks(barrier.expression):
-                raise SystemDefinitionError(
-                    f"barrier {barrier.name} = {barrier.expression} has kinks and relative degree"
-                    f" {degree}: it cannot be differentiated that often. Give a smooth one, or a"
-                    " barrier for each of its pieces"
-                )
             _require_gains(problem.gains_of(i), barrier.name, degree)
     x = _safe_starts(problem)
     _require_finite(problem, x)
@@ -207,26 +200,33 @@ def _doubt_box_of_barriers(problem: SafetyProblem, x: Components) -> None:
     """Warn where the condition of a barrier is far out of reach at every start."""
     model = problem.model
     for i, barrier in enumerate(problem.barriers):
-        chain, gains = model.numeric(barrier.expression), problem.gains_of(i)
-        for gain in gains[:-1]:
-            chain = generator(model, chain) + gain * chain
-        rate = generator(model, chain).replace(
-            sp.DiracDelta, lambda *_: sp.Integer(0)
-        )  # At a kink, which no start is likely to hit.
-        effect = model.numeric(lie_derivative_g(model, chain))
-        best = sum(
-            sp.Max(e * variable.low, e * variable.high)
-            for e, variable in zip(effect, problem.inputs, strict=True)
-        )
-        without, reach = _values(model.states, [model.numeric(rate + gains[-1] * chain), best], x).T
-        if (without < -_OTHER_UNITS * abs(reach)).all():
-            nearest = int((abs(reach) / -without).argmax())
-            _doubt(
-                f"the input bounds are too narrow for {barrier.name} at every start: at"
-                f" {_at(problem, x, nearest)} the condition lacks {-without[nearest]:.4g}, of which"
-                f" the inputs make up {reach[nearest]:.4g}: check the units of the bounds and"
-                " the gains"
+        # Of a maximum, another function may do.
+        for h in [each[0] for each in clauses(barrier.expression) if len(each) == 1]:
+            chain, gains = model.numeric(h), problem.gains_of(i)
+            for gain in gains[:-1]:
+                chain = _smooth(generator(model, chain)) + gain * chain
+            rate = _smooth(generator(model, chain))
+            effect = _smooth(model.numeric(lie_derivative_g(model, chain)))
+            best = sum(
+                sp.Max(e * variable.low, e * variable.high)
+                for e, variable in zip(effect, problem.inputs, strict=True)
             )
+            without, reach = _values(
+                model.states, [model.numeric(rate + gains[-1] * chain), best], x
+            ).T
+            if (without < -_OTHER_UNITS * abs(reach)).all():
+                nearest = int((abs(reach) / -without).argmax())
+                _doubt(
+                    f"the input bounds are too narrow for {barrier.name} at every start: at"
+                    f" {_at(problem, x, nearest)} the condition lacks {-without[nearest]:.4g}, of"
+                    f" which the inputs make up {reach[nearest]:.4g}: check the units of the bounds"
+                    " and the gains"
+                )
+
+
+def _smooth(expression: Any) -> Any:
+    """Leave out what sympy adds at kinks, which no start is likely to hit."""
+    return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
 
 
 def _doubt_box_of_workspace(problem: SafetyProblem, x: Components) -> None:

@@ -79,14 +79,14 @@ def check_condition(
     x = _states(problem, samples, rng, seed)
     low, high = np.array(problem.box).T
     u = rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (samples, len(low)))
-    for (barrier, one), constraint in zip(
-        safety_filter.pairs, safety_filter.constraints, strict=True
-    ):
+    constraints = zip(safety_filter.parts, safety_filter.constraints, strict=True)
+    for (barrier, one), given in constraints:
         what = f"{one.name} on {barrier.name}"
-        found = _Constraint(one.believed(safety_filter.model), one, constraint, what)
-        found.check_values(x, u)
-        if constraint.terms is None and constraint.uncertainty is None:
-            found.check_derivatives(x, u)
+        for constraint in given.alternatives or (given,):
+            found = _Constraint(one.believed(safety_filter.model), one, constraint, what)
+            found.check_values(x, u)
+            if constraint.terms is None and constraint.uncertainty is None:
+                found.check_derivatives(x, u)
     middle, half = (low + high) / 2.0, (high - low) / 2.0
     for share in (1.0, _TIGHT):
         bounds = np.stack([middle - share * half, middle + share * half])
@@ -260,8 +260,13 @@ def _check_decisions(
     flagged = (found.slack <= 0.0).all(axis=1) | ~found.feasible
     _require(bool(flagged.all()), f"infeasible: {name} has a slack where it is feasible")
     first, *others = safety_filter.constraints
-    if others or any(
-        part is not None for part in (first.demand, first.change, first.uncertainty, first.terms)
+    if (
+        others
+        or first.alternatives
+        or any(
+            part is not None
+            for part in (first.demand, first.change, first.uncertainty, first.terms)
+        )
     ):
         return
     a, b = _affine(safety_filter, x)

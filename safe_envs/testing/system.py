@@ -11,6 +11,7 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import generator, ito_correction, lie_derivative_f, lie_derivative_g
+from safe_envs.dynamics.min_max import pieces
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -54,11 +55,12 @@ def check_system(system: System, *, steps: int = 50, seed: int = 0) -> None:
     states = _checked("batch", lambda: _check_simulation(problem, steps, seed))
     for believed, dynamics in (("plant", problem.plant), ("model", problem.model)):
         for barrier in problem.barriers:
-            phi: sp.Expr = barrier.expression
-            for level in range(degree_of(dynamics, phi)):
-                title = f"{barrier.name} (level {level}, {believed})"
-                _check_derivatives(title, phi, dynamics, states)
-                phi = generator(dynamics, phi)
+            degree = degree_of(dynamics, barrier.expression)
+            for phi in pieces(barrier.expression):
+                for level in range(degree):
+                    title = f"{barrier.name} (level {level}, {believed})"
+                    _check_derivatives(title, phi, dynamics, states)
+                    phi = generator(dynamics, phi)
 
 
 def _built(system: System) -> SafetyProblem:

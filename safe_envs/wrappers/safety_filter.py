@@ -21,6 +21,7 @@ from safe_envs.wrappers.conditions.at_estimate import (
     constraint_at_estimate,
     with_belief_signals,
 )
+from safe_envs.wrappers.conditions.parts import parts_of
 from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.estimation import Estimator, make_estimator
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
@@ -66,7 +67,7 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
             be infinite unless the filter has a goal, a reciprocal condition or certificate, or an
             uncertain constraint: these go as far as they can.
         weights: diagonal of W, one positive number for each input; ones by default.
-        priorities: weights of the squared slacks, one positive number for each constraint; ones by
+        priorities: weights of the squared slacks, one positive number for each barrier; ones by
             default.
         dt: control period in s, for conditions with a sampling margin of first order.
         clf: goal of the joint QP, whose weights replace W.
@@ -77,7 +78,9 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
 
     Attributes:
         model: the system, as given.
-        pairs: each barrier with its condition, of the constraints in `constraints`.
+        pairs: each barrier with its condition.
+        parts: the same for each constraint in `constraints`: a barrier that is a minimum has one
+            for each of its pieces, see `Condition.parts`.
         qp: the QP, whose model has the adjustable parameters as signals.
 
     Raises:
@@ -110,21 +113,24 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
         self.pairs = arguments.read_pairs(known, barriers, conditions)
         arguments.require_goal(clf, weights)
         settings = EstimateSettings(dt, instants, region, certain_states(estimator))
+        owners, self.parts = parts_of(self.pairs)
         self.constraints = tuple(
-            constraint_at_estimate(c, known, barrier, settings, len(self.pairs))
-            for barrier, c in self.pairs
+            constraint_at_estimate(c, known, barrier, settings, len(self.parts))
+            for barrier, c in self.parts
         )
         known = with_belief_signals(known, self.constraints)
         endless = limits.takes_endless(self.constraints, clf)
+        weights_of = limits.positive_weights("priorities", priorities, len(self.pairs))
         qp = FilterQP(
             known,
             self.constraints,
             *limits.read_bounds(known.inputs, bounds, endless),
             limits.positive_weights("weights", weights, known.m),
-            limits.positive_weights("priorities", priorities, len(self.pairs)),
+            [weights_of[i] for i in owners],
             limits.control_period(self.constraints, dt),
             clf,
             arguments.runtime_symbols(known, self.pairs, self.constraints, clf),
+            owners if len(owners) > len(self.pairs) else (),
         )
         super().__init__(qp, [barrier.name for barrier, _ in self.pairs])
         fixed = [p.name for p in known.parameters]

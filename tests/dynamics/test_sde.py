@@ -5,12 +5,19 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, state_problem
+from safe_envs import (
+    ConfigurationError,
+    ControlAffineSDE,
+    SystemDefinitionError,
+    SystemDefinitionWarning,
+    state_problem,
+)
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.integrators import Integrator
@@ -84,6 +91,20 @@ def test_a_diffusion_of_zeros_is_no_noise_however_they_are_written():
         )
         assert system.noisy == noisy
         assert Integrator(system, 0.1, 1, "floats").channels == noisy
+
+
+def test_no_diffusion_is_no_noise():
+    assert not ControlAffineSDE((x, y), (u,), [0, 0], [1, 0]).noisy
+    assert not ControlAffineSDE.from_rate((x, y), (u,), [u, y]).noisy
+
+
+def test_a_single_noise_of_several_states_warns_unless_it_is_written_as_such():
+    for shared in ([0.3, 0.3], [k, 1], (0.1, x), np.array([0.1, 0.2])):
+        with pytest.warns(SystemDefinitionWarning, match="a single Wiener process"):
+            ControlAffineSDE((x, y), (u,), [0, 0], [1, 0], shared, {k: 1.0})
+    for meant in ([0, 0.3], [0.0, k], [[0.3], [0.3]], sp.Matrix([k, k]), [[0.3, 0], [0, 0.3]]):
+        system = ControlAffineSDE((x, y), (u,), [0, 0], [1, 0], meant, {k: 1.0})
+        assert replace(system, drift=[x, y]).diffusion == system.diffusion
 
 
 def test_with_parameters_returns_another_system_and_knows_its_names():

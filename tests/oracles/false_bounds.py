@@ -46,7 +46,7 @@ def pole():
 
 def island():
     """A narrow second peak of h under the start, far from the rest of C."""
-    system = ControlAffineSDE.from_rate((x, y), (u,), [u, 0], diffusion=[0.1, 0.1])
+    system = ControlAffineSDE.from_rate((x, y), (u,), [u, 0], diffusion=[[0.1], [0.1]])
     barrier = 1 - x**2 - y**2 + 30 * sp.exp(-((x - 1.5) ** 2 + (y - 0.3) ** 2) / 1e-4**2)
     ranges = {x: (-2, 2), y: (-2, 2)}
     return state_problem(

@@ -29,7 +29,7 @@ def _made(
     **rest: Any,
 ) -> Any:
     rows = [u, *[0] * (len(states) - 1)] if rows is None else rows
-    noise = [*noise, *[0] * (len(states) - len(noise))]
+    noise = [[each] for each in (*noise, *[0] * (len(states) - len(noise)))]
     system = ControlAffineSDE.from_rate(states, inputs, rows, diffusion=noise)
     problem = state_problem(
         system,
@@ -143,6 +143,7 @@ NASTY: dict[str, Any] = {
     "high frequency": lambda: _made(1 + sp.sin(1000 * x) / 2 - x**2, start=(0.1,)),
     "wave": lambda: _made(1 + sp.sin(40 * x) / 20 - x**2, high=200.0, start=(0.1,)),
     "minimum": lambda: _made(sp.Min(1 - x, 1 + x)),
+    "maximum": lambda: _made(sp.Max(1 - x**2, 1 - 2 * x)),
     "size": lambda: _made(1 - x * sp.Abs(x) ** 3),
     "sign": lambda: _made(1 + sp.sign(x) / 2 - x**2, start=(0.3,)),
     "floor": lambda: _made(sp.floor(x) + 1 - x**2 / 8, start=(0.3,)),
@@ -173,7 +174,7 @@ NASTY: dict[str, Any] = {
     ),
 }  # fmt: skip
 
-REFUSED = ("saturated tanh", "saturated erf", "minimum", "size", "sign", "floor")
+REFUSED = ("saturated tanh", "saturated erf", "maximum", "sign", "floor")
 """Those that are no problems, or whose filter is none."""
 
 UNPROVED = (

@@ -94,7 +94,9 @@ def _of_degree_one(rng: np.random.Generator) -> tuple[SafetyProblem, str]:
     xs, us = sp.symbols(f"x_1:{n + 1}", real=True), sp.symbols(f"u_1:{m + 1}", real=True)
     axes, noisy = _axes(rng, n), rng.random() < 0.8
     rows = [_wave(rng, xs, 0.6) + sum(axes[i][j] * us[j] for j in range(m)) for i in range(n)]
-    system = ControlAffineSDE.from_rate(xs, us, rows, diffusion=_noise(rng, xs, noisy))
+    system = ControlAffineSDE.from_rate(
+        xs, us, rows, diffusion=[[e] for e in _noise(rng, xs, noisy)]
+    )
     turned: Any = [sum(a * s for a, s in zip(row, xs, strict=True)) for row in _axes(rng, n)]
     weights = [_number(rng, 0.6, 1.6) for _ in xs]
     ellipse = 1 - sum(w * t**2 for w, t in zip(weights, turned, strict=True))
@@ -117,7 +119,7 @@ def _of_degree_two(rng: np.random.Generator) -> tuple[SafetyProblem, str]:
     noisy = rng.random() < 0.7
     xs = (*ps, *vs)
     rows = [*vs, *(_wave(rng, xs, 0.5) + u for u in us)]
-    noise = [*[0] * pairs, *_noise(rng, vs, noisy)]
+    noise = [[each] for each in (*[0] * pairs, *_noise(rng, vs, noisy))]
     system = ControlAffineSDE.from_rate(xs, us, rows, diffusion=noise)
     round_: Any = 1 - sum(p**2 for p in ps)
     kinds = [[round_], [1 - ps[0]], [1 - ps[0] + 0.2 * ps[-1] ** 2], [1 - ps[0], 1 + ps[-1]]]

@@ -97,7 +97,7 @@ def test_from_rate_takes_a_rate_apart():
         ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
         ({"barriers": 1 - x**2 > 0}, SystemDefinitionError, "give the expression itself"),
         ({"barriers": "1 - x**2"}, SystemDefinitionError, "give a sympy expression"),
-        ({"barriers": 1 - sp.Abs(x)}, SystemDefinitionError, "has kinks and relative degree 2"),
+        ({"barriers": sp.Min(1 - x, 1 - v)}, RelativeDegreeError, "different relative degrees"),
         ({"nominal": lambda state: -state}, SystemDefinitionError, "nominal is a function"),
         (
             {"nominal": sp.log(x - 5)},

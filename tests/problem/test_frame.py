@@ -161,7 +161,9 @@ def test_laws_that_quadratures_cannot_resolve_are_refused():
 
 def test_a_state_that_stands_for_itself_is_a_coordinate_or_known():
     rate = [u * x - y, u * y + x, 1]
-    system = ControlAffineSDE.from_rate((x, y, p), (u,), rate, [s_1, s_2, 0], {s_1: 0, s_2: 0})
+    system = ControlAffineSDE.from_rate(
+        (x, y, p), (u,), rate, [[s_1], [s_2], [0]], {s_1: 0, s_2: 0}
+    )
     radius = 1 + sp.sin(p) / 5
     frame = replace(TURNING, section=(r, sp.Integer(0), p))
     numbers = {"box": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0, "frame": frame}

@@ -275,6 +275,17 @@ def test_rows_of_functions_with_kinks():
     assert assert_slopes(module, rng.normal(size=(30, 2)), 4.0 + rng.normal(size=(30, 1))) > 25
 
 
+def test_a_minimum_has_the_gradients_of_its_pieces_and_a_maximum_is_refused():
+    x, y, u, w = sp.symbols("x y u w", real=True)
+    model = ControlAffineSDE((x, y), (u, w), [y, 0], [[1, 0], [0, 1]])
+    minimum = SafetyFilter(model, 1 - x - sp.Abs(y), "cbf:alpha=2", bounds=[(-9, 9)] * 2)
+    rng = np.random.default_rng(0)
+    states, inputs = rng.normal(size=(30, 2)) / 2, rng.normal(size=(30, 2)) + 1
+    assert assert_slopes(TorchFilter(minimum), states, inputs) > 25
+    with pytest.raises(ConfigurationError, match="cbf on h is of a maximum"):
+        TorchFilter(SafetyFilter(model, sp.Max(x, y), "cbf", bounds=[(-9, 9)] * 2))
+
+
 def test_names_of_symbols_change_nothing():
     found = []
     for names in (("y", "z"), ("x0", "x1"), ("x1", "sin"), ("torch", "None")):

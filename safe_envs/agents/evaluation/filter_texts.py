@@ -9,6 +9,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import parse_conditions, require_readable, spec_of
 from safe_envs.wrappers.conditions.names import unfiltered_in_sum
+from safe_envs.wrappers.conditions.parts import parts_of
 from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
 from safe_envs.wrappers.env_wrappers import lone_filters
 
@@ -38,6 +39,6 @@ def checked_filter(name: str, problem: SafetyProblem, known: ControlAffineSDE) -
         return None
     conditions = parse_conditions(name, problem)
     # What does not suit a barrier is an error before tables are read, which may take long.
-    for condition, barrier in zip(conditions, problem.barriers, strict=True):
+    for barrier, condition in parts_of(tuple(zip(problem.barriers, conditions, strict=True)))[1]:
         replace(condition, belief=None, measurement_error=()).constraint(known, barrier)
     return spec_of(conditions)

@@ -18,6 +18,7 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
+from safe_envs.wrappers.conditions.parts import with_parts
 from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
 from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
@@ -170,11 +171,13 @@ def _outside_of(
     """
     corrected = any(c.corrects_model for c in conditions)
     known = problem.plant if knowledge == "plant" and not corrected else problem.model
+    if conditions:
+        problem, conditions = with_parts(problem, conditions)
     rows = [
         c.constraint(known, barrier)
         for c, barrier in zip(conditions, problem.barriers, strict=bool(conditions))
     ]
-    if not rows or any(row.terms is not None for row in rows):
+    if not rows or any(row.terms is not None or row.alternatives for row in rows):
         return None
     later = [b for row in rows for b in row.chain[1:]]
     if not later:

@@ -150,7 +150,7 @@ def estimator_step(batch: int | None) -> Case:
         (turn, push),
         [v * sp.cos(theta), v * sp.sin(theta), 0, 0],
         [[0, 0], [0, 0], [1, 0], [0, 1]],
-        [0.05, 0.05, 0.05, 0.1],
+        [[0.05], [0.05], [0.05], [0.1]],
     )
     sensor = Measurement((Channel("x", x, 0.1), Channel("y", y, 0.1)))
     initial = InitialBelief.of([0.0, 0.0, 0.5, 1.0], 0.1 * np.eye(4))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import sympy as sp
 
+from safe_envs.dynamics.min_max import clauses
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.barrier import Barrier
@@ -18,6 +19,7 @@ from safe_envs.wrappers.conditions.belief import (
     standard_deviations,
 )
 from safe_envs.wrappers.conditions.bounded_error import Region, with_bounded_error
+from safe_envs.wrappers.conditions.chain import require_smooth
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 
@@ -43,7 +45,7 @@ def constraint_at_estimate(
     model: ControlAffineSDE,
     barrier: Barrier,
     settings: EstimateSettings,
-    barriers: int,
+    count: int,
 ) -> AffineConstraint:
     """Return the constraint of a condition, at the true state or at an estimate as it asks.
 
@@ -52,7 +54,7 @@ def constraint_at_estimate(
         model: that the filter knows.
         barrier: h.
         settings: see there.
-        barriers: how many share the probability `belief`.
+        count: of constraints that share the probability `belief`.
 
     Raises:
         ConfigurationError: A setting is missing, or the condition is none for estimates.
@@ -65,6 +67,12 @@ def constraint_at_estimate(
             f"{condition.name} was learned or proved at true states: leave belief and"
             " measurement_error out, or take a condition of a model, such as scbf or hocbf"
         )
+    if len(clauses(barrier.expression)[0]) > 1:
+        raise ConfigurationError(
+            f"barrier {barrier.name} = {barrier.expression} is a maximum, which {condition.name}"
+            " keeps at true states only; leave belief and measurement_error out, or take a smooth"
+            " function below it"
+        )
     known = model
     if condition.belief is not None:
         if settings.instants is None or settings.dt is None:
@@ -73,11 +81,13 @@ def constraint_at_estimate(
                 " whose number and length are not known; give instants=K+1 and dt=..., or make"
                 " the filter by SafetyFilter.for_problem"
             )
-        z = standard_deviations(condition.belief, settings.instants * barriers)
+        z = standard_deviations(condition.belief, settings.instants * count)
         barrier = belief_barrier(model, barrier, z, settings.dt, settings.certain)
         known = belief_system(model, settings.certain)
     found = plain.constraint(known, barrier)
     if condition.measurement_error:
+        # The mean value theorem, too, takes slopes of what does not jump.
+        require_smooth(known, barrier, [*found.coefficient, found.offset], False, kinks=True)
         found = with_bounded_error(
             found, known, condition.measurement_error, settings.region, condition.name
         )

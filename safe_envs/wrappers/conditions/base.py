@@ -12,13 +12,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import sympy as sp
 
 from safe_envs.dynamics.declarations import TIME
-from safe_envs.dynamics.identities import pieces_fit
 from safe_envs.dynamics.lie import Derivative, generator, lie_derivative_f, lie_derivative_g
+from safe_envs.dynamics.min_max import clauses
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    SafeEnvsError,
+    SystemDefinitionError,
+    shortened,
+    shown,
+)
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.chain import not_smooth, resolved
-from safe_envs.wrappers.conditions.constraint import AffineConstraint
+from safe_envs.wrappers.conditions.chain import require_smooth, resolved
+from safe_envs.wrappers.conditions.constraint import AffineConstraint, either_of
 from safe_envs.wrappers.conditions.names import COMMON
 
 if TYPE_CHECKING:
@@ -128,6 +134,9 @@ class Condition(ABC):
     def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint for a model and a barrier, in the model's symbols.
 
+        A barrier that is a maximum has a constraint for each function, one of which is enough. A
+        minimum has several constraints: see `parts`.
+
         Args:
             model: system that the filter knows.
             barrier: barrier h.
@@ -137,8 +146,8 @@ class Condition(ABC):
 
         Raises:
             RelativeDegreeError: The condition does not suit the barrier's relative degree.
-            SystemDefinitionError: A class-K function cannot be differentiated as often as the chain
-                needs.
+            SystemDefinitionError: A class-K function, the barrier or the model cannot be
+                differentiated as often as the chain needs, or the barrier is a minimum.
             ConfigurationError: The condition is only for models without signals and time, or the
                 code of a condition from outside fails.
         """
@@ -149,8 +158,17 @@ class Condition(ABC):
             )
         if self.autonomous:
             _require_autonomous(self.name, model, barrier)
+        if len(self.parts(barrier)) > 1:
+            raise SystemDefinitionError(
+                f"barrier {barrier.name} = {barrier.expression} is a minimum, which has several"
+                " constraints; give one barrier for each of its pieces, or make a SafetyFilter,"
+                " which does so"
+            )
+        functions = clauses(barrier.expression)[0] if self.splits else (barrier.expression,)
         try:
-            return _constraint(self, model, barrier)
+            found = [_constraint(self, model, Barrier(h, barrier.name)) for h in functions]
+            noisy = self.stochastic and model.noisy
+            return found[0] if len(found) == 1 else either_of(self.name, barrier, found, noisy)
         except SafeEnvsError:
             raise
         except (Exception, SystemExit) as error:
@@ -158,6 +176,24 @@ class Condition(ABC):
                 f"{self.name} cannot derive its constraint on {barrier.name}"
                 f" ({type(error).__name__}: {shortened(error)}); correct its class"
             ) from error
+
+    @property
+    def splits(self) -> bool:
+        """Whether minima and maxima of functions are taken apart."""
+        return self.differentiates and not self.is_learned
+
+    def parts(self, barrier: Barrier) -> tuple[Barrier, ...]:
+        """Return the barriers with a constraint each that keep a barrier: those it is the least of.
+
+        Args:
+            barrier: h.
+        """
+        found = clauses(barrier.expression) if self.splits else ()
+        if len(found) < 2:
+            return (barrier,)
+        return tuple(
+            Barrier(sp.Max(*each), f"{barrier.name}_{i}") for i, each in enumerate(found, 1)
+        )
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """Return the system to differentiate along: the model, or a learned one."""
@@ -246,20 +282,16 @@ def _constraint(
     """Derive a constraint; remembered, since derivatives of long expressions take their time."""
     model = condition.believed(model)
     found = _sympified(condition.derived(model, barrier), model.m)
-    # The generator differentiates twice each time; only the last derivative may jump.
-    times = len(found.chain) + (condition.sampling_margin == FIRST_ORDER)
-    if condition.differentiates and not pieces_fit(
-        barrier.expression,
-        model.measured,
-        (2 if condition.stochastic and model.noisy else 1) * times - 1,
-    ):
-        raise not_smooth(barrier)
+    noisy = condition.stochastic and model.noisy
+    if condition.differentiates:
+        require_smooth(model, barrier, found.chain, noisy)
     if condition.sampling_margin == FIRST_ORDER:
         row = (
             sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True))
             + found.offset
             - (found.demand or 0)
         )
+        require_smooth(model, barrier, [row], noisy, kinks=not noisy)
         by_input = (lie_derivative_g(model, row) * sp.Matrix(model.inputs))[0, 0]
         return replace(found, change=resolved(condition.derivative(model, row) + by_input, barrier))
     if condition.sampling_margin != "none":

@@ -7,7 +7,16 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.lie import Derivative, has_kinks, relative_degree
+from safe_envs.dynamics.kinks import STEPS, edges, is_bent, switches
+from safe_envs.dynamics.lie import (
+    Derivative,
+    gradient,
+    lie_derivative_f,
+    lie_derivative_g,
+    relative_degree,
+    vanishes,
+)
+from safe_envs.dynamics.min_max import MOST, clauses
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import SystemDefinitionError
 from safe_envs.problem.barrier import Barrier
@@ -54,28 +63,80 @@ def chain_of(
 
 
 def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
-    """Return a derivative of a chain without what sympy adds at kinks of class-K functions.
+    """Return a derivative of a chain without what sympy adds where functions have kinks.
 
-    At the kink of s |s| and the like, that has no weight.
+    It has no weight where what is differentiated is continuous; see `require_smooth`.
 
     Args:
         expression: the derivative.
         barrier: barrier of the chain.
 
     Raises:
-        SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's
-            formula miss a local time.
+        SystemDefinitionError: sympy cannot differentiate.
     """
-    if not expression.has(sp.DiracDelta, sp.Derivative, sp.Subs):
-        return expression
-    if expression.has(sp.Derivative, sp.Subs) or has_kinks(barrier.expression):
-        raise not_smooth(barrier)
+    if expression.has(sp.Derivative, sp.Subs):
+        raise SystemDefinitionError(
+            f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is"
+            " needed; give a smooth one, of real symbols"
+        )
     return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
 
 
-def not_smooth(barrier: Barrier) -> SystemDefinitionError:
-    """Return the error of a barrier with kinks where a derivative is needed."""
+def require_smooth(
+    model: ControlAffineSDE,
+    barrier: Barrier,
+    functions: Sequence[sp.Expr],
+    noisy: bool,
+    kinks: bool = False,
+) -> None:
+    """Raise SystemDefinitionError where functions cannot be differentiated along a system.
+
+    Where one jumps, its derivative lacks the jump. Where it has a kink, the two sides have their
+    own constraints. The chain is right where states only pass, which they do where neither the
+    input nor noise acts across the kink. Where the input does, it may hold the state there, by
+    turns of inputs that the two sides allow, with a mean that neither allows. Where noise does, the
+    generator lacks a local time.
+
+    Args:
+        model: the system.
+        barrier: barrier of the chain.
+        functions: that are differentiated.
+        noisy: whether noise counts.
+        kinks: whether they may have kinks anywhere.
+    """
+    for function in filter(is_bent, functions):
+        known = model.exact(function)
+        for edge in edges(known, model.measured):
+            raise _not_smooth(model, barrier, edge, "may jump", "which its derivative leaves out")
+        for edge in () if kinks else edges(known, model.measured, 1):
+            across: list[Any] = [*lie_derivative_g(model, edge)]
+            across += [*(gradient(model, edge) * model.diffusion)] if noisy else []
+            speed = model.exact(lie_derivative_f(model, edge))
+            if edges(speed, model.measured) or not all(vanishes(model, e) for e in across):
+                why = "across which an input or noise acts"
+                raise _not_smooth(model, barrier, edge, "may have a kink", why)
+
+
+def _not_smooth(
+    model: ControlAffineSDE, barrier: Barrier, edge: Any, what: str, why: str
+) -> SystemDefinitionError:
+    """Return the error of a chain that is not smooth, with the function that makes it so."""
+    parts = {f"the drift of {s}": e for s, e in zip(model.states, model.drift, strict=True)}
+    parts |= {"the input matrix": model.input_matrix, "the diffusion": model.diffusion}
+    entries = [(name, e) for name, part in parts.items() for e in sp.flatten([part])]
+    causes = [(name, e) for name, e in entries if edge in switches(model.exact(e))]
+    place = f"where {edge} = 0" if isinstance(edge, sp.Expr) else f"by {edge}"
+    place = f"by {edge}" if isinstance(edge, STEPS) else place
+    reason = f"{what}{'' if edge.atoms(sp.Dummy) else f' {place}'}, {why}"
+    if edge in switches(model.exact(barrier.expression)) or not causes:
+        others = f"a smooth one, a sum of multiples of Min, Max and Abs of up to {MOST} ones, or "
+        others *= len(clauses(barrier.expression)) == 1
+        return SystemDefinitionError(
+            f"barrier {barrier.name} = {barrier.expression} {reason}; give {others}one barrier for"
+            " each of its pieces"
+        )
+    name, expression = causes[0]
     return SystemDefinitionError(
-        f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is"
-        " needed; give a smooth one, of real symbols, or one barrier for each of its pieces"
+        f"{name} = {expression} {reason}; the chain of barrier {barrier.name} differentiates it:"
+        " give a smooth function, such as tanh for a step, or another barrier"
     )

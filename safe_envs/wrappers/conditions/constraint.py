@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import sympy as sp
 
@@ -14,7 +14,8 @@ from safe_envs.compiled.own_source import has_own_source
 from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.lie import lie_derivative_g, tidied
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import NotCompilableError
+from safe_envs.errors import NotCompilableError, SystemDefinitionError
+from safe_envs.problem.barrier import Barrier
 
 
 class Terms(Protocol):
@@ -81,6 +82,8 @@ class AffineConstraint:
         uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
             symmetric Q(x) with which the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
         terms: learned numbers in the expressions, whose symbols are no states.
+        alternatives: constraints of the functions of a barrier that is their maximum, of which one
+            is enough; what else is stated is that of the first.
     """
 
     coefficient: tuple[sp.Expr, ...]
@@ -91,6 +94,7 @@ class AffineConstraint:
     uncertainty: tuple[sp.Expr, ...] | None = None
     terms: Terms | None = None
     domain: tuple[sp.Expr, ...] = ()
+    alternatives: tuple[AffineConstraint, ...] = ()
 
     @classmethod
     def after(
@@ -108,7 +112,33 @@ class AffineConstraint:
             offset: part of b_r without the input.
             demand: see the class.
         """
-        a = lie_derivative_g(model, chain[-1])
+        # What sympy adds at kinks has no weight: see `safe_envs.wrappers.conditions.chain`.
+        a: Any = lie_derivative_g(model, chain[-1]).replace(sp.DiracDelta, lambda *_: sp.Integer(0))
         return cls(
             tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand
         )
+
+
+def either_of(
+    name: str, barrier: Barrier, found: Sequence[AffineConstraint], noisy: bool
+) -> AffineConstraint:
+    """Return the constraint of a barrier that is a maximum.
+
+    Args:
+        name: of the condition.
+        barrier: h.
+        found: constraints of the functions that it is the maximum of.
+        noisy: whether the condition takes noise into account.
+
+    Raises:
+        SystemDefinitionError: The constraint of one function is not enough.
+    """
+    special = [p for c in found for p in (c.demand, c.change, c.uncertainty, c.terms)]
+    if noisy or any(part is not None for part in special):
+        raise SystemDefinitionError(
+            f"barrier {barrier.name} = {barrier.expression} is a maximum, which {name} cannot keep:"
+            " the constraint of one of its functions is enough only without noise, uncertainty,"
+            " reciprocal demands and first-order margins. Take cbf, ecbf or hocbf, or a smooth"
+            " function below it, such as log((exp(k*a) + exp(k*b))/2)/k for Max(a, b)"
+        )
+    return replace(found[0], alternatives=tuple(found))

@@ -20,7 +20,7 @@ from safe_envs.errors import ConfigurationError, RelativeDegreeError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers.conditions.base import FIRST_ORDER, Condition, is_nonnegative
 from safe_envs.wrappers.conditions.cbf import gains_of_poles
-from safe_envs.wrappers.conditions.chain import chain_of
+from safe_envs.wrappers.conditions.chain import chain_of, require_smooth
 from safe_envs.wrappers.conditions.class_k import positive_rates
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
@@ -185,6 +185,7 @@ class LearnedHOCBF(LearnedCondition):
             )
         k = [sp.Float(value, 17) for value in (*gains_of_poles([-p for p in self.p]), 1.0)]
         eta = derivatives(model, barrier.expression, r, lie_derivative_f)
+        require_smooth(model, barrier, eta[:-1], False)
         a = lie_derivative_g(model, eta[r - 1])
         deltas, sigmas = part.symbols[:r], part.symbols[r:]
         error = part.eps(self.level).tolist() if self.eps is None else [self.eps] * (r + m)
@@ -242,6 +243,7 @@ class DDSCBF(LearnedCondition):
         self._require_no_first_order()
         part = self.learned.generators[self._number_of(model, barrier)]
         eta = derivatives(model, barrier.expression, part.degree, lie_derivative_f)
+        require_smooth(model, barrier, eta[:-1], model.noisy)
         term, *slopes = part.symbols
         a: Any = lie_derivative_g(model, eta[-2])
         if slopes:

@@ -102,7 +102,7 @@ def compare(
             fails.
     """
     require_whole("states", states, 1)
-    options = options or ExportOptions()
+    options, safety_filter = options or ExportOptions(), safety_filter.by_constraint()
     interface, texts = _matching(Path(directory), safety_filter, options)
     compiler = c_compiler()
     if compiler is None:

@@ -70,6 +70,7 @@ def export_filter(
     """
     folder, options = Path(directory), options or ExportOptions()
     require_own(folder)
+    safety_filter = safety_filter.by_constraint()
     interface, texts = sources(safety_filter, float32, options)
     region = region_of(safety_filter, options)
     golden = golden_cases(safety_filter, region, is_single=float32)

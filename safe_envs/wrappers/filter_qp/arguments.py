@@ -19,9 +19,8 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
 from safe_envs.validators import numbers_in
 from safe_envs.wrappers.conditions import AffineConstraint, Condition
+from safe_envs.wrappers.conditions.parts import Pairs
 from safe_envs.wrappers.conditions.spec_text import parse_for_system
-
-Pairs = tuple[tuple[Barrier, Condition], ...]
 
 _FORMS = (
     "give a Condition, one for each barrier, or their text, such as 'szcbf', 'hocbf:p=2,8' or"
@@ -238,7 +237,7 @@ def runtime_symbols(
         clf: its goal, if there is one.
     """
     expressions = [barrier.expression for barrier, _ in pairs]
-    for c in constraints:
+    for c in (each for given in constraints for each in (given, *given.alternatives)):
         expressions += [*c.coefficient, c.offset, *c.chain, *c.domain, *(c.uncertainty or ())]
         expressions += [e for e in (c.demand, c.change) if e is not None]
     if clf is not None:

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import Any
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
-from safe_envs.wrappers.filter_qp.compiled import domain_of
-from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
-from safe_envs.wrappers.filter_qp.decision_text import Body, Values
+from safe_envs.wrappers.filter_qp.compiled import domain_of, functions_of
+from safe_envs.wrappers.filter_qp.decision_kernel import (
+    aim_outwards,
+    furthest_constraint,
+    take_nearest_function,
+)
+from safe_envs.wrappers.filter_qp.decision_text import Body, Values, causing_barrier, largest_slacks
+from safe_envs.wrappers.filter_qp.kernel_choice import kernel_for
 from safe_envs.wrappers.filter_qp.qp import FilterQP
-from safe_envs.wrappers.qp.kernels.interval import project_interval, work_of_interval
 from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
-from safe_envs.wrappers.qp.kernels.many import project_many, work_of_many
 from safe_envs.wrappers.qp.kernels.one_constraint import (
     project_one_constraint,
     row_margin,
     row_tolerance,
     work_of_one_constraint,
 )
-from safe_envs.wrappers.qp.kernels.plane import project_plane, work_of_plane
-from safe_envs.wrappers.qp.kernels.second_order import project_second_order, work_of_second_order
 
 
 class ArrayDecision:
@@ -48,9 +47,10 @@ class ArrayDecision:
         constraints = list(enumerate(qp.constraints))
         self._reciprocal = [i for i, c in constraints if c.demand is not None]
         self._sampled = [i for i, c in constraints if c.change is not None]
+        self._maxima = [i for i, c in constraints if c.alternatives]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
         self._second_order = bool(self._uncertain) and self._m == 1 and not self._goal
-        self._method, self._room = _method(
+        self._method, self._room = kernel_for(
             self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
         self._values, self._body = Values(qp, data), Body(data)
@@ -71,13 +71,14 @@ class ArrayDecision:
         body.add(*self._values.lines)
         body.table("a", self._a)
         body.vector("b", self._b)
-        if not self._single:
-            self._finite.append(" + ".join([*self._b, *(e for row in self._a for e in row)]))
         for name, count in (("action", m), ("margin", size), ("active", size)):
             body.room(name, count)
         body.room("scratch", self._room)
         self._bounds()
         self._wish()
+        self._choose_functions()
+        if not self._single:
+            self._finite.append(" + ".join([*self._b, *(e for row in self._a for e in row)]))
         self._domains()
         self._constraints()
         self._minimise()
@@ -132,6 +133,21 @@ class ArrayDecision:
             "goal_row, goal_offset, aim, low, high, w, priority, proposed, margin, active,"
             " goal_scratch",
         )
+
+    def _choose_functions(self) -> None:
+        """Write which functions of maxima count, and take their constraints."""
+        m = self._m
+        for i in self._maxima:
+            expressions = functions_of(self._qp.constraints[i])
+            self._body.add(f"of_{i} = {self._values.call(f'filter_functions_{i}', expressions)}")
+            entries = [f"of_{i}[{e}]" for e in range(len(expressions))]
+            lines = [entries[k : k + m + 2] for k in range(0, len(entries), m + 2)]
+            self._body.table(f"given_{i}", lines)
+            self._finite.append(" + ".join(line[-1] for line in lines))
+            self._body.call(
+                take_nearest_function, f"{i}, {m}, given_{i}, proposed, low, high, w, a, b"
+            )
+            self._a[i], self._b[i] = [f"a[{i}, {j}]" for j in range(m)], f"b[{i}]"
 
     def _domains(self) -> None:
         """Write which conditions are inside their domain, and aim outwards where one is not."""
@@ -200,7 +216,8 @@ class ArrayDecision:
             slopes, constant = self._planes[i]
             slopes, constant = [body.number(s) for s in slopes], body.number(constant)
         else:
-            entry = dict(zip(_pairs(m), form, strict=True))
+            places = itertools.combinations_with_replacement(range(m + 1), 2)
+            entry = dict(zip(places, form, strict=True))
             square = range(m + 1)
             body.table(f"form_{i}", [[entry[min(j, e), max(j, e)] for e in square] for j in square])
             body.room(f"slopes_{i}", m)
@@ -266,10 +283,10 @@ class ArrayDecision:
         self._finite.append(" + ".join(margin if self._single else [*action, *margin]))
         cause = "0"
         if not self._single:
-            cause = "cause"
             arguments = f"{m}, a, {self._asked}, proposed, w, inside, active"
             body.call(furthest_constraint, arguments, "cause = ")
-        slack = "".join(f"0.0 if feasible else max(-{g}, 0.0), " for g in margin)
+            cause = causing_barrier(self._qp)
+        slack = "".join(f"{each}, " for each in largest_slacks(self._qp))
         proposed = "".join(f"proposed[{j}], " for j in range(m))
         body.add(
             f"acts = {' or '.join(f'active[{i}] > 0.0' for i in range(k))}",
@@ -279,21 +296,3 @@ class ArrayDecision:
             f"wanted = {f'({proposed})' if self._goal else 'u'}",
             f"return chosen, wanted, acts, feasible, slack, {cause}, sound",
         )
-
-
-def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int]:
-    """Return the kernel for k constraints on m inputs, and the scratch entries that it needs."""
-    if uncertain:
-        return project_second_order, work_of_second_order(k, m)
-    if k == 1:
-        return project_one_constraint, work_of_one_constraint(k, m)
-    if m == 1:
-        return project_interval, work_of_interval(k, m)
-    if m == 2:
-        return project_plane, work_of_plane(k, m)
-    return project_many, work_of_many(k, m)
-
-
-def _pairs(m: int) -> list[tuple[int, int]]:
-    """Return the places of the entries of an uncertainty in its symmetric matrix."""
-    return list(itertools.combinations_with_replacement(range(m + 1), 2))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from safe_envs.dynamics.codegen import Flavour, compile_function
 from safe_envs.errors import NumericalError
 from safe_envs.wrappers.conditions import AffineConstraint
-from safe_envs.wrappers.filter_qp.arguments import Pairs
+from safe_envs.wrappers.conditions.parts import Pairs
+from safe_envs.wrappers.filter_qp.component_filter import ComponentFilter
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 
 
@@ -19,9 +23,25 @@ class BarrierValues:
     """The part of a `SafetyFilter` that evaluates its barriers."""
 
     pairs: Pairs
+    parts: Pairs
     constraints: tuple[AffineConstraint, ...]
     qp: FilterQP
     undefined: Callable[..., NumericalError]
+
+    def by_constraint(self) -> Any:
+        """Return the filter with an entry for each constraint in its decisions.
+
+        Of itself, decisions have one for each barrier, which may have several constraints.
+        """
+        if not self.qp.owners:
+            return self
+        found: Any = copy.copy(self)
+        found.pairs = self.parts
+        names = [barrier.name for barrier, _ in self.parts]
+        ComponentFilter.__init__(found, replace(self.qp, owners=()), names)
+        for name in ("_barriers_floats", "_barriers_arrays"):
+            vars(found).pop(name, None)
+        return found.warm_up()
 
     @cached_property
     def _barriers_floats(self) -> Any:
@@ -34,8 +54,10 @@ class BarrierValues:
     def _compile_barriers(self, flavour: Flavour) -> Any:
         # A condition with a belief keeps the barrier of that.
         kept = [
-            barrier.expression if c.belief is None else constraint.chain[0]
-            for (barrier, c), constraint in zip(self.pairs, self.constraints, strict=True)
+            barrier.expression
+            if c.belief is None
+            else sp.Min(*[self.constraints[i].chain[0] for i in members])
+            for (barrier, c), members in zip(self.pairs, self.qp.members, strict=True)
         ]
         expressions = [self.qp.model.numeric(h) for h in kept]
         return compile_function(self.qp.symbols, expressions, flavour)

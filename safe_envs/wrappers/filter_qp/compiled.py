@@ -18,6 +18,7 @@ from safe_envs.dynamics.codegen import Components, Flavour, compile_function, co
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
+from safe_envs.wrappers.filter_qp.furthest import dot
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp import dispatch, second_order_batch, second_order_constraint
 from safe_envs.wrappers.qp.majorant import majorant
@@ -48,6 +49,7 @@ class CompiledQP:
         self._domains = [domain_of(qp.constraints[i]) for i in self._reciprocal]
         self._sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
+        self._maxima = [i for i, c in enumerate(qp.constraints) if c.alternatives]
         arrays = flavour == "arrays"
         self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
         self._symbols = (*qp.symbols, *(s for term in qp.terms for s in term.symbols))
@@ -76,7 +78,7 @@ class CompiledQP:
 
     def compile(self) -> None:
         """Compile all functions that a decision may call; else each is at its first call."""
-        _ = self._values, self._demands, self._changes, self.planes
+        _ = self._values, self._demands, self._changes, self._functions, self.planes
         zero: Any = np.zeros(1) if self._flavour == "arrays" else 0.0
         for term in self._terms:
             # Learned terms compile themselves when they are first read, wherever that is.
@@ -160,6 +162,48 @@ class CompiledQP:
         loss = self._larger(-self._changes[i](*x, *action)[0], 0.0)
         return loss if inside is None else self._choose(inside, loss, 0.0)
 
+    def nearest(self, values: Components, u: Sequence[Any], bounds: Bounds) -> Sequence[Any]:
+        """Return a and b of the function of a maximum whose constraint is nearest to an input.
+
+        It is one whose set holds the state: the constraint of another would not keep the maximum.
+        Where none of these can be met, and outside of all sets, it is the largest one's.
+
+        Args:
+            values: a, b and the level of each function.
+            u: m components of the proposed input.
+            bounds: of the inputs.
+        """
+        width = self._m + 2
+        functions = [values[k : k + width] for k in range(0, len(values), width)]
+        self._require_finite([f[-1] for f in functions])
+        *chosen, top = functions[0]
+        for *each, level in functions[1:]:
+            chosen = self._chosen(level > top, each, chosen)
+            top = self._larger(top, level)
+        least: Any = math.inf
+        for *a, b, level in functions:
+            ends = zip(a, *bounds, strict=True)
+            most = b + sum([self._larger(aj * lo, aj * hi) for aj, lo, hi in ends])
+            keeps = (most >= 0.0) & ((level >= 0.0) | (level == top))
+            distance = self._larger(self._distance(a, b, u), 0.0)
+            closer = keeps & (distance < least)
+            chosen = self._chosen(closer, (*a, b), chosen)
+            least = self._choose(closer, distance, least)
+        return chosen
+
+    def _chosen(self, first: Any, entries: Sequence[Any], others: Sequence[Any]) -> list[Any]:
+        return [self._choose(first, a, b) for a, b in zip(entries, others, strict=True)]
+
+    def _distance(self, a: Sequence[Any], b: Any, u: Sequence[Any]) -> Any:
+        """Return how far an input is from the half-space of a constraint; -b where a is 0."""
+        size = functools.reduce(self._larger, [abs(aj) for aj in a])
+        # So that squares neither overflow nor vanish.
+        unit = self._choose(size > 0.0, size, 1.0)
+        square = sum(
+            [p * p / wj for p, wj in zip([aj / unit for aj in a], self.weights, strict=True)]
+        )
+        return -(dot(a, u) + b) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
+
     @cached_property
     def _values(self) -> Any:
         """Values that `_split` takes apart again."""
@@ -190,6 +234,10 @@ class CompiledQP:
             for i in self._sampled
         }
 
+    @cached_property
+    def _functions(self) -> dict[int, Any]:
+        return {i: self._compiled(functions_of(self._qp.constraints[i])) for i in self._maxima}
+
     def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
         model = self._qp.model
         return compile_function(
@@ -200,6 +248,16 @@ class CompiledQP:
 def domain_of(constraint: AffineConstraint) -> tuple[sp.Expr, ...]:
     """Return what is positive where a constraint's demand has a meaning."""
     return constraint.domain or (_beyond_rounding(constraint.chain[0]),)
+
+
+def functions_of(constraint: AffineConstraint) -> list[sp.Expr]:
+    """Return a, b and the level of each function of a barrier that is their maximum.
+
+    The level is not negative in the set that the function's own condition keeps.
+    """
+    return [
+        e for c in constraint.alternatives for e in (*c.coefficient, c.offset, sp.Min(*c.chain))
+    ]
 
 
 def _beyond_rounding(h: sp.Expr) -> sp.Expr:

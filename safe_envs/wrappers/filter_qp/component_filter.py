@@ -11,6 +11,7 @@ from safe_envs.dynamics.codegen import Components, filled
 from safe_envs.errors import NumericalError
 from safe_envs.wrappers.filter_qp.compiled import Bounds
 from safe_envs.wrappers.filter_qp.decision import FilterDecision, UndefinedConstraintError
+from safe_envs.wrappers.filter_qp.per_barrier import PerBarrier
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
 from safe_envs.wrappers.qp import dispatch
@@ -37,6 +38,9 @@ class ComponentFilter:
         self._solve_floats = self._floats.solve_single if single else self._floats.solve
         if qp.plain and not single and not any(c.uncertainty for c in qp.constraints):
             self._solve_floats = self._floats.solve_plain
+        if qp.owners:
+            self._solve_floats = PerBarrier(self._solve_floats, qp, "floats")
+            self._solve_arrays = PerBarrier(self._solve_arrays, qp, "arrays")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)

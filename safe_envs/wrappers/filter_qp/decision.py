@@ -8,6 +8,9 @@ from typing import Any, NamedTuple
 class FilterDecision(NamedTuple):
     """What a filter decides, for m inputs and k barriers.
 
+    A barrier that is a minimum has several constraints: of these, the one that is violated most
+    counts.
+
     `SafetyFilter.filter` gives arrays, of one state or of a batch with leading axes `...`.
     `decide_floats` and `decide_arrays` give sequences of components in place of the last axes,
     floats or arrays (B,), and no values of the barriers.

@@ -117,3 +117,54 @@ def furthest_constraint(
             if cause < 0 or distance > furthest:
                 cause, furthest = i, distance
     return cause
+
+
+def take_nearest_function(  # noqa: PLR0913
+    i: int,
+    m: int,
+    functions: np.ndarray,
+    u: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    w: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+) -> None:
+    """Write the constraint of a maximum: that of a function whose is nearest to the proposed input.
+
+    See `CompiledQP.nearest`.
+
+    Args:
+        i: number of the constraint.
+        m: number of inputs.
+        functions: coefficients, offset and level of each function, shape (count, m + 2).
+        u: proposed inputs, m entries or more.
+        low: lower bounds, likewise.
+        high: upper bounds, likewise.
+        w: positive weights, likewise.
+        a: constraints, shape (k, m), which are changed.
+        b: offsets, shape (k,), which are changed.
+    """
+    chosen, top = 0, functions[0, m + 1]
+    for f in range(functions.shape[0]):
+        if functions[f, m + 1] > top:
+            chosen, top = f, functions[f, m + 1]
+    least = inf
+    for f in range(functions.shape[0]):
+        unit = unit_of_row(m, functions, f)
+        square, value, most = 0.0, 0.0, 0.0
+        for j in range(m):
+            part = functions[f, j] / unit
+            square += part * part / w[j]
+            value += functions[f, j] * u[j]
+            most += max(functions[f, j] * low[j], functions[f, j] * high[j])
+        distance = -(value + functions[f, m]) / unit
+        if square > 0.0:
+            distance = distance / sqrt(square)
+        distance = max(distance, 0.0)
+        keeps = functions[f, m + 1] >= 0.0 or functions[f, m + 1] == top
+        if keeps and functions[f, m] + most >= 0.0 and distance < least:
+            chosen, least = f, distance
+    for j in range(m):
+        a[i, j] = functions[chosen, j]
+    b[i] = functions[chosen, m]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -67,6 +68,29 @@ class Values:
             given.append(inputs)
         self._text += formulas(name, arguments, numbers, self._data)
         return f"{name}({', '.join(given)}, data)"
+
+
+def largest_slacks(qp: FilterQP) -> list[str]:
+    """Return the texts of the largest slack of each barrier, of the `margin` of its constraints.
+
+    Args:
+        qp: the QP.
+    """
+    texts = [[f"margin[{i}]" for i in each] for each in qp.members]
+    least = [functools.reduce(lambda a, b: f"min({a}, {b})", each) for each in texts]
+    return [f"0.0 if feasible else max(-{margin}, 0.0)" for margin in least]
+
+
+def causing_barrier(qp: FilterQP) -> str:
+    """Return the text of the barrier that the constraint `cause` is of.
+
+    Args:
+        qp: the QP.
+    """
+    text = "cause" if not qp.owners else "-1"
+    for owner, members in enumerate(qp.members if qp.owners else ()):
+        text = f"{owner} if cause >= {members[0]} else ({text})"
+    return text
 
 
 class Body:

@@ -28,6 +28,8 @@ class FilterQP:
         clf: goal of the joint QP, if there is one.
         runtime: what the constraints may hold besides the states: the model's signals, and the time
             if it occurs.
+        owners: number of the barrier that each constraint is of, not falling; () where each
+            constraint is of a barrier of its own.
     """
 
     model: ControlAffineSDE
@@ -39,6 +41,7 @@ class FilterQP:
     dt: float
     clf: CLF | None
     runtime: tuple[sp.Symbol, ...] = ()
+    owners: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         # What is compiled into solvers does not change from outside.
@@ -55,12 +58,21 @@ class FilterQP:
         """Whether the constraints at the proposed input are all there is.
 
         Then there is no demand of a reciprocal condition, no sampling margin of first order, no
-        goal, and uncertainty only for one input.
+        maximum, no goal, and uncertainty only for one input.
         """
         return self.clf is None and all(
-            c.demand is None and c.change is None and (c.uncertainty is None or self.model.m == 1)
+            c.demand is None
+            and c.change is None
+            and not c.alternatives
+            and (c.uncertainty is None or self.model.m == 1)
             for c in self.constraints
         )
+
+    @property
+    def members(self) -> list[list[int]]:
+        """Numbers of the constraints of each barrier."""
+        owners = self.owners or range(len(self.constraints))
+        return [[i for i, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners)]
 
     @property
     def terms(self) -> list[Terms]:

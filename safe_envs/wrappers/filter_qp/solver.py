@@ -110,6 +110,8 @@ class FilterQPSolver(CompiledQP):
         if goal:
             target = [0.0 * uj for uj in u]
             u = self._best(goal, target, bounds)
+        for i in self._maxima:
+            *a[i], b[i] = self.nearest(self._functions[i](*x), u, bounds)
         inside = self._inside(levels)
         self._require_finite([*b, *[aj for ai in a for aj in ai]])
         asked = [
@@ -265,15 +267,10 @@ class FilterQPSolver(CompiledQP):
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
             if acts is False or (acts is not True and not np.count_nonzero(acts)):
                 continue
-            size = functools.reduce(self._larger, [abs(aj) for aj in ai])
-            # So that squares neither overflow nor vanish.
-            unit = self._choose(size > 0.0, size, 1.0)
-            square = sum(
-                [p * p / wj for p, wj in zip([aj / unit for aj in ai], self.weights, strict=True)]
-            )
-            distance = -(dot(ai, u) + bi) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
+            distance = self._distance(ai, bi, u)
             if i in inside:
                 distance = self._choose(inside[i], distance, math.inf)
+            size = functools.reduce(self._larger, [abs(aj) for aj in ai])
             distance = self._choose(acts & (size > 0.0), distance, -math.inf)
             first: Any = acts & (cause < 0)
             cause = self._choose(first | (distance > furthest), i, cause)

@@ -64,6 +64,8 @@ class TorchFilter(torch.nn.Module):
         super().__init__()
         if not isinstance(safety_filter, SafetyFilter):
             raise _not_differentiable(type(safety_filter).__name__)
+        # The formula is of constraints, of which a barrier may have several.
+        safety_filter = safety_filter.by_constraint()
         # The filter keeps its qp to its solvers, which share it.
         qp = safety_filter.qp
         _require_plain(safety_filter, qp)
@@ -225,11 +227,15 @@ def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
         "uncertainty": (
             "is uncertain; use a condition of a model, or a learned one without uncertainty"
         ),
+        "alternatives": (
+            "is of a maximum, of whose functions the proposed input chooses one; take a smooth"
+            " function below it"
+        ),
         "terms": "holds a network; use a condition of a model, or a learned one with formulas",
     }
-    for (barrier, condition), constraint in zip(safety_filter.pairs, qp.constraints, strict=True):
+    for (barrier, condition), constraint in zip(safety_filter.parts, qp.constraints, strict=True):
         for attribute, reason in reasons.items():
-            if getattr(constraint, attribute) is not None:
+            if getattr(constraint, attribute) not in (None, ()):
                 raise ConfigurationError(
                     f"the constraint {condition.name} on {barrier.name} {reason}: a torch layer"
                     " takes plain constraints only"

@@ -19,6 +19,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.parts import with_parts
 
 _SINGLE = 2.0**-23
 """Of a number: rounding of observations and actions to single precision, with room."""
@@ -129,6 +130,8 @@ def require_one_input(problem: SafetyProblem) -> None:
 
 def _constraint(problem: SafetyProblem, condition: Condition, knowledge: str) -> list[sp.Expr]:
     """Return a and b of the constraint a u + b >= 0."""
+    if len(problem.barriers) == 1:
+        problem, _ = with_parts(problem, (condition,))
     if len(problem.barriers) != 1:
         raise ConfigurationError(
             f"{problem.name} has {len(problem.barriers)} barriers; closed loops with one are"
@@ -139,7 +142,7 @@ def _constraint(problem: SafetyProblem, condition: Condition, knowledge: str) ->
     system = problem.plant if knowledge == "plant" else problem.model
     found = condition.constraint(system, problem.barriers[0])
     parts = (found.demand, found.change, found.uncertainty, found.terms)
-    if found.domain or any(part is not None for part in parts):
+    if found.domain or found.alternatives or any(part is not None for part in parts):
         raise ConfigurationError(
             f"the constraint of {condition.name} is not of the form a u + b >= 0 with known a and"
             " b, or has a margin of first order; its closed loop is not bounded"

@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.dynamics.identities import is_zero
+from safe_envs.dynamics.kinks import edges
 from safe_envs.dynamics.lie import has_kinks
 from safe_envs.wrappers.conditions import Certified
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import in_workspace, workspace_of
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
+from safe_envs.wrappers.verification.smoothness import NOT_ESTABLISHED
 
 
 def no_bound(formulas: Formulas) -> str:
@@ -43,27 +46,39 @@ def kinked(name: str, function: Any) -> str:
         A text.
     """
     asked = "is not twice differentiable, which Ito's formula asks for"
-    return f"{name} {asked}" if has_kinks(function) else ""
+    symbols = sorted(function.free_symbols, key=str)
+    return f"{name} {asked}" if has_kinks(function) and edges(function, symbols, 2) else ""
 
 
 def mismatch(formulas: Formulas) -> str:
     """Say in what the system that the conditions know differs from the plant; "" if in nothing."""
     plant, known = formulas.problem.plant, formulas.system
-    parts = [
-        n
-        for n in ("drift", "input_matrix", "diffusion")
-        if plant.numeric(getattr(plant, n)) != known.numeric(getattr(known, n))
-    ]
+    theirs, ours = (
+        {
+            "drift": s.exact(s.drift),
+            "input_matrix": s.exact(s.input_matrix),
+            # Noises with the same covariance are the same.
+            "diffusion": s.exact(s.diffusion * s.diffusion.T),
+        }
+        for s in (plant, known)
+    )
+    parts = [n for n, part in theirs.items() if not all(map(is_zero, part - ours[n]))]
     names = [p.name for p, value in plant.parameters.items() if known.parameters.get(p) != value]
     return f"the model differs from the plant in {', '.join(names or parts)}" if parts else ""
 
 
 def failures(analysis: SafeSetAnalysis) -> list[str]:
     """Return the hypotheses that fail, apart from the shortfall, in words."""
-    found = [mismatch(analysis.formulas), _undefined(analysis), analysis.rough]
+    rough = "" if nearly_rough(analysis) else analysis.rough
+    found = [mismatch(analysis.formulas), _undefined(analysis), rough]
     if analysis.runaway:
         found.append("it asks for unbounded control towards the edge")
     return [reason for reason in found if reason]
+
+
+def nearly_rough(analysis: SafeSetAnalysis) -> str:
+    """Say which function comes so near to a pole or kink that a search cannot tell; "" if none."""
+    return analysis.rough if analysis.rough.startswith(NOT_ESTABLISHED) else ""
 
 
 JOINT = "the shortfall of several conditions together is not established"

@@ -16,6 +16,7 @@ from safe_envs.wrappers.verification.assumptions import (
     amount,
     failures,
     mismatch,
+    nearly_rough,
     no_bound,
     outside,
     unbounded,
@@ -109,6 +110,7 @@ class ChainGuarantee:
     def _unverified(self) -> list[str]:
         """The assumptions that neither the search nor the judge establishes, in words."""
         found = [] if self.proof.bounded.word == "proved" else [self.analysis.limits]
+        found += [] if self.proof.regular else [nearly_rough(self.analysis)]
         if not self.formulas.joint and math.isinf(self.proof.shortfall.value):
             found.append(JOINT)
         return [reason for reason in found if reason]

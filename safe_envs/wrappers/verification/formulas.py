@@ -10,10 +10,10 @@ import numpy as np
 
 from safe_envs.dynamics.lie import quadratic_variation_rate
 from safe_envs.dynamics.tables import tabulated
-from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.safety_filter import SafetyFilter
+from safe_envs.wrappers.conditions.parts import with_parts
+from safe_envs.wrappers.verification.filter_of_formulas import filter_of_formulas
 from safe_envs.wrappers.verification.safe_set import region_of
 from safe_envs.wrappers.verification.search import Region
 
@@ -33,25 +33,22 @@ class Formulas:
         stages: the chain b_0..b_(r-1) of each barrier, as slices of all of them.
 
     Args:
-        problem: whose barriers, input bounds and system are taken.
+        problem: whose barriers, input bounds and system are taken. A barrier that is a minimum
+            counts as the barriers that it is the least of.
         conditions: one for each barrier.
         knowledge: "model" or "plant".
 
     Raises:
-        ConfigurationError: an argument is out of its range.
+        ConfigurationError: an argument is out of its range, or a barrier is a maximum.
         RelativeDegreeError: a condition does not suit a barrier.
     """
 
     def __init__(
         self, problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str
     ) -> None:
-        self.problem, self.conditions, self.knowledge = problem, tuple(conditions), knowledge
-        if any(c.is_learned for c in self.conditions):
-            raise ConfigurationError(
-                "the condition is learned; for bayesian-scbf:simultaneous=P a bound is estimated"
-                " over the posterior"
-            )
-        self.safety_filter = SafetyFilter.for_problem(problem, self.conditions, knowledge)
+        self.problem, self.conditions = with_parts(problem, conditions)
+        self.knowledge = knowledge
+        self.safety_filter = filter_of_formulas(self.problem, self.conditions, knowledge)
         self.system = self.safety_filter.model
         self._constraints = self.safety_filter.constraints
         self._low, self._high = np.array(problem.box).T

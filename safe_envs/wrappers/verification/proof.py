@@ -141,6 +141,11 @@ class ChainProof:
         asked = not_polynomial([system.exact(e) for e in entries], system.states)
         return judge(replace(self._region, name="the system on G", continuous=asked), self._budget)
 
+    @property
+    def regular(self) -> bool:
+        """Whether the chains and the system are proved to be as smooth on G as bounds require."""
+        return self.smooth.word == self.continuous.word == "proved"
+
     @cached_property
     def suprema(self) -> tuple[JudgedNumber, ...]:
         """Proved upper bounds of the b_j on G."""

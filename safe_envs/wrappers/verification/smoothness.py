@@ -16,8 +16,17 @@ from safe_envs.wrappers.verification.search import Region, Score, largest
 _TOUCHED = 1e-6
 """Part of its typical size at which a function counts as one that reaches 0."""
 
+_NEXT = 1e-8
+"""Part of the range of a state within which a search does not tell a function that reaches 0."""
+
+NOT_ESTABLISHED = "it is not established that "
+"""How the text begins of a function that comes near 0 and may stay away from it."""
+
 _LONGEST = 60
 """Number of characters of a part that a message shows."""
+
+
+_TWICE = "twice differentiable, which Ito's formula asks for,"
 
 
 class Edge(NamedTuple):
@@ -97,6 +106,8 @@ def roughness(
 ) -> str:
     """Say which function is not smooth somewhere in a set, and where; "" if none was found.
 
+    Where it comes near that only, the text begins with `NOT_ESTABLISHED`.
+
     Ito's formula asks for two continuous derivatives, and without noise paths may not pass a pole.
     A function with a kink by its name is found by `safe_envs.dynamics.lie.has_kinks`.
 
@@ -111,34 +122,36 @@ def roughness(
     Returns:
         A text.
     """
+    doubt = ""
     for name, expression, only_poles in asked:
         for edge in edges(expression):
-            if only_poles and not edge.pole:
+            if (only_poles and not edge.pole) or edge.base.is_nonzero:
                 continue
-            state = _reaches_zero(edge.base, states, level, points, region, rng)
-            if state is not None:
-                at = ", ".join(
-                    f"{s} = {value + 0.0:.4g}"
-                    for s, value in zip(states, state.tolist(), strict=True)
-                )
-                what = (
-                    "has a pole"
-                    if edge.pole
-                    else "is not twice differentiable, which Ito's formula asks for,"
-                )
-                return f"{name} {what} near {at}, by {shortened(edge.part, _LONGEST)}"
-    return ""
+            state, reached = _nearest_zero(edge.base, states, level, points, region, rng)
+            if state is None:
+                continue
+            values = zip(states, state.tolist(), strict=True)
+            at = ", ".join(f"{s} = {value + 0.0:.4g}" for s, value in values)
+            place = f"near {at}, by {shortened(edge.part, _LONGEST)}"
+            if reached:
+                return f"{name} {'has a pole' if edge.pole else f'is not {_TWICE}'} {place}"
+            denied = "has no pole" if edge.pole else f"is {_TWICE}"
+            doubt = doubt or f"{NOT_ESTABLISHED}{name} {denied} {place}"
+    return doubt
 
 
-def _reaches_zero(
+def _nearest_zero(
     base: sp.Expr,
     states: Sequence[sp.Symbol],
     level: Score,
     points: np.ndarray,
     region: Region,
     rng: np.random.Generator,
-) -> np.ndarray | None:
-    """Return a state (n,) of the set where a function is 0 to rounding; None if none is found."""
+) -> tuple[np.ndarray | None, bool]:
+    """Return a state (n,) of the set where a function is next to 0, and whether it reaches 0 there.
+
+    None if no such state is found.
+    """
     values = tabulated(states, [base])
 
     def size(x: np.ndarray) -> np.ndarray:
@@ -152,4 +165,9 @@ def _reaches_zero(
     sizes = size(points)
     sizes = sizes[np.isfinite(sizes)]
     least, state = largest(score, points, region, rng)
-    return state if sizes.size and -least <= _TOUCHED * float(np.median(sizes)) else None
+    if not (sizes.size and -least <= _TOUCHED * float(np.median(sizes))):
+        return None, False
+    steps = np.diag(_NEXT * (region.high - region.low))
+    with np.errstate(all="ignore"):
+        here, *around = values(np.concatenate([state[None], state + steps, state - steps]))[:, 0]
+    return state, bool(abs(here) <= np.nan_to_num(np.abs(np.array(around) - here)).max())

@@ -24,7 +24,7 @@ from safe_envs.wrappers.conditions.bounded_error import largest_slope
 
 x, y, u = sp.symbols("x y u", real=True)
 LINE = ControlAffineSDE.from_rate((x,), (u,), [0.5 * x + u], diffusion=[0.3])
-PLANE = ControlAffineSDE.from_rate((x, y), (u,), [y, -x + u], diffusion=[0.1, 0.2])
+PLANE = ControlAffineSDE.from_rate((x, y), (u,), [y, -x + u], diffusion=[[0.1], [0.2]])
 
 
 def test_the_constraint_of_a_half_space_is_the_one_by_hand():
@@ -118,7 +118,7 @@ def test_the_margin_shares_its_probability():
 def test_bounded_errors_are_met_at_every_state_within_them():
     rng = np.random.default_rng(0)
     system = ControlAffineSDE.from_rate(
-        (x, y), (u,), [y - x**3, -x * y + (1 + x**2) * u], diffusion=[0.1, 0.2]
+        (x, y), (u,), [y - x**3, -x * y + (1 + x**2) * u], diffusion=[[0.1], [0.2]]
     )
     eps, region = (0.05, 0.03), [(-1.5, 1.5), (-1.5, 1.5)]
     for h in (1 - x**2 - y**2, 1 - y - x * y / 2):

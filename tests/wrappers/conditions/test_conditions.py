@@ -22,6 +22,7 @@ from safe_envs.wrappers import (
     SCBF,
     SRCBF,
     SZCBF,
+    SafetyFilter,
     parse_condition,
     parse_conditions,
     spec_of,
@@ -162,20 +163,58 @@ def test_single_numbers_do_for_one_rate():
     assert ECBF(poles=-2.0) == ECBF((2.0,))
 
 
-def test_barriers_with_kinks_are_refused_where_the_chain_meets_them():
-    x, u = sp.symbols("x u", real=True)
-    y = sp.Symbol("y", real=True)
+def test_a_minimum_has_a_constraint_for_each_piece():
+    x, u, y = sp.symbols("x u y", real=True)
     noisy = ControlAffineSDE((x,), (u,), [0], [1], [1])
-    for h in (1 - sp.Abs(x), sp.Min(1 - x, 1 + x)):
-        CBF(1.0).constraint(noisy, Barrier(h))
-        for condition in (SCBF(), SRCBF(), CBF(1.0, sampling_margin="first-order")):
-            with pytest.raises(SystemDefinitionError, match="cannot be differentiated"):
-                condition.constraint(noisy, Barrier(h))
-    chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
-    with pytest.raises(
-        SystemDefinitionError, match="cannot be differentiated as often as is needed"
-    ):
-        HOCBF((1.0, 1.0)).constraint(chain, Barrier(1 - sp.Abs(x)))
+    chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1])
+    early = CBF(1.0, sampling_margin="first-order")
+    for h in (1 - sp.Abs(x), sp.Min(1 - x, 1 + x), sp.Piecewise((1 - x, x > 0), (1 + x, True))):
+        for condition in (CBF(1.0), RCBF(), SCBF(), SRCBF(), early, HOCBF((1.0, 1.0))):
+            system = chain if isinstance(condition, HOCBF) else noisy
+            with pytest.raises(SystemDefinitionError, match="one barrier for each of its pieces"):
+                condition.constraint(system, Barrier(h))
+            parts = condition.parts(Barrier(h))
+            assert {part.expression for part in parts} == {1 - x, 1 + x}
+            for part in parts:
+                condition.constraint(system, part)
+
+
+STEP, V = sp.Heaviside(X - 0.9) / 2, sp.Symbol("v", real=True)
+
+
+@pytest.mark.parametrize(
+    ("rate", "condition", "message"),
+    [
+        (V + STEP, HOCBF((2.0, 2.0)), r"drift of x = .* may jump where 10\*x - 9 = 0"),
+        (V + STEP, ECBF(poles=(-1.0, -2.0)), r"drift of x = .* may jump"),
+        (V + STEP, SZCBF((1.0, 1.0)), r"drift of x = .* may jump"),
+        (V + STEP, SCBF(), r"drift of x = .* may jump"),
+        (V + sp.Piecewise((0, X < 0.9), (0.5, True)), HOCBF((2.0, 2.0)), r"drift of x .* may jump"),
+        (V + sp.floor(X), HOCBF((2.0, 2.0)), r"drift of x = .* may jump by floor\(x\)"),
+        (V + 2 * sp.Abs(V), HOCBF((2.0, 2.0)), r"drift of x = .* may have a kink where v = 0"),
+        # States only pass these.
+        (V + sp.Abs(X - 0.9), HOCBF((2.0, 2.0)), None),
+        (V + sp.tanh(200 * (X - 0.9)), HOCBF((2.0, 2.0)), None),
+    ],
+)
+def test_a_drift_that_the_chain_differentiates_does_not_jump(rate, condition, message):
+    u = sp.Symbol("u", real=True)
+    system = ControlAffineSDE((X, V), (u,), [rate, -sp.sign(V)], [0, 1])
+    if message is None:
+        assert condition.constraint(system, Barrier(1 - X)).offset != 0
+        return
+    with pytest.raises(SystemDefinitionError, match=message):
+        condition.constraint(system, Barrier(1 - X))
+
+
+def test_where_only_the_constraint_jumps_its_slope_is_not_taken():
+    u = sp.Symbol("u", real=True)
+    for step in (STEP, sp.Piecewise((0, X < 0.9), (0.5, True))):
+        system = ControlAffineSDE((X,), (u,), [step], [1])
+        SafetyFilter(system, 1 - X, "cbf", (-1, 1))
+        for text in ("cbf:sampling_margin=first-order", "cbf:measurement_error=0.1"):
+            with pytest.raises(SystemDefinitionError, match=r"the drift of x = .* may jump"):
+                SafetyFilter(system, 1 - X, text, (-1, 1), dt=0.1, region=[(-2, 2)])
 
 
 @pytest.mark.parametrize(
@@ -184,6 +223,7 @@ def test_barriers_with_kinks_are_refused_where_the_chain_meets_them():
         (sp.Piecewise((1 - X, X > 0), (1 + X, True)), 0),
         (sp.Piecewise((1 - X**2, X > 0), (1, True)), 1),
         (sp.Piecewise((1, X < 2), (1 - (X - 2) ** 4, X < 3), (12 - 4 * X, True)), 1),
+        (sp.Piecewise((1 - X**3 * (X + 2), X > 0), (1, True)), 2),
         (1 - sp.Piecewise((X**4, X > 0), (0, True)), 3),
         (sp.Piecewise((1 - X, X > 0), (2 + X, True)), -1),
         (sp.Piecewise((1 - X, X**3 + X > 0), (1 + X, True)), -1),
@@ -194,14 +234,16 @@ def test_pieces_of_a_barrier_have_to_meet_as_smoothly_as_the_chain_differentiate
     u, y = sp.symbols("u y", real=True)
     noisy = ControlAffineSDE((X,), (u,), [0], [1], [1])
     chain = ControlAffineSDE((X, y), (u,), [y, 0], [0, 1], [0, 1])
+    shaken = ControlAffineSDE((X, y), (u,), [y, 0], [0, 1], [1, 0])
     needs = [
-        (CBF(1.0), noisy, 0),
-        (RCBF(), noisy, 0),
+        (CBF(1.0), noisy, 1),
+        (RCBF(), noisy, 1),
         (CBF(1.0, sampling_margin="first-order"), noisy, 1),
         (HOCBF((1.0, 1.0)), chain, 1),
         (SCBF(), noisy, 1),
         (SRCBF(), noisy, 1),
-        (SZCBF((1.0, 1.0)), chain, 3),
+        (SZCBF((1.0, 1.0)), chain, 1),
+        (SZCBF((1.0, 1.0)), shaken, 3),
         (SCBF(sampling_margin="first-order"), noisy, 3),
     ]
     for condition, system, order in needs:

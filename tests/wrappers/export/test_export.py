@@ -240,6 +240,20 @@ def test_formulas(name: str, tmp_path: Path) -> None:
 
 
 @NEEDS_COMPILER
+def test_minima_and_maxima(tmp_path: Path) -> None:
+    system = ControlAffineSDE((x, y), (u, w), [-y / 5, x / 10], [[1, 0], [0, 1]])
+    disks = sp.Max(1 - (x - 0.9) ** 2 - y**2, 1 - (x + 0.9) ** 2 - y**2, -1 - x)
+    barriers = [sp.Min(disks, 2 - sp.Abs(x)), 3 - x - y]
+    safety_filter = SafetyFilter(system, barriers, CBF(1.0), (-5, 5))
+    interface = export_filter(safety_filter, tmp_path)
+    assert interface.barriers == ("h_1_1", "h_1_2", "h_1_3", "h_2")
+    found = compare(tmp_path, safety_filter, states=3000)
+    assert_equal(found)
+    assert found.infeasible > 0
+    assert "0 differences" in run_selftest(tmp_path)
+
+
+@NEEDS_COMPILER
 def test_states_without_a_finite_constraint(tmp_path: Path) -> None:
     system = ControlAffineSDE((x,), (u,), [sp.log(x)], [1 / (x - 1)], [0])
     safety_filter = SafetyFilter(system, [2 - x], CBF(1.0), (-5, 5))

@@ -306,6 +306,20 @@ CASES: dict[str, tuple[int, list[tuple[Any, Any]], dict[str, Any]]] = {
         ],
         {},
     ),
+    "minimum": (1, [(sp.Min(CURVED, STEEP), CBF(1.0)), (SLANTED, CBF(2.0, **EARLY))], {}),
+    "reciprocal minimum": (2, [(sp.Min(ROUND, TILTED), RCBF(1.0)), (ACROSS, CBF(0.5))], {}),
+    "maximum": (1, [(sp.Max(CURVED, SLANTED), CBF(1.0))], {}),
+    "maximum in a plane": (
+        2,
+        [(TILTED, CBF(2.0, **EARLY)), (sp.Max(ROUND, ACROSS, -x), CBF(1.0))],
+        {"weights": (5.0, 0.2)},
+    ),
+    "maxima on three": (
+        3,
+        [(sp.Min(sp.Max(ROUND, -z), TILTED + z), CBF(1.0)), (sp.Max(CURVED, z), CBF(0.5))],
+        {},
+    ),
+    "goal of a maximum": (1, [(sp.Max(CURVED, SLANTED), CBF(1.0))], {"clf": CLF((x - 3) ** 2)}),
     "learned": (1, [(CURVED, Corrected(1.0, learned=ONE))], {}),
     "several learned": (
         1,

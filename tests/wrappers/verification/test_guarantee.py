@@ -273,6 +273,17 @@ def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
     assert made(problem, "srcbf", samples=512).analysis.runaway is not kept
 
 
+def test_equal_formulas_are_the_same_model():
+    one = sp.sin(x) ** 2 + sp.cos(x) ** 2
+    problem = problem_with([x], [1 - x**2], noise=(0.3,))
+    same, other = (
+        replace(problem, model=replace(problem.model, drift=[f], diffusion=[s]))
+        for f, s in ((x * one, -0.3), (x * one + 1e-9, 0.4))
+    )
+    assert made_bound(same, "szcbf").note is None
+    assert made_bound(other, "szcbf").note == "the model differs from the plant in drift, diffusion"
+
+
 def test_a_kink_has_no_bound_under_noise():
     barrier = sp.Piecewise((1 - x**2, x > 0), (1 - 2 * x**2, True))
     bound = made_bound(problem_with([0 * x], [barrier], noise=(1.0,)))

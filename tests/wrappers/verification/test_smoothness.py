@@ -63,6 +63,29 @@ def test_only_what_is_in_the_safe_set_counts(barrier, note):
     )
 
 
+@pytest.mark.parametrize(
+    "near",
+    [
+        1 / sp.sqrt(x**2 + 1e-6),
+        sp.sqrt(sp.cosh(2 * x) - sp.Float("0.99999999")),
+        1 / (sp.Float("1.0000001") - sp.sin(x)),
+    ],
+)
+def test_what_comes_near_a_pole_or_kink_only_is_left_to_the_judge(near):
+    found = made_bound(problem_with([0 * x], [1 - x**2 + near / 1000], noise=(0.3,)), "szcbf")
+    assert (found.note, found.proof.regular) == (None, True)
+
+
+def test_what_is_near_a_kink_and_not_judged_is_not_established():
+    near = sp.sqrt(sp.cosh(2 * x) - sp.Float("0.99999999"))
+    problem = problem_with([0 * x], [1 - x**2 + near / 1000], noise=(0.3,))
+    rough = made(problem, "szcbf", samples=512).analysis.rough
+    start = "it is not established that h_1 is twice differentiable, which Ito's formula asks for,"
+    assert rough.startswith(f"{start} near x = ")
+    square = problem_with([0 * x], [1 - x**2 - sp.Abs(x) ** 3], noise=(0.3,))
+    assert "differentiable" not in (made_bound(square, "szcbf").note or "")
+
+
 def test_without_noise_a_kink_is_no_matter_and_a_pole_is():
     kink = problem_with(
         [(x**2 + 1e-4) ** sp.Rational(1, 4) * (1 - x) ** sp.Rational(3, 2)], [1 - x**2]
