@@ -214,7 +214,7 @@ def test_actions_that_are_none_are_errors(action):
         ({"plant": {"v": math.inf}}, "parameter v"),
         ({"barrier": {"radius": -1.0}}, "radius"),
         ({"barrier": {"raduis": 1.0}}, "no barrier argument 'raduis'; did you mean 'radius'"),
-        ({"nois": 1.0}, "no argument 'nois'; did you mean 'noise'"),
+        ({"nois": 1.0}, "unexpected keyword argument 'nois'; did you mean 'noise'"),
         ({"dt": 0.0}, "dt = 0"),
         ({"dt": math.nan}, "dt = nan"),
         ({"horizon": 0.01}, "horizon = 0.01"),
