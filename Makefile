@@ -25,7 +25,7 @@ test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not oracle and not cluster"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
 oracle: $(READY)
 	$(BIN)/python -m pytest -n 2 -m oracle

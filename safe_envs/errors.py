@@ -28,6 +28,14 @@ class ConfigurationError(SafeEnvsError, ValueError):
     """An argument names something unknown or has a value outside its range."""
 
 
+class UnknownArgumentError(ConfigurationError, TypeError):
+    """A keyword argument is unknown.
+
+    It is a TypeError in Python's words too: libraries that try arguments on any env, as TorchRL
+    does with `frameskip`, leave out those that are refused so.
+    """
+
+
 class NotCompilableError(ConfigurationError):
     """Something is asked of the compiled engine that only the NumPy engine can do."""
 
@@ -75,6 +83,18 @@ def unknown(what: str, name: Any, allowed: Iterable[str]) -> ConfigurationError:
         allowed: names.
     """
     return ConfigurationError(f"unknown {what} {shown(name)}; {nearest(str(name), allowed)}")
+
+
+def unexpected_argument(owner: str, name: str, advice: str) -> UnknownArgumentError:
+    """Return the error of a keyword argument that nobody knows.
+
+    Args:
+        owner: what does not have it.
+        name: of the argument.
+        advice: what helps, such as the nearest names.
+    """
+    complaint = f"{owner} got an unexpected keyword argument {shown(name)}"
+    return UnknownArgumentError(f"{complaint}; {advice}")
 
 
 def install_extra(extra: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 from pathlib import Path
 
 # Before NumPy and torch are imported, and for processes that tests start: on small matrices,
@@ -30,6 +31,24 @@ hypothesis.settings.register_profile(
     "project", derandomize=True, database=None, deadline=None, print_blob=False
 )
 hypothesis.settings.load_profile("project")
+
+
+OWN_TARGETS = ("oracle", "cluster", "docs")
+"""Marks of tests that `make` runs by targets of their own."""
+
+
+def selection(marks: str) -> str:
+    """Return what to select by -m: of the marks with targets of their own those that it names."""
+    left_out = [f"not {mark}" for mark in OWN_TARGETS if not re.search(rf"\b{mark}\b", marks)]
+    return " and ".join([f"({marks})"] * bool(marks) + left_out)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Leave out tests with targets of their own, whatever else -m selects.
+
+    An -m in `addopts` would be replaced by that of the command line.
+    """
+    config.option.markexpr = selection(config.option.markexpr)
 
 
 @pytest.fixture(params=safe_envs.ENV_IDS, ids=lambda env_id: env_id.split("/")[1])

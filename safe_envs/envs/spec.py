@@ -88,10 +88,21 @@ class SystemSpec(EnvSpec):
 
 
 class OwnSpec:
-    """Base of envs whose spec tells the length of their own episodes, `_limit` periods."""
+    """Base of envs whose spec tells the length of their own episodes, `_limit` periods.
+
+    Gymnasium's class is among the direct bases of each subclass: skrl looks no further.
+    """
 
     _spec: EnvSpec | None = None
     _limit: int
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        for kind in (gym.Env, gym.vector.VectorEnv):
+            if issubclass(cls, kind) and kind not in cls.__bases__:
+                bases = list(cls.__bases__)
+                last = max(i for i, base in enumerate(bases) if issubclass(base, kind))
+                cls.__bases__ = (*bases[: last + 1], kind, *bases[last + 1 :])  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def spec(self) -> EnvSpec | None:

@@ -248,7 +248,7 @@ class SafeVectorEnv(VectorInterface):
         if not self.episodes.started:
             raise _without_state()
         due = self.episodes.due()
-        if due is not None and self._autoreset == AutoresetMode.DISABLED:
+        if due is not None and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
                 f"the episodes of envs {np.flatnonzero(due)[:5].tolist()} have ended: reset them"
             )
@@ -265,7 +265,7 @@ class SafeVectorEnv(VectorInterface):
             terminated = terminated | (info["violation"] & ~episodes.begun)
         ended = terminated | truncated
         last: Info = {}
-        if self._autoreset == AutoresetMode.SAME_STEP:
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = last_of_episode(ended, observation, info)
                 episodes.keep_last(self.state, self.measured)

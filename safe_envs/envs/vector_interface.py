@@ -28,6 +28,7 @@ class VectorInterface(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     Attributes:
         problem: that is simulated.
+        autoreset_mode: when ended episodes restart, as of Gymnasium's Sync- and AsyncVectorEnv.
         viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
@@ -51,13 +52,13 @@ class VectorInterface(  # pyright: ignore[reportIncompatibleVariableOverride]
     ) -> None:
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
-        self._autoreset = _mode(autoreset_mode)
+        self.autoreset_mode = _mode(autoreset_mode)
         self._limit = steps_until(problem, max_episode_steps)
         self.problem, self.num_envs = problem, num_envs
         self.metadata = {
             "render_modes": [*RENDER_MODES[1:]],
             "render_fps": frames_a_second(problem),
-            "autoreset_mode": self._autoreset,
+            "autoreset_mode": self.autoreset_mode,
         }
         self.single_observation_space = observation_box(problem)
         self.single_action_space = action_box(problem)

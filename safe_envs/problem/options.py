@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
 
-from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.errors import ConfigurationError, nearest, shown, unexpected_argument
 from safe_envs.number_text import finite_number, named_values, numbers
 from safe_envs.problem.measurement_text import read_items
 from safe_envs.problem.option_errors import refused_noise
@@ -166,14 +166,22 @@ class ProblemOptions:
             The options, with all arguments of the barrier under `barrier`.
 
         Raises:
-            ConfigurationError: An argument is unknown or of the wrong kind.
+            UnknownArgumentError: There is no such argument.
+            ConfigurationError: An argument is of the wrong kind, or the barrier does not have it.
         """
         apart = {name: value for name, value in arguments.items() if name in of_barrier}
         options = {name: value for name, value in arguments.items() if name not in of_barrier}
-        _require_known(f"{title} has no argument", options, (*OPTION_NAMES, *of_barrier))
+        for name in options:
+            if name not in OPTION_NAMES:
+                allowed = (*OPTION_NAMES, *of_barrier)
+                raise unexpected_argument(title, name, nearest(name, allowed))
         found = cls(**options)
         barrier = {**(found.barrier or {}), **apart}
-        _require_known(f"{title} has no barrier argument", barrier, of_barrier)
+        for name in barrier:
+            if name not in of_barrier:
+                raise ConfigurationError(
+                    f"{title} has no barrier argument {shown(name)}; {nearest(name, of_barrier)}"
+                )
         return replace(found, barrier=barrier)
 
     @property
@@ -198,12 +206,6 @@ WHOLE_OPTIONS: dict[str, int] = {
 
 PARAMETER_GROUPS = ("plant", "model", "barrier")
 """The options that are values by name."""
-
-
-def _require_known(complaint: str, given: Mapping[str, Any], allowed: Collection[str]) -> None:
-    for name in given:
-        if name not in allowed:
-            raise ConfigurationError(f"{complaint} {shown(name)}; {nearest(name, allowed)}")
 
 
 def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[str, float]:

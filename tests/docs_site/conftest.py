@@ -25,7 +25,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.fixture(scope="session")
 def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the site."""
-    given = request.config.getoption("--site")
+    # pytest knows the option where this folder is named on the command line.
+    given = request.config.getoption("--site", default=None)
     if given:
         folder = Path(given).resolve()
         assert (folder / "index.html").is_file(), f"{folder} holds no site; run `make docs`"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import pickle
 
@@ -14,6 +15,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.dynamics.philox import StreamReader
 from safe_envs.envs.simulation import Simulation
+from safe_envs.registry import env_class
 from safe_envs.systems.stochastic_dubins import StochasticDubins
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
@@ -50,6 +52,7 @@ def test_specs_round_trip(env_id, wrapped):
         other = gym.make(copy)
         assert str(other) == str(env)
         assert other.unwrapped.problem == env.unwrapped.problem
+        env.action_space.seed(3)
         first, again = env.reset(seed=3), other.reset(seed=3)
         np.testing.assert_array_equal(first[0], again[0])
         action = env.action_space.sample()
@@ -214,7 +217,7 @@ def test_actions_that_are_none_are_errors(action):
         ({"plant": {"v": math.inf}}, "parameter v"),
         ({"barrier": {"radius": -1.0}}, "radius"),
         ({"barrier": {"raduis": 1.0}}, "no barrier argument 'raduis'; did you mean 'radius'"),
-        ({"nois": 1.0}, "no argument 'nois'; did you mean 'noise'"),
+        ({"nois": 1.0}, "unexpected keyword argument 'nois'; did you mean 'noise'"),
         ({"dt": 0.0}, "dt = 0"),
         ({"dt": math.nan}, "dt = nan"),
         ({"horizon": 0.01}, "horizon = 0.01"),
@@ -271,8 +274,8 @@ def test_steps_before_a_reset_are_errors():
 
 
 def test_classes_are_documented(env_id):
-    text = type(gym.make(env_id).unwrapped).__doc__
-    assert text is not None
+    # Python 3.13 takes the indentation from `__doc__` itself.
+    text = inspect.getdoc(env_class(env_id)) or ""
     for heading in (
         "Equations",
         "States",
@@ -286,7 +289,7 @@ def test_classes_are_documented(env_id):
         "Arguments",
         "Source",
     ):
-        assert f"    ## {heading}\n" in text
+        assert f"\n## {heading}\n" in text
 
 
 def test_a_problem_is_stated_once_for_the_same_arguments():

@@ -144,12 +144,12 @@ def test_factory_arguments_may_stand_by_themselves_or_in_barrier(make, env_id, a
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_obstacle": 3}, "no argument 'num_obstacle'; did you mean 'num_obstacles'"),
+        ({"num_obstacle": 3}, "argument 'num_obstacle'; did you mean 'num_obstacles'"),
         (
             {"barrier": {"num_obstacle": 3}},
             "no barrier argument 'num_obstacle'; did you mean 'num_obstacles'",
         ),
-        ({"tilt": 0.2}, "no argument 'tilt'"),
+        ({"tilt": 0.2}, "keyword argument 'tilt'"),
     ],
 )
 def test_unknown_factory_arguments_are_refused(arguments, message):

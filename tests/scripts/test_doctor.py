@@ -130,6 +130,16 @@ def test_what_is_missing_says_how_to_install_it(monkeypatch):
     assert found["numpy"].found == "1.0"
 
 
+def test_a_folder_on_the_path_is_named(monkeypatch):
+    def requires(package):
+        raise PackageNotFoundError(package)
+
+    monkeypatch.setattr(installation, "requires", requires)
+    check = list(installation.packages())[-1]
+    assert (check.name, check.ok) == ("safe-envs", False)
+    assert "pip install" in check.advice
+
+
 def test_speeds_are_of_single_envs(monkeypatch):
     monkeypatch.setattr(benchmark_cases, "NUM_ENVS", 8)
     found = installation.speeds()

@@ -6,7 +6,6 @@ import hashlib
 import json
 import platform
 from functools import cache
-from importlib.metadata import version
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.package_version import package_version
 
 _PACKAGES = (
     "safe-envs",
@@ -41,8 +41,8 @@ def _versions() -> dict[str, str]:
     """Read the versions once: each is in a file of its own."""
     return {
         "python": platform.python_version(),
-        **{package: version(package) for package in _PACKAGES},
-        **{package: version(package) for package in _OPTIONAL if find_spec(package)},
+        **{package: package_version(package) for package in _PACKAGES},
+        **{package: package_version(package) for package in _OPTIONAL if find_spec(package)},
     }
 
 

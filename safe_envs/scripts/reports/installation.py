@@ -9,7 +9,7 @@ import timeit
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, requires, version  # noqa: TID251
 from importlib.util import find_spec
 
 import gymnasium as gym
@@ -48,7 +48,13 @@ def packages() -> Iterator[Check]:
     """Check Python, the required packages, and the optional ones with their extras."""
     version_ok = sys.version_info >= (3, 11)
     yield Check("python", version_ok, platform.python_version(), "Python 3.11 or newer is needed")
-    for package, extra in required():
+    try:
+        needed = required()
+    except PackageNotFoundError:
+        advice = "pip install --editable . in a checkout"
+        yield Check("safe-envs", False, "on the path, but not installed", advice)
+        return
+    for package, extra in needed:
         if package == "pygame-ce" and (wrong := _other_pygame()):
             yield wrong
             continue

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, InvalidInputError, nearest
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, unexpected_argument
 from safe_envs.number_text import finite_number
 from safe_envs.object_import import load_object
 from safe_envs.problem.barrier import Barrier
@@ -127,16 +127,20 @@ class FilterSpec:
             degree_of(self.model, barrier.expression)
 
     @classmethod
+    def refuse_unknown(cls, names: Iterable[str]) -> None:
+        """Raise UnknownArgumentError for a name that no wrapper takes."""
+        allowed = [f.name for f in fields(cls) if f.name != "filter"]
+        for name in names:
+            if name not in allowed:
+                raise unexpected_argument("the filter", name, nearest(name, allowed))
+
+    @classmethod
     def of(cls, view: dict[str, Any]) -> FilterSpec:
         """Return a spec from arguments by name.
 
         Raises:
-            ConfigurationError: a name is unknown, or one that is needed is missing.
+            ConfigurationError: one that is needed is missing.
         """
-        names = [f.name for f in fields(cls) if f.name != "filter"]
-        for name in view:
-            if name not in names:
-                raise ConfigurationError(f"unknown argument {name!r}; {nearest(name, names)}")
         missing = [name for name in ("model", "barriers", "state_fn") if name not in view]
         if missing:
             raise ConfigurationError(

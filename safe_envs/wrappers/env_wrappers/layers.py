@@ -208,8 +208,10 @@ def third_party_spec(
         knowledge: what the filter is to know.
 
     Raises:
+        UnknownArgumentError: There is no such field.
         ConfigurationError: The env is this project's, or anything but the model is to be known.
     """
+    FilterSpec.refuse_unknown(view)
     if isinstance(env, ours):
         raise ConfigurationError(
             f"{', '.join(view)}: only for third-party envs; {env} has a model and barriers of its"

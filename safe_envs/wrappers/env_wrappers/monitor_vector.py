@@ -44,7 +44,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
         doubt_layers(env)
         self.watch(spec, _one_of(env), env.single_action_space, "arrays", self.num_envs)
-        self._mode = autoreset_mode(env)
+        self.autoreset_mode = autoreset_mode(env)
         self.executed: Components = ()
         self._x: Components = ()
         self.episodes = Episodes(self.num_envs)
@@ -97,7 +97,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         observation, reward, terminated, truncated, info = self.env.step(actions)
         ended, episodes = terminated | truncated, self.episodes
         episodes.steps += 1
-        if self._mode == AutoresetMode.SAME_STEP:
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
             shown = self._of_same_step(observation, ended, info)
             episodes.begun = ended
         else:

@@ -75,7 +75,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             self.single_observation_space = self.observation_box(env.single_observation_space)
             self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._rest = rest_info(inner.problem)
-        self._mode = env.metadata["autoreset_mode"]
+        self.autoreset_mode = env.metadata["autoreset_mode"]
         self._stepper = self._compiled() if env is inner else None
         self._counted = _Counted(self.num_envs) if self._stepper is None else self._stepper
 
@@ -139,7 +139,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         added = self._decided(decision, active) | self._reported(reached=True)
         begun = self._inner.episodes.begun
         if np.count_nonzero(begun):
-            if self._mode == AutoresetMode.SAME_STEP:
+            if self.autoreset_mode == AutoresetMode.SAME_STEP:
                 last = {key: value.copy() for key, value in added.items()}
                 info["final_info"].update(with_masks(last, begun))
                 self._observe_last(info, begun)
@@ -159,7 +159,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def _with_last(self, now: Sequence[Any], last: Sequence[Any]) -> Sequence[Any]:
         """Return components of now, with others in envs whose episodes ended in this step."""
         begun = self._inner.episodes.begun
-        if self._mode != AutoresetMode.SAME_STEP or not np.count_nonzero(begun):
+        if self.autoreset_mode != AutoresetMode.SAME_STEP or not np.count_nonzero(begun):
             return now
         return tuple([np.where(begun, old, c) for old, c in zip(last, now, strict=True)])
 

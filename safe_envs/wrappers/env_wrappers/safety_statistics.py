@@ -97,7 +97,7 @@ class RecordSafetyStatisticsVector(IndependentCopies, gym.wrappers.vector.Record
     def __init__(
         self, env: gym.vector.VectorEnv, buffer_length: int = 100, stats_key: str = "episode"
     ) -> None:
-        self._mode = autoreset_mode(env)
+        self.autoreset_mode = autoreset_mode(env)
         super().__init__(env, buffer_length, _OWN)
         self._key = stats_key
         self.cost_queue: deque[float] = deque(maxlen=buffer_length)
@@ -125,7 +125,7 @@ class RecordSafetyStatisticsVector(IndependentCopies, gym.wrappers.vector.Record
         observation, reward, terminated, truncated, info = super().step(actions)
         ended = terminated | truncated
         if ended.any():
-            same_step = self._mode == AutoresetMode.SAME_STEP
+            same_step = self.autoreset_mode == AutoresetMode.SAME_STEP
             last = info["final_info"] if same_step else info
             added = {key: np.where(ended, v, 0.0) for key, v in _of_episode(last, self.env).items()}
             self.cost_queue.extend(added["c"][ended].tolist())

@@ -47,7 +47,7 @@ class SpecificationMonitorVector(IndependentCopies, gym.vector.VectorWrapper):
         self._inner = readable(env)
         problem = with_regions(self._inner.problem, regions)
         self.tracker = SpecificationTracker(problem, specification, self.num_envs)
-        self._same_step = env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+        self.autoreset_mode = env.metadata["autoreset_mode"]
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -66,7 +66,7 @@ class SpecificationMonitorVector(IndependentCopies, gym.vector.VectorWrapper):
         x, episodes = self._inner.components, self._inner.episodes
         begun = episodes.begun
         restarted = bool(np.count_nonzero(begun))
-        if restarted and self._same_step:
+        if restarted and self.autoreset_mode == AutoresetMode.SAME_STEP:
             last = np.where(begun[:, None], episodes.last_states, np.stack(x, axis=-1))
             self.tracker.advance(tuple(last.T))
             info["final_info"].update(with_masks(self.tracker.report(), begun))

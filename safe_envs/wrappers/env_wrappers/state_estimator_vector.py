@@ -44,7 +44,7 @@ class StateEstimatorVectorWrapper(EstimatorLayer, gym.vector.VectorWrapper):
         if self._sees_estimate:
             self.single_observation_space = self._box
             self.observation_space = batch_space(self._box, env.num_envs)
-        self._mode = env.metadata["autoreset_mode"]
+        self.autoreset_mode = env.metadata["autoreset_mode"]
         self.last_states = np.empty((env.num_envs, 0))
         self.last_covariance: Sequence[Any] = ()
 
@@ -86,7 +86,7 @@ class StateEstimatorVectorWrapper(EstimatorLayer, gym.vector.VectorWrapper):
         observation, reward, terminated, truncated, info = found
         world, begun = self._measured_env, self.episodes.begun
         restarts = np.count_nonzero(begun) > 0
-        same_step = restarts and self._mode == AutoresetMode.SAME_STEP
+        same_step = restarts and self.autoreset_mode == AutoresetMode.SAME_STEP
         sample = world.measured
         if same_step:
             sample = merged(begun, self.episodes.last_sample, sample)

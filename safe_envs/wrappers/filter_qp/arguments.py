@@ -11,7 +11,13 @@ import sympy as sp
 
 from safe_envs.dynamics.declarations import declared_sign
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    SystemDefinitionError,
+    nearest,
+    shown,
+    unexpected_argument,
+)
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.clf import CLF
@@ -194,7 +200,7 @@ def _no_condition(given: Any) -> ConfigurationError:
 
 
 def refuse_unknown(given: Iterable[str], known: Callable[..., Any]) -> None:
-    """Raise ConfigurationError for arguments that something does not have.
+    """Raise UnknownArgumentError for arguments that something does not have.
 
     Args:
         given: their names.
@@ -202,10 +208,8 @@ def refuse_unknown(given: Iterable[str], known: Callable[..., Any]) -> None:
     """
     for name in given:
         allowed = list(inspect.signature(known).parameters)[1:-1]
-        raise ConfigurationError(
-            f"a filter has no argument {name!r};"
-            f" {'input bounds are bounds=...' if name == 'box' else nearest(name, allowed)}"
-        )
+        advice = "input bounds are bounds=..." if name == "box" else nearest(name, allowed)
+        raise unexpected_argument("SafetyFilter", name, advice)
 
 
 def require_goal(clf: Any, weights: Any) -> None:

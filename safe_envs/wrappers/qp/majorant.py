@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.wrappers.qp.rounding import added
+
 _TINY = 1e-300
 """A distance that can divide."""
 
@@ -35,17 +37,17 @@ def majorant(
     roots = []
     for corner in corners:
         w = (1.0, *corner)
-        square: Any = sum([q[i][j] * (w[i] * w[j]) for i in range(m + 1) for j in range(m + 1)])
+        square: Any = added([q[i][j] * (w[i] * w[j]) for i in range(m + 1) for j in range(m + 1)])
         roots.append(np.sqrt(np.maximum(square, 0.0)))
     half = 2.0 ** (m - 1)
     # An input that is held, its two bounds being equal, has two equal faces and no slope.
     slopes = [
-        sum([r if k >> j & 1 else -r for k, r in enumerate(roots)])
+        added([r if k >> j & 1 else -r for k, r in enumerate(roots)])
         / (half * np.maximum(high[j] - low[j], _TINY))
         for j in range(m)
     ]
     above = [
-        r - sum([c * e for c, e in zip(slopes, corner, strict=True)])
+        r - added([c * e for c, e in zip(slopes, corner, strict=True)])
         for r, corner in zip(roots, corners, strict=True)
     ]
     return slopes, np.maximum.reduce(above)

@@ -15,13 +15,22 @@ divided among the components that are free.
 from __future__ import annotations
 
 import sys
+from operator import mul
 from typing import Any
 
 import numpy as np
 
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 from safe_envs.wrappers.qp.kernels.two_inputs import project_two_inputs
-from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, tolerance, tolerances
+from safe_envs.wrappers.qp.rounding import (
+    ROUNDING,
+    Arrays,
+    Entries,
+    Floats,
+    added,
+    tolerance,
+    tolerances,
+)
 
 _EXCESS = 1e3
 """A constraint that holds with so many times its rounding to spare is not on the nearest action:
@@ -60,17 +69,13 @@ def project_floats(
             return [u1, u2], margin, active, True
     v = u
     u = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
-    margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
+    margin = b + added(map(mul, a, u))
     if margin >= 0.0:
         return u, margin, False, True
     u, ways = _follow_multiplier(a, b, v, low, high, w)
-    margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
+    margin, allowed = b + added(map(mul, a, u)), tolerance(a, b, u)
     for _ in range(_CORRECTIONS):
-        slope = (
-            0.0
-            if -allowed <= margin <= allowed
-            else sum([aj * way for aj, way in zip(a, ways, strict=True)])
-        )
+        slope = 0.0 if -allowed <= margin <= allowed else added(map(mul, a, ways))
         if not slope > 0.0:
             break
         step = margin / slope
@@ -79,7 +84,7 @@ def project_floats(
             for uj, way, lo, hi in zip(u, ways, low, high, strict=True)
         ]
         margin, allowed = (
-            b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]),
+            b + added(map(mul, a, u)),
             tolerance(a, b, u),
         )
     return u, margin, True, margin >= -allowed
@@ -107,17 +112,13 @@ def _follow_multiplier(
         ]
 
     kink, phi = max(
-        [
-            (k, p)
-            for k in (0.0, *enter, *leave)
-            if (p := b + sum([aj * uj for aj, uj in zip(a, inputs(k), strict=True)])) < 0.0
-        ],
+        [(k, p) for k in (0.0, *enter, *leave) if (p := b + added(map(mul, a, inputs(k)))) < 0.0],
         default=(0.0, -0.0),
     )
     # Where a component is so far off that it enters and leaves at the same multiplier, up to
     # rounding, it is free there.
     ways = [dj if s != f and (e <= kink < x or e == kink == x) else 0.0 for s, f, dj, e, x in parts]
-    slope = sum([aj * way for aj, way in zip(a, ways, strict=True)])
+    slope = added(map(mul, a, ways))
     if not slope > 0.0:
         return far, ways
     step = phi / slope

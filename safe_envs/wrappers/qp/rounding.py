@@ -15,7 +15,9 @@ all constraints in this sense.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -36,6 +38,18 @@ ArrayAnswer = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.nda
 """Inputs (m), margins and binding constraints (k), and whether all constraints can be met."""
 
 
+def added(terms: Iterable[Any]) -> Any:
+    """Return the sum of floats or arrays, added in order.
+
+    From Python 3.12 on `sum` corrects the rounding of floats, which NumPy and compiled programs do
+    not: a state by itself would have another result than in a batch.
+
+    Args:
+        terms: the floats or arrays.
+    """
+    return reduce(add, terms, 0.0)
+
+
 def tolerance(a: Floats, b: float, u: Floats) -> float:
     """Return by how much a constraint may be violated at m inputs and count as met.
 
@@ -45,7 +59,7 @@ def tolerance(a: Floats, b: float, u: Floats) -> float:
         u: m inputs.
     """
     # Each term is scaled by itself, so that their sum does not overflow.
-    return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
+    return ROUNDING * abs(b) + added([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
 
 
 def tolerances(a: Entries | np.ndarray, b: Any, u: Entries | np.ndarray) -> Any:

@@ -9,11 +9,11 @@ import os
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from importlib.metadata import version
 from pathlib import Path
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.file_locks import locked
+from safe_envs.package_version import package_version
 from safe_envs.user_cache import cache_folder
 from safe_envs.wrappers.value.closed_loop import ClosedLoop, ClosedLoopTable
 from safe_envs.wrappers.value.closed_loop_files import (
@@ -98,7 +98,7 @@ def is_any_at_hand() -> bool:
 
 def _key(loop: ClosedLoop, grid: Grid) -> str:
     """Return the name of a table; another version of the package may compute another one."""
-    described = [FORMAT, version("safe-envs"), loop.fingerprint(), list(grid.shape)]
+    described = [FORMAT, package_version(), loop.fingerprint(), list(grid.shape)]
     return hashlib.sha256(json.dumps(described).encode()).hexdigest()
 
 

@@ -8,12 +8,12 @@ import logging
 import os
 import time
 from contextlib import ExitStack, suppress
-from importlib.metadata import version
 from pathlib import Path
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.file_locks import locked
+from safe_envs.package_version import package_version
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.user_cache import cache_folder
 from safe_envs.wrappers.value.reduction import reduced
@@ -144,7 +144,7 @@ def _of_file(
 
 def _key(fingerprint: str, settings: ValueSettings) -> str:
     """Return the name of a table; another version of the package may compute another one."""
-    described = [FORMAT, version("safe-envs"), fingerprint, settings.as_dict()]
+    described = [FORMAT, package_version(), fingerprint, settings.as_dict()]
     return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 

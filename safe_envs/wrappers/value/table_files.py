@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from safe_envs.array_files import checksum, reading, write_arrays
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT
 from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.package_version import package_version
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.automaton_building import MOST_STATES
 from safe_envs.wrappers.value.grid import Axis, Grid
@@ -71,7 +71,7 @@ def save_table(table: ValueTable, path: Path | str) -> None:
         "first": int(table.first),
         "sizes": {"instants": len(table.lower), "cells": list(grid.shape)},
         "seconds": float(table.seconds),
-        "version": version("safe-envs"),
+        "version": package_version(),
     }
     header["sha256"] = checksum(header, arrays)
     write_arrays(path, header, arrays, MOST_BYTES_OF_TABLE - MOST_BYTES_OF_TEXT)

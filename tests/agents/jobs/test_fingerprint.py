@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+import safe_envs
 from safe_envs.agents.jobs import fingerprint
 from safe_envs.agents.jobs.fingerprint import json_checksum, package_versions, source_checksum
 
@@ -43,3 +45,11 @@ def test_versions_are_those_of_all_that_results_depend_on():
     assert {"python", "numpy", "safe-envs", "torch"} <= set(found)
     found.clear()
     assert package_versions()
+
+
+def test_a_folder_that_is_only_on_the_path_has_no_version(monkeypatch: pytest.MonkeyPatch):
+    def version(package: str) -> str:
+        raise metadata.PackageNotFoundError(package)
+
+    monkeypatch.setattr(metadata, "version", version)
+    assert fingerprint._versions.__wrapped__()["safe-envs"] == safe_envs.__version__ == "0+unknown"

@@ -56,6 +56,7 @@ def asked(monkeypatch):
 def test_states_are_read_off_observations(env_id):
     problem = make_problem(env_id)
     env = SafeVectorEnv(problem, 16)
+    env.action_space.seed(3)
     observation, _ = env.reset(seed=3)
     for _ in range(3):
         observation, *_ = env.step(env.action_space.sample())

@@ -45,6 +45,7 @@ def test_info_has_every_key_with_one_type_at_reset_and_at_each_step(env_id, filt
         natural = env.unwrapped.problem.filter
         env, vector = SafetyFilterWrapper(env, natural), SafetyFilterVectorWrapper(vector, natural)
     env.action_space.seed(0)
+    vector.action_space.seed(0)
     infos = [env.reset(seed=0)[1]] + [env.step(env.action_space.sample())[4] for _ in range(5)]
     for info in infos:
         assert {key: type(value) for key, value in info.items()} == contract

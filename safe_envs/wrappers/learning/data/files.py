@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from safe_envs import array_files
 from safe_envs.array_files import ArrayFile, reading, write_arrays
 from safe_envs.errors import shortened, shown
+from safe_envs.package_version import package_version
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.values import LearnedFileError, require_text
 
@@ -80,7 +80,7 @@ def save(
         "kind": kind,
         "signature": asdict(signature),
         "details": dict(details),
-        "versions": {package: version(package) for package in _PACKAGES},
+        "versions": {package: package_version(package) for package in _PACKAGES},
         "sha256": checksum(kind, signature, details, arrays),
     }
     write_arrays(path, header, arrays)
