@@ -15,6 +15,9 @@ from typing import SupportsFloat
 _MOST_PLACES = 9
 """Of a percentage."""
 
+_FINEST = 18
+"""Places of a percentage that tell any two floats apart that are not next to each other."""
+
 Number = SupportsFloat | Rational
 
 
@@ -70,6 +73,19 @@ def percents_between(lower: Number, upper: Number, places: int = 1) -> tuple[str
     return f"{rounded(low, digits, up=False):f}", f"{rounded(high, digits, up=True):f}"
 
 
+def percents_apart(upper: Number, lower: Number) -> tuple[str, str]:
+    """Return an upper bound and a lower one above it in per cent, with digits that tell them apart.
+
+    Args:
+        upper: in [0, 1], rounded up.
+        lower: in [0, 1], rounded down.
+    """
+    high, low = 100 * _exact(upper), 100 * _exact(lower)
+    pairs = [(rounded(high, d, up=True), rounded(low, d, up=False)) for d in range(1, _FINEST)]
+    most, least = next((pair for pair in pairs if pair[0] < pair[1]), pairs[-1])
+    return f"{most:f}", f"{least:f}"
+
+
 def number_at_most(value: Number, digits: int = 4) -> str:
     """Return an upper bound, rounded up; "infinite" for infinity.
 
@@ -91,8 +107,8 @@ def number_at_least(value: Number, digits: int = 4) -> str:
 
 
 def _significant(value: Number, digits: int, *, up: bool) -> str:
-    if math.isinf(float(value)):
-        return "infinite" if float(value) > 0.0 else "-infinite"
+    if not math.isfinite(float(value)):
+        return "infinite" if float(value) == math.inf else str(float(value))
     exact = _exact(value)
     if not exact:
         return "0"

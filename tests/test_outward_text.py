@@ -14,6 +14,7 @@ from safe_envs.outward_text import (
     number_at_most,
     percent_at_least,
     percent_at_most,
+    percents_apart,
     percents_between,
 )
 
@@ -53,13 +54,22 @@ def test_no_digit_says_more_than_two_bounds(one, other):
     assert 100 * Fraction(repr(upper)) <= high
 
 
-@given(st.floats(-1e300, 1e300), st.integers(1, 15))
+@given(st.floats(-1e300, 1e300, allow_subnormal=False), st.integers(1, 15))
 def test_no_digit_says_more_than_a_number(value, digits):
     low, high = number_at_least(value, digits), number_at_most(value, digits)
     assert Fraction(low) <= Fraction(repr(value)) <= Fraction(high)
-    if value and 1e-290 < abs(value):
+    if value and abs(value) > 1e-290:
         spacing = Fraction(10) ** (math.floor(math.log10(abs(value))) + 2 - digits)
         assert Fraction(high) - Fraction(low) <= spacing
+
+
+@given(SHARES, SHARES)
+def test_bounds_that_contradict_each_other_are_told_apart(one, other):
+    upper, lower = sorted((one, other))
+    most, least = (Fraction(text) for text in percents_apart(upper, lower))
+    assert 100 * Fraction(repr(upper)) <= most
+    assert least <= 100 * Fraction(repr(lower))
+    assert most < least or lower - upper < 1e-15
 
 
 def test_numbers_have_as_many_digits_as_are_asked_for():

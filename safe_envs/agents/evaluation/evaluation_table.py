@@ -13,6 +13,7 @@ from safe_envs.agents.evaluation.evaluation_data import EvaluationData, FilterTi
 from safe_envs.agents.evaluation.rate_text import percent, percent_in, points_in
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.outward_text import percent_at_most
 from safe_envs.text_lines import visible
 from safe_envs.text_tables import Column, FittedTable, arranged, without_empty
 from safe_envs.wrappers.estimation.consistency import Consistency
@@ -173,7 +174,7 @@ def _outside(found: EstimationSummary | None) -> str:
 def _unsafe_at_most(found: EstimationSummary | None) -> str:
     if found is None or found.unsafe_at_most is None:
         return _NONE
-    return f"{percent(found.unsafe_at_most)} {found.bound_word}"
+    return f"{percent_at_most(found.unsafe_at_most)} % {found.bound_word}"
 
 
 def _timing(rows: Sequence[FilterTiming]) -> list[Column]:

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.comparison import pair_counts
-from safe_envs.agents.evaluation.contradiction import continuous_judged
+from safe_envs.agents.evaluation.contradiction import continuous_judged, upper_ends_of
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
-from safe_envs.agents.evaluation.yardstick import sure_high
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 
@@ -155,7 +154,7 @@ def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
     """
     for evaluation in finer:
         finer_row = evaluation.row(row.filter)
-        row = continuous_judged(row, finer_row.ci_high, sure_high(finer_row))
+        row = continuous_judged(row, *upper_ends_of(finer_row, evaluation.spec.confidence))
     return row
 
 

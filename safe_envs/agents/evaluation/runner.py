@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.bound_averages import BoundAverager
 from safe_envs.agents.evaluation.closed_loop_bound import compute_closed_loop
 from safe_envs.agents.evaluation.comparison import compare_all
-from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.contradiction import judged, upper_ends_of
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
 from safe_envs.agents.evaluation.evaluation_data import FilterTiming, Timing
@@ -28,7 +28,7 @@ from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.evaluation.views import View, views_of
 from safe_envs.agents.evaluation.work_parts import WorkParts
-from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained, sure_high
+from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained
 
 
 class EvaluationRunner:
@@ -181,7 +181,7 @@ class EvaluationRunner:
             **vars(pooled(summaries, spec.confidence)),
             **vars(together(bounds)),
         )
-        return judged(row, row.ci_high, sure_high(row))
+        return judged(row, *upper_ends_of(row, spec.confidence))
 
     def _timing(
         self, view: View, totals: Sequence[EpisodeStatistics], player: Player, seconds: float

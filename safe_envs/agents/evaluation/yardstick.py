@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from safe_envs.agents.evaluation.attainable import (
-    SURE,
     AttainableSafety,
     attainable_safety,
     contradicted,
@@ -33,7 +32,6 @@ from safe_envs.agents.evaluation.contradiction import Bounded, above_attainable,
 from safe_envs.agents.evaluation.countings import leaves_safely
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
-from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
@@ -135,17 +133,6 @@ def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> Attai
     """
     judging = [r for r in rows if r.learning is None or r.learning.repeats == 1]
     return contradicted(best, [(row.filter, row.safe, row.episodes) for row in judging])
-
-
-def sure_high(row: EvaluationRow) -> float:
-    """Return the upper end of the interval of a row's rate that a proved bound is held against.
-
-    Args:
-        row: of an evaluation; over several identifications its own interval is all there is.
-    """
-    if row.learning is not None and row.learning.repeats > 1:
-        return row.ci_high
-    return rate_interval(row.safe, row.episodes, SURE)[1]
 
 
 def chained(

@@ -10,7 +10,7 @@ from typing import Any
 
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, listed
-from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.statistics import exact_interval
 from safe_envs.agents.evaluation.work_parts import WorkParts
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, optimal_tilt
@@ -181,7 +181,7 @@ class _Estimator:
         power, pilot_steps = splitting.choose(self.particles, work.part())
         found = splitting.estimate(power, self.particles, self.repetitions, work.part())
         paths = found.paths
-        low, high = rate_interval(found.first, paths.lowest.size, spec.confidence)
+        low, high = exact_interval(found.first, paths.lowest.size, spec.confidence)
         plain = PlainEpisodes(
             paths.lowest.size, found.first, low, high, paths.outside, paths.kept_length
         )

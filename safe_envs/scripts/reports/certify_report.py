@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,12 @@ from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
+from safe_envs.outward_text import (
+    number_at_least,
+    number_at_most,
+    percent_at_least,
+    percent_at_most,
+)
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
@@ -113,7 +120,7 @@ def print_certification(console: Console, answer: CertifyAnswer) -> None:
             str(a.members),
             percent(c.program if c else None),
             percent(c.mean if c else None),
-            "-" if j is None else "undecided" if j.numbers.reason else percent(j.mean),
+            proved_cell(j and j.mean, j.numbers.reason if j else ""),
             f"{c.bound.rate:g}" if c else "-",
             f"{j.numbers.boxes:,}" if j else "-",
             f"{a.seconds + (j.seconds if j else 0.0):.1f}",
@@ -132,21 +139,11 @@ def _result_lines(answer: CertifyAnswer) -> list[str]:
     found, certificate = answer.found, answer.found.certificate
     if certificate is None:
         return ["No bound above 0 is proved."]
-    a, m, c, horizon = (
-        f"{float(v):.6g}"
-        for v in (
-            certificate.rate,
-            certificate.shortfall,
-            certificate.supremum,
-            certificate.horizon,
-        )
-    )
-    margin = "" if found.starts == 1 else f" - {100 * found.margin:.2g} %"
-    of = "from the start" if found.starts == 1 else f"mean over {found.starts:,} starts"
+    numbers = (certificate.rate, certificate.shortfall, certificate.supremum)
+    a, m, c = (number_at_most(v, 6) for v in numbers)
     lines = [
-        f"Proved: P(safe for {horizon} s, or until the workspace is left) >="
-        f" {percent(found.mean)}{margin}, {of}"
-        + ("" if found.starts == 1 else "; the margin of the mean is one at 99.99 %"),
+        f"Proved: P(safe for {number_at_least(certificate.horizon, 6)} s, or until the workspace is"
+        f" left) {proved_mean(found.mean, found.margin, found.starts)}",
         f"psi of degree {certificate.psi.degree}, a = {a} 1/s, m = {m} 1/s, c = {c};"
         f" found and proved in {found.seconds:.3g} s",
     ]
@@ -159,14 +156,43 @@ def _result_lines(answer: CertifyAnswer) -> list[str]:
         )
     if answer.upper is not None:
         lines.append(
-            f"No policy is safer than {percent(answer.upper)} with the env's own held input"
-            " (computed; another claim than this one, of continuous control)"
+            f"No policy is safer than {percent_at_most(answer.upper)} % with the env's own held"
+            " input (computed; another claim than this one, of continuous control)"
         )
     lines.append(
         "Note: the bound is of continuous control; the env holds its input for"
         f" {answer.problem.dt:g} s."
     )
     return lines
+
+
+def proved_cell(mean: float | None, reason: str) -> str:
+    """Return the bound of a degree as the cell of a table.
+
+    Args:
+        mean: of the bound; None where the judge was not asked.
+        reason: why it is undecided; "" where it is proved.
+    """
+    if mean is None:
+        return "-"
+    return "undecided" if reason else f"{percent_at_least(mean)} %"
+
+
+def proved_mean(mean: float, margin: float, starts: int) -> str:
+    """Return ">=" and a proved bound, as one number, and what it is of.
+
+    Args:
+        mean: of the bound over the starts.
+        margin: by which the mean over all starts may be lower, at 99.99 % confidence.
+        starts: how many there are; 1 where none is drawn.
+    """
+    if starts == 1:
+        return f">= {percent_at_least(mean)} %, from the start"
+    least = max(Decimal(repr(mean)) - Decimal(repr(margin)), Decimal(0))
+    return (
+        f">= {percent_at_least(least)} %, mean over the starts: that over {starts:,} drawn ones,"
+        f" less {percent_at_most(margin)} %, at 99.99 % confidence"
+    )
 
 
 def say_written(console: Console, out: Path | None) -> None:

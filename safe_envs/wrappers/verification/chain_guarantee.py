@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from safe_envs.outward_text import number_at_most
 from safe_envs.wrappers.verification import bounds
 from safe_envs.wrappers.verification.assumptions import (
     JOINT,
@@ -265,7 +266,9 @@ class ChainGuarantee:
             else of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
         )
         if any(stages.shortfalls):
-            name = f"repaired for the shortfall m = {max(stages.shortfalls):.4g}, up to T"
+            name = (
+                f"repaired for the shortfall m = {number_at_most(max(stages.shortfalls))}, up to T"
+            )
             values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
             found.append(Candidate(name, values, allows_shortfall=True))
         return found

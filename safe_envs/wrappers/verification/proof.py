@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
+from safe_envs.outward_text import number_at_most
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.verification.assumptions import JOINT
 from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.certificate_statements import rounded_up
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.input_terms import (
     exact_number,
@@ -261,11 +261,15 @@ class ChainProof:
             ("the barrier is twice differentiable on G", self.smooth),
         ]
         if not certain:
-            found += [(f"{n.name} <= {_shown(n.value)}", n.verdict) for n in self.suprema]
+            found += [
+                (f"{n.name} <= {number_at_most(n.value, _SHOWN)}", n.verdict) for n in self.suprema
+            ]
         found.append(("the condition can be met everywhere on G", self.feasible))
         if self.feasible.word != "proved":
             number = self.shortfall
-            amount = f" by at most {_shown(number.value)}" * math.isfinite(number.value)
+            amount = f" by at most {number_at_most(number.value, _SHOWN)}" * math.isfinite(
+                number.value
+            )
             found.append((f"the best input violates it{amount}", number.verdict))
         return found
 
@@ -284,8 +288,3 @@ class ChainProof:
                 if verdict.word == word:
                     return word, verdict.reason
         return "proved", ""
-
-
-def _shown(value: float) -> str:
-    """Return a proved upper bound in few digits, not below it."""
-    return f"{float(rounded_up(value, _SHOWN)) if math.isfinite(value) else value:.{_SHOWN}g}"

@@ -12,7 +12,7 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import attainable, yardstick
 from safe_envs.agents.evaluation.attainable import AttainableSafety, attainable_safety
 from safe_envs.agents.evaluation.countings import leaves_safely
-from safe_envs.agents.evaluation.greedy_episodes import simulate
+from safe_envs.agents.evaluation.greedy_episodes import SimulatedRate, simulate
 from safe_envs.agents.evaluation.yardstick import (
     TimesUnavoidable,
     best_at_hand,
@@ -103,6 +103,22 @@ def test_bounds_that_the_greedy_policy_contradicts_are_withheld(lower, upper, wh
     assert where in judged.contradiction
     assert (judged.lower is None) == (judged.upper is None) == bool(where)
     assert bool(judged.contradiction) == bool(where)
+
+
+@pytest.mark.parametrize(("safe", "lower", "kept"), [(999, 0.99999, True), (990, 0.99999, False)])
+def test_a_single_violation_contradicts_no_lower_bound(safe, lower, kept):
+    rate = SimulatedRate(
+        safe=safe,
+        episodes=1000,
+        rate=safe / 1000,
+        low=0.0,
+        high=1.0,
+        confidence=0.95,
+        leave_rate=0.0,
+        seed=0,
+    )
+    judged = attainable.judged(replace(made_up(lower, 1.0), simulated=rate))
+    assert (judged.lower == lower) == kept
 
 
 def test_bounds_that_a_row_exceeds_are_withheld():

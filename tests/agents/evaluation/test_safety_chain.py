@@ -105,9 +105,7 @@ def test_a_bound_above_the_interval_is_withheld(chain_of):
 def test_a_bound_above_what_is_attainable_withholds_the_table(chain_of, word, left):
     found = chain_of(held=held_of(0.8, word), best=attainable(0.1, 0.7))
     assert found.best.upper is None
-    assert found.best.contradiction.startswith(
-        "scbf: the bound for held input, 80.0000 %, is above"
-    )
+    assert found.best.contradiction.startswith("scbf: the bound for held input, 80.0 %, is above")
     assert found.bounds.held_bound == left
 
 
