@@ -133,7 +133,7 @@ def refine(
         "filters": first.spec.filters or [row.filter for row in first.rows],
         "bounds": False,
         "best": False,
-        "closed_loop": None,
+        "closed_loop": False,
         "learned": first.learned,
     }
     finer = [

@@ -28,7 +28,7 @@ from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.evaluation.views import View, views_of
 from safe_envs.agents.evaluation.work_parts import WorkParts
-from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained
+from safe_envs.agents.evaluation.yardstick import best_for, chained
 
 
 class EvaluationRunner:
@@ -109,14 +109,8 @@ class EvaluationRunner:
         )
 
     def _best(self) -> AttainableSafety | None:
-        """Return how safe any policy can be, if it is asked for or known already."""
-        resolved = self._resolved
-        if self._spec.best:
-            return best_for(resolved.truth, self._work.part())
-        third_party = resolved.target.filter_spec is not None
-        if self._spec.best is False or third_party or self._spec.monitoring == "continuous":
-            return None
-        return best_at_hand(resolved.truth)
+        """Return how safe any policy can be, if it is asked for."""
+        return best_for(self._resolved.truth, self._work.part()) if self._spec.best else None
 
     def _bounded(self, view: View) -> list[FilteredPolicy]:
         """Return what the bounds of a filter are of, for each identification."""

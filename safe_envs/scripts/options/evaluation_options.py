@@ -129,24 +129,23 @@ Refine = Annotated[
     ),
 ]
 Best = Annotated[
-    bool | None,
+    bool,
     typer.Option(
         "--best/--no-best",
         help=(
             "Compute the best attainable safety, and how many times the unavoidable violations each"
-            " filter has. By default they are shown if a table is in the cache."
+            " filter has."
         ),
         show_default=False,
     ),
 ]
 ClosedLoop = Annotated[
-    bool | None,
+    bool,
     typer.Option(
         "--closed-loop/--no-closed-loop",
         help=(
             "Compute a certified lower bound for each filter whose controller has a formula, by"
-            " tables of closed loops: up to two states, about a minute each. By default those"
-            " in the cache are read."
+            " tables of closed loops: up to two states, about a minute each."
         ),
         show_default=False,
     ),

@@ -16,6 +16,7 @@ from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.outward_text import number_at_most, percents_between
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.quantities import size_text
 from safe_envs.scripts.reports.tables import print_rows
 
 _COUNTED = {
@@ -127,9 +128,5 @@ def _grid_lines(found: AttainableSafety) -> list[str]:
     return [
         f"Coordinates: {'; '.join(found.coordinates)}",
         f"Grid: {count} cells, {found.inputs} inputs, {found.steps} steps; computed in"
-        f" {found.seconds:.3g} s, table of {_bytes(found.memory)}",
+        f" {found.seconds:.3g} s, table of {size_text(found.memory)}",
     ]
-
-
-def _bytes(count: int) -> str:
-    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"

@@ -13,7 +13,6 @@ from rich.text import Text
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.errors import ConfigurationError
 from safe_envs.outward_text import (
     number_at_least,
     number_at_most,
@@ -25,10 +24,6 @@ from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.synthesis.certify import Certification
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.starts import start_values
-from safe_envs.wrappers.value.table_cache import table_at_hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +35,7 @@ class CertifyAnswer:
         config: what was asked for, as JSON.
         problem: of the env.
         found: the certificate, and what was tried.
-        upper: of the best attainable safety of the env's step; None where no table of it is kept.
+        upper: of the best attainable safety of the env's step; None where it was not asked for.
         out: file of the certificate, if one was asked for.
     """
 
@@ -83,19 +78,6 @@ class CertifyAnswer:
             "seconds": found.seconds,
             "file": None if self.out is None or found.certificate is None else str(self.out),
         }
-
-
-def attainable_upper(problem: SafetyProblem) -> float | None:
-    """Return how safe any policy can be at most, if `best` has computed it; see `table_at_hand`.
-
-    Args:
-        problem: of the env.
-    """
-    try:
-        table = table_at_hand(problem, ValueSettings(leaving="safe"))
-        return table and start_values(LookAhead(table, problem), problem).upper
-    except ConfigurationError:  # No grid takes the problem.
-        return None
 
 
 def print_certification(console: Console, answer: CertifyAnswer) -> None:
