@@ -168,7 +168,8 @@ Rare = Annotated[
 Particles = Annotated[
     int | None,
     typer.Option(
-        show_default="250", help="With --rare, in place of --episodes: episodes of a repetition."
+        show_default="250 to 4000, as many as make the repetitions differ little",
+        help="With --rare, in place of --episodes: episodes of a repetition.",
     ),
 ]
 Repetitions = Annotated[
