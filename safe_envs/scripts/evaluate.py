@@ -133,7 +133,7 @@ def _evaluate(
     with progress_bar("Evaluating") as progress:
         run: Any = refinement.refine if refine else evaluate.evaluate
         found = run(problem, policy, progress=progress, **arguments)
-    first = found.evaluations[0] if refine else found
+    first = found.given if refine else found
     print_evaluation(stdout(), first, timing)
     if refine:
         print_refinement(stdout(), found)

@@ -125,7 +125,8 @@ Confidence = Annotated[
 Refine = Annotated[
     bool,
     typer.Option(
-        "--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged."
+        "--refine",
+        help="Repeat with dt/2 and dt/4, and extrapolate the safety rate to dt -> 0.",
     ),
 ]
 Best = Annotated[
