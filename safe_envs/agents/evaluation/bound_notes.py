@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from safe_envs.agents.evaluation.held_input import NO_FILTER
 from safe_envs.agents.evaluation.promise_notes import computed_notes
 from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
-from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.wrappers.conditions.text_parts import name_by_itself, names_promise
 
 CHAIN = "bound, held input <= safe <= attainable is a chain: all three are of the env's own steps."
@@ -37,7 +36,7 @@ def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
     Args:
         rows: of the evaluation.
     """
-    filtered = [row for row in rows if row.filter != UNFILTERED]
+    filtered = [row for row in rows if row.kind == "filter"]
     known = [row for row in filtered if row.learning is None]
     none = (row for row in rows if row.held_bound is None)
     # That there is no filter needs no saying, but why its table of a closed loop is missing does.

@@ -170,6 +170,7 @@ class EvaluationRunner:
         row = EvaluationRow(
             filter=view.name,
             policy=policy,
+            kind=view.kind,
             learning=learning,
             estimation=view.estimation([each.estimation for each in totals], spec.confidence),
             **vars(pooled(summaries, spec.confidence)),

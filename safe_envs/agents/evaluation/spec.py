@@ -18,6 +18,7 @@ from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition, FilterSpec, spec_of
+from safe_envs.wrappers.conditions.names import AT_STATE
 from safe_envs.wrappers.learning import LearnedModel
 
 UNFILTERED = "none"
@@ -264,6 +265,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError
+
+
+def is_unfiltered(filter_text: str) -> bool:
+    """Return whether the text of a filter is that of none, at the true state or at an estimate."""
+    return filter_text.removesuffix(AT_STATE) == UNFILTERED
 
 
 def listed(filters: Sequence[Filter] | Filter | None) -> Sequence[Filter] | None:

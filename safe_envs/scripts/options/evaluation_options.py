@@ -129,6 +129,14 @@ Refine = Annotated[
         help="Repeat with dt/2 and dt/4, and extrapolate the safety rate to dt -> 0.",
     ),
 ]
+Bounds = Annotated[
+    bool,
+    typer.Option(
+        "--bounds/--no-bounds",
+        help="Look for bounds of the safety, which takes some seconds for each filter.",
+        show_default=False,
+    ),
+]
 Best = Annotated[
     bool,
     typer.Option(

@@ -56,7 +56,7 @@ class CertifyAnswer:
             degrees.append(
                 {
                     "degree": a.degree,
-                    "coeffi\u00adcients": a.members,
+                    "coefficients": a.members,
                     "program": c and c.program,
                     "sampled": c and c.mean,
                     "proved": j and (None if j.numbers.reason else j.mean),
