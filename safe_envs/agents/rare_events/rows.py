@@ -43,7 +43,7 @@ class RareEstimate:
             estimates: of the repetitions.
             confidence: of the interval.
         """
-        low, high = log_normal_interval(estimates, confidence)
+        low, high = skewed_interval(estimates, confidence)
         p = math.fsum(estimates) / len(estimates)
         error = float(np.std(estimates, ddof=1)) / math.sqrt(len(estimates)) / p
         return cls(method, p, low, min(high, 1.0), error, estimates.tolist())
@@ -120,6 +120,32 @@ class RareRow:
     def as_dict(self) -> dict[str, Any]:
         """Return the row as JSON-able data."""
         return asdict(self) | {"estimates": list(self.estimates)}
+
+
+def skewed_interval(estimates: np.ndarray, confidence: float) -> tuple[float, float]:
+    """Return an interval for the mean of positive estimates, of which the largest are the rarest.
+
+    It is that for nearly normal logarithms, see
+    `safe_envs.agents.evaluation.statistics.log_normal_interval`. Some estimates are more skewed
+    than that, on the side on which a probability is taken for too small: the upper end is that of
+    Johnson's interval where this is larger, which has the third moment in place of a distribution.
+
+    Args:
+        estimates: of the repetitions, shape (R,).
+        confidence: of the two-sided interval.
+
+    Source: N. J. Johnson, Modified t tests and confidence intervals for asymmetrical populations,
+        Journal of the American Statistical Association 73 (1978) 536-544.
+    """
+    from scipy.special import stdtrit
+
+    low, high = log_normal_interval(estimates, confidence)
+    count, mean = len(estimates), float(np.mean(estimates))
+    deviation = float(np.std(estimates, ddof=1))
+    spread = float(np.std(estimates))
+    skew = float(np.mean((estimates - mean) ** 3)) / spread**3 if spread else 0.0
+    t = float(stdtrit(count - 1, 0.5 + confidence / 2.0)) / math.sqrt(count)
+    return low, max(high, mean + deviation * (t + skew * (1.0 / (6.0 * count) + t**2 / 3.0)))
 
 
 def doubt_of(found: RareEstimate, check: RareEstimate | None, plain: PlainEpisodes) -> str | None:

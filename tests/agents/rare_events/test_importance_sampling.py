@@ -18,7 +18,12 @@ from safe_envs.agents.rare_events.importance_sampling import (
     log_ratio,
     optimal_tilt,
 )
-from safe_envs.agents.rare_events.rows import PlainEpisodes, RareEstimate, doubt_of
+from safe_envs.agents.rare_events.rows import (
+    PlainEpisodes,
+    RareEstimate,
+    doubt_of,
+    skewed_interval,
+)
 from safe_envs.agents.rare_events.splitting import Splitting
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from tests.agents.rare_events.conftest import paths_of
@@ -175,3 +180,24 @@ FEW_SEEN = PlainEpisodes(5000, 5, 4e-4, 2e-3)
 def test_what_contradicts_an_estimate(found, check, plain, doubt):
     told = doubt_of(found, check, plain)
     assert (told is None) if doubt is None else (doubt in told)
+
+
+def test_an_interval_of_skewed_estimates_reaches_further_up():
+    even = np.array([0.9, 1.0, 1.1] * 7)
+    assert skewed_interval(even, 0.95) == log_normal_interval(even)
+    skewed = np.array([1.0] * 19 + [3.0])
+    (low, high), (coxs_low, coxs_high) = skewed_interval(skewed, 0.95), log_normal_interval(skewed)
+    assert (low, high > coxs_high) == (coxs_low, True)
+    assert skewed_interval(np.array([2.0, 2.0]), 0.95) == (2.0, 2.0)
+
+
+@pytest.mark.parametrize("skew", [0.0, 1.0])
+def test_an_interval_of_skewed_estimates_covers(skew):
+    # Sums of log-normal numbers and of rarer, larger ones: of mean 1 and a deviation of .3.
+    rng = np.random.default_rng(0)
+    parts = np.exp(0.25 * rng.standard_normal((2000, 20)) - 0.25**2 / 2)
+    rare = 1.0 * (rng.random(parts.shape) < 0.03)
+    estimates = (parts + skew * rare) / (1.0 + 0.03 * skew)
+    ends = [skewed_interval(each, 0.95) for each in estimates]
+    covered = np.mean([low < 1.0 < high for low, high in ends])
+    assert covered > 0.935
