@@ -44,7 +44,7 @@ _EXTREMES: dict[Any, Any] = {
     sp.Max: sp.Function("_largest", real=True),
     sp.Min: sp.Function("_smallest", real=True),
 }
-"""What stands for them while common parts are looked for."""
+"""Functions in their place while common parts are looked for."""
 
 
 class Arithmetic(Protocol):

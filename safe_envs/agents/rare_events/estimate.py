@@ -208,19 +208,16 @@ class _Estimator:
         spec, steps = self.resolved.spec, pilot.run.paths.steps
         seen, levels, check = pilot.run, pilot.run.levels[pilot.part], None
         best, drift_steps = self._by_drift(pilot, particles, chosen)
-        steps += drift_steps
+        size, steps = self._first, steps + drift_steps
         if best is None:
-            splitting = Splitting(chosen.player, spec.seed)
-            seen = splitting.estimate(pilot.power, particles, self.repetitions, self.work.part())
+            size, splitting = particles, Splitting(chosen.player, spec.seed)
+            seen = splitting.estimate(pilot.power, size, self.repetitions, self.work.part())
             levels, steps = seen.levels, steps + seen.paths.steps
-        plain = _plain(seen, spec.confidence)
-        nothing = replace(
-            nothing, levels=float(levels.mean()), steps=steps, plain=plain, particles=particles
-        )
+        plain, mean = _plain(seen, spec.confidence), float(levels.mean())
+        nothing = replace(nothing, levels=mean, steps=steps, plain=plain, particles=size)
         by = f"splitting on h{'/sqrt(T - t)' * (pilot.power != POWERS[0])}"
         if best is not None:
             check = RareEstimate.of(by, pilot.estimates, spec.confidence)
-            nothing = replace(nothing, particles=self._first)
         elif seen.stuck or seen.endless:
             return replace(nothing, reason=_why_none(seen, particles, self.resolved.problem, plain))
         else:
@@ -252,7 +249,7 @@ class _Estimator:
         length, deviation = optimal_tilt(
             *pilot.run.violating(pilot.part), self.resolved.problem.duration
         )
-        predicted = pilot.spread * math.sqrt(pilot.particles / particles)
+        predicted = pilot.deviation * math.sqrt(pilot.particles / particles)
         worth = _BETTER * deviation / math.sqrt(self._first) < predicted
         if deviation > _MOST_DEVIATION or not worth:
             return None, 0

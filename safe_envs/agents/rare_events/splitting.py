@@ -239,7 +239,7 @@ class Pilot:
         return self.run.estimates[self.part]
 
     @property
-    def spread(self) -> float:
+    def deviation(self) -> float:
         """Standard deviation of the logarithms of the estimates that were not given up."""
         found = self.estimates[self.estimates > 0.0]
         return float(np.std(np.log(found), ddof=1)) if len(found) > 1 else 0.0
@@ -249,5 +249,5 @@ class Pilot:
         lost = np.count_nonzero(self.estimates == 0.0)
         if self.often or 2 * lost > len(self.part):
             return self.particles  # Where hardly any repetition gets there, more do not either.
-        times = (self.spread / TARGET) ** 2
+        times = (self.deviation / TARGET) ** 2
         return math.ceil(self.particles * min(max(times, 4.0 if lost else 1.0), _MOST_TIMES))
