@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import stat
+import time
 
 import pytest
 
 from safe_envs import user_cache
-from safe_envs.user_cache import VARIABLE, cache_folder
+from safe_envs.user_cache import CONTENTS, VARIABLE, cache_folder, entries, make_room, own_cache
 
 
 def test_places_of_the_cache(tmp_path, monkeypatch):
@@ -36,3 +37,50 @@ def test_a_folder_that_others_write_to_is_not_trusted(tmp_path, monkeypatch):
     folder.chmod(0o700)
     tmp_path.chmod(0o777)
     assert cache_folder("values") is None
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """An entry in each folder, the later the folder the later used, and files of others."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    folders = {name: cache_folder(name) for name in CONTENTS}
+    for i, (name, folder) in enumerate(folders.items()):
+        if name == "compiled":
+            (folder / ("0" * 32)).mkdir()
+            (folder / ("0" * 32) / "program.py").write_bytes(b"x" * 10)
+            place = folder / ("0" * 32)
+        else:
+            place = folder / f"{'0' * 64}.{'json' if name == 'attainable' else 'npz'}"
+            place.write_bytes(b"x" * 10)
+        os.utime(place, (i, i))
+        (folder / "mine.npz").write_bytes(b"x" * 1000)
+    return folders
+
+
+def test_what_was_used_last_remains(cache):
+    names = list(CONTENTS)
+    make_room(25)
+    assert [name for name in names if entries(name)] == names[-2:]
+    make_room(5)
+    assert [name for name in names if entries(name)] == names[-1:]
+    assert all((folder / "mine.npz").exists() for folder in cache.values())
+
+
+def test_what_killed_processes_left_goes_after_a_day(cache):
+    old, new = (cache["values"] / f".{digit * 40}.abc.npz" for digit in "01")
+    for place, age in ((old, 90_000), (new, 60)):
+        place.touch()
+        os.utime(place, (time.time() - age, time.time() - age))
+    make_room()
+    assert (old.exists(), new.exists()) == (False, True)
+    assert all(entries(name) for name in CONTENTS)
+
+
+def test_a_cache_of_its_own_has_compiled_programs_alone(cache):
+    with own_cache():
+        assert [name for name in CONTENTS if entries(name)] == ["compiled"]
+        table = cache_folder("values") / f"{'1' * 64}.npz"
+        table.touch()
+        assert entries("values")
+    assert os.environ[VARIABLE] == str(cache["values"].parent)
+    assert [each.place.name[0] for each in entries("values")] == ["0"]

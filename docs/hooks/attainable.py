@@ -11,10 +11,11 @@ that no grid serves. Entries of other envs remain.
 from __future__ import annotations
 
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Any
+
+from safe_envs.outward_text import percents_between
 
 KEPT = Path(__file__).resolve().parents[1] / "assets" / "attainable.json"
 
@@ -67,12 +68,9 @@ def _line(name: str, entry: dict[str, Any]) -> str:
     elif entry["upper"] - entry["lower"] >= 1.0 - _NEAR:
         bounds = "0 (grid too coarse) | 1 (grid too coarse)"
     else:
-        bounds = " | ".join(_outwards(entry["lower"], entry["upper"]))
+        ends = percents_between(entry["lower"], entry["upper"], 2)
+        bounds = " | ".join(f"{end} %" for end in ends)
     return f"| {_link(name)} | {bounds} | {rate:.1f} % [{low:.1f}, {high:.1f}] | {by} |"
-
-
-def _outwards(lower: float, upper: float) -> tuple[str, str]:
-    return f"{math.floor(1e4 * lower) / 100:.2f} %", f"{math.ceil(1e4 * upper) / 100:.2f} %"
 
 
 def _grid_line(name: str, entry: dict[str, Any]) -> str:

@@ -11,10 +11,8 @@ import base64
 import contextlib
 import hashlib
 import json
-import os
 import platform
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import distributions
 from importlib.util import find_spec
@@ -22,12 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.atomic_io import write_atomically
-from safe_envs.user_cache import VARIABLE, cache_folder
+from safe_envs.user_cache import own_cache
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / ".docs_cache"
 
-_COMPILED = "compiled"
 _BYTES = "base64:"
 
 _used: set[Path] = set()
@@ -48,7 +45,7 @@ def cached(subject: Any, make: Callable[[], Any]) -> Any:
     _used.add(path)
     with contextlib.suppress(OSError, ValueError):
         return json.loads(path.read_text(), object_hook=_decoded)
-    with _own_tables():
+    with own_cache():
         found = make()
     # Code that was edited meanwhile may have been imported before or after the edit.
     if code_checksum() == _checksum_at_start():
@@ -92,23 +89,6 @@ def _packages() -> list[str]:
         platform.machine(),
         *sorted(f"{each.name} {each.version}" for each in distributions()),
     ]
-
-
-@contextlib.contextmanager
-def _own_tables() -> Iterator[None]:
-    """Use an empty cache but for compiled programs, on which no number depends."""
-    compiled, before = cache_folder(_COMPILED), os.environ.get(VARIABLE)
-    with tempfile.TemporaryDirectory() as folder:
-        if compiled is not None:
-            (Path(folder) / _COMPILED).symlink_to(compiled)
-        os.environ[VARIABLE] = folder
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ[VARIABLE]
-            else:
-                os.environ[VARIABLE] = before
 
 
 def _encoded(value: bytes) -> dict[str, str]:

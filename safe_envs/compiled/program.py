@@ -6,7 +6,6 @@ import hashlib
 import importlib.util
 import inspect
 import logging
-import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -17,16 +16,19 @@ from typing import Any
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.compiled import plain_natives
-from safe_envs.compiled.cache import DIGITS, FOLDER, forget_old_programs
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.linker import linked
 from safe_envs.errors import ConfigurationError, NotCompilableError, install_extra, shortened
-from safe_envs.user_cache import cache_folder
+from safe_envs.user_cache import cache_folder, make_room, mark_used
 
 ADVICE = f"{install_extra('fast')}, or use the engine 'numpy'"
 
 _LOG = logging.getLogger("safe_envs")
 _FILE = "program.py"
+_DIGITS = 32
+
+FOLDER = "compiled"
+"""Name of the folder of programs in the user's cache."""
 
 Functions = dict[str, Callable[..., Any]]
 """Entry points by name."""
@@ -85,12 +87,12 @@ def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
 def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     natives = _natives()
     stamp = f"{inspect.getsource(natives)}\n{text}"
-    digest = hashlib.sha256(stamp.encode()).hexdigest()[:DIGITS]
+    digest = hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
     folder = cache_folder(FOLDER)
     try:
         if folder is not None:
             program = _KeptProgram(folder / digest, text, title)
-            forget_old_programs(folder)
+            make_room()
             return {name: program.entry(name) for name in names}
     except (OSError, ConfigurationError):  # The disk may be full.
         pass
@@ -163,7 +165,7 @@ class _KeptProgram:
         self._folder.mkdir(mode=0o700, exist_ok=True)
         if not file.is_file() or file.read_bytes() != text:
             write_atomically(file, lambda path: path.write_bytes(text))
-        os.utime(self._folder)
+        mark_used(self._folder)
         name = f"safe_envs_program_{self._folder.name}"
         spec: Any = importlib.util.spec_from_file_location(name, file)
         module = importlib.util.module_from_spec(spec)

@@ -40,6 +40,11 @@ _INVERSES = {
     sp.csch: sp.sinh,
     sp.coth: sp.tanh,
 }
+_EXTREMES: dict[Any, Any] = {
+    sp.Max: sp.Function("_largest", real=True),
+    sp.Min: sp.Function("_smallest", real=True),
+}
+"""Functions in their place while common parts are looked for."""
 
 
 class Arithmetic(Protocol):
@@ -120,9 +125,12 @@ class ExpressionProgram:
         self._arithmetic = arithmetic
         shared: Any
         reduced: Any
-        shared, reduced = sp.cse(
-            list(expressions), symbols=sp.numbered_symbols(cls=sp.Dummy), list=False
-        )
+        # SymPy compares the parts of Max and Min in pairs whenever it makes one.
+        opaque = [
+            sp.sympify(e).replace(sp.Max, _EXTREMES[sp.Max]).replace(sp.Min, _EXTREMES[sp.Min])
+            for e in expressions
+        ]
+        shared, reduced = sp.cse(opaque, symbols=sp.numbered_symbols(cls=sp.Dummy), list=False)
         for symbol, expression in shared:
             self._known[symbol] = self._slot(expression)
         self._results = [self._slot(e) for e in reduced]
@@ -160,8 +168,9 @@ class ExpressionProgram:
             return ops.step(kind), parts
         if kind in _INVERSES:
             return ops.reciprocal, [_INVERSES[kind](*parts)]
-        if kind in (sp.Max, sp.Min):
-            return partial(self._folded, ops.extreme(kind)), parts
+        for extreme, opaque in _EXTREMES.items():
+            if kind in (extreme, opaque):
+                return partial(self._folded, ops.extreme(extreme)), parts
         if kind is sp.atan2:
             return ops.atan2, parts
         raise SystemDefinitionError(f"{excerpt(expression)} has no interval form")

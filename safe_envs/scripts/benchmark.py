@@ -36,6 +36,7 @@ def benchmark(
     from safe_envs import __version__
     from safe_envs.scripts.reports import benchmark_figures
     from safe_envs.scripts.reports.benchmark_cases import ENV_ID
+    from safe_envs.user_cache import own_cache
 
     require_result(json)
     earlier = {} if compare is None else _read_figures(compare)
@@ -44,7 +45,8 @@ def benchmark(
     say(console, f"{ENV_ID} with scbf, safe-envs {__version__}, on {cores}; 1 to 3 minutes")
     for part in benchmark_figures.parts():
         say(console, f"\nmeasuring {part.what} ...\n")
-        found = part.measure()
+        with own_cache():
+            found = part.measure()
         figures |= found
         _print(console, found, earlier)
     if sides := benchmark_figures.side_by_side(figures):

@@ -11,7 +11,7 @@ import typer
 
 from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options import completion, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
@@ -51,6 +51,7 @@ def certify(
     seconds: Annotated[
         float, typer.Option(help="Time after which no higher degree is begun.")
     ] = 25.0,
+    best: evaluation_options.Best = False,
     seed: text_options.Seed = 0,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the certificate: a JSON file.")
@@ -77,7 +78,6 @@ def certify(
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.certify_report import (
         CertifyAnswer,
-        attainable_upper,
         print_certification,
     )
     from safe_envs.wrappers.certificates.files import save_certificate
@@ -85,10 +85,10 @@ def certify(
     from safe_envs.wrappers.synthesis.certify import certify as find
     from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 
-    if held and (policy or rates):
+    if held and (policy or rates or best):
         raise ConfigurationError(
-            "--held is for every policy under psi's constraint and has no a: leave --policy and"
-            " --rate out, or --held"
+            "--held is for every policy under psi's constraint, has no a, and counts leaving in"
+            " another way than --best: leave --policy, --rate and --best out, or --held"
         )
     require_whole("seed", seed, 0)
     require_result(json)
@@ -112,10 +112,10 @@ def certify(
         config = {"env_id": known, "options": arguments, "held": True, "seed": seed}
         _certify_held(named, settings, _HeldOutput(title_of(known, arguments), config, out, json))
         return
+    upper = _attainable(problem) if best else None
     with progress_bar("Searching") as tell:
         found = find(named, settings, bool(policy), tell)
     config = {"env_id": known, "options": arguments, "policy": policy or None, "seed": seed}
-    upper = attainable_upper(problem)
     answer = CertifyAnswer(title_of(known, arguments), config, problem, found, upper, out)
     if found.certificate is not None and out is not None:
         save_certificate(found.certificate, out)
@@ -159,6 +159,14 @@ def _certify_held(named: Named, settings: SynthesisSettings, output: _HeldOutput
     if found.certificate is None:
         sys.stdout.flush()
         raise SystemExit(1)
+
+
+def _attainable(problem: SafetyProblem) -> float | None:
+    """Return how safe any policy can be at most."""
+    from safe_envs.agents.evaluation.yardstick import best_for
+
+    with progress_bar("Best attainable safety") as tell:
+        return best_for(problem, tell).upper
 
 
 def _require_formula(policy: str, problem: SafetyProblem) -> None:

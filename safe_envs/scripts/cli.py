@@ -123,6 +123,12 @@ COMMANDS = tuple(
         ),
         ("list", _TOOLS, "listing:list_envs", "List the registered envs."),
         ("doctor", _TOOLS, "doctor:doctor", "Check the installation."),
+        (
+            "cache",
+            _TOOLS,
+            "cache:cache",
+            "Print what is kept in the user's cache, or clear it.",
+        ),
         ("benchmark", _TOOLS, "benchmark:benchmark", "Measure the speed of filters and envs."),
     )
 )

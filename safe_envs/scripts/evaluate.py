@@ -37,8 +37,9 @@ def evaluate(
     confidence: of.Confidence = 0.95,
     refine: of.Refine = False,
     monitoring: of.Monitoring = "discrete",
-    best: of.Best = None,
-    closed_loop: of.ClosedLoop = None,
+    bounds: of.Bounds = True,
+    best: of.Best = False,
+    closed_loop: of.ClosedLoop = False,
     rare: of.Rare = False,
     particles: of.Particles = None,
     repetitions: of.Repetitions = None,
@@ -84,6 +85,7 @@ def evaluate(
             "--refine": refine,
             "--plot": plot,
             "--latex": latex,
+            "--no-bounds": not bounds,
             "--best": best,
             "--estimator": estimator,
             "--closed-loop": closed_loop,
@@ -105,7 +107,7 @@ def evaluate(
     third_party = filter_spec and env.env_id and not env.system
     common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "best": best}
     common |= {"closed_loop": closed_loop, "estimator": estimator, "belief": belief}
-    common |= {"observe": observe}
+    common |= {"observe": observe, "bounds": bounds}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     common |= {"episodes_out": episodes_out, "keep_episodes": False}
     problem = env.env_id if third_party else env.full_id
@@ -133,7 +135,7 @@ def _evaluate(
     with progress_bar("Evaluating") as progress:
         run: Any = refinement.refine if refine else evaluate.evaluate
         found = run(problem, policy, progress=progress, **arguments)
-    first = found.evaluations[0] if refine else found
+    first = found.given if refine else found
     print_evaluation(stdout(), first, timing)
     if refine:
         print_refinement(stdout(), found)

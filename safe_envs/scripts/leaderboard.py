@@ -86,8 +86,8 @@ def leaderboard(
             "--best",
             help=(
                 "Compute the best attainable safety of each env, and the largest return at each"
-                " probability of a violation. Otherwise only results that were computed before are"
-                " shown, with --quick only those of this command."
+                " probability of a violation. Otherwise only results of this command that were"
+                " computed before are shown."
             ),
         ),
     ] = False,
@@ -158,7 +158,7 @@ def leaderboard(
             tell or (lambda _: None),
             lambda text: print(text, file=sys.stderr, flush=True),
         )
-    report = _report(found, out, best or (False if quick else None))
+    report = _report(found, out, best)
     if pictures is not None:
         _draw(report, pictures)
     written = leaderboard_markdown(report, _links(report, pictures, page))
@@ -179,7 +179,7 @@ def leaderboard(
     found.require_all()
 
 
-def _report(found: Any, out: Path, best: bool | None) -> LeaderboardReport:
+def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
     """Return the statistics of a study, with what is known of what could be had."""
     from safe_envs.agents.training.leaderboard import (
         attainable_of,
@@ -196,7 +196,7 @@ def _report(found: Any, out: Path, best: bool | None) -> LeaderboardReport:
     with progress_bar("Best attainable safety") as tell:
         known = attainable_of(study.env_ids, out, best, tell or (lambda _: None))
     with progress_bar("Largest returns") as tell:
-        frontiers = frontiers_of(study.env_ids, out, bool(best), tell or (lambda _: None))
+        frontiers = frontiers_of(study.env_ids, out, best, tell or (lambda _: None))
     return LeaderboardReport(
         found,
         tuple(entry for entry in entries if entry is not None),

@@ -8,7 +8,13 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import completion, early_checks, figure_options, text_options
+from safe_envs.scripts.options import (
+    completion,
+    early_checks,
+    evaluation_options,
+    figure_options,
+    text_options,
+)
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
@@ -48,6 +54,8 @@ def verify(
             "--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds."
         ),
     ] = True,
+    best: evaluation_options.Best = False,
+    closed_loop: evaluation_options.ClosedLoop = False,
     engine: text_options.Engine = "auto",
     json: Annotated[
         Path | None,
@@ -74,10 +82,12 @@ def verify(
     need. A judge then proves the hypotheses and numbers of the bounds, refutes them, or leaves
     them undecided. None of this depends on the policy; the simulation does, and a bound that it
     contradicts is withheld. At the end the rate stands between a bound for the env's own steps and
-    what any policy can attain, as far as these are known.
+    what any policy can attain, with --closed-loop and --best.
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
+    from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
     from safe_envs.agents.evaluation.safety_chain import safety_chain
+    from safe_envs.agents.evaluation.yardstick import best_for
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.compiled.engine import require_engine
     from safe_envs.registry import make_problem, title_of
@@ -105,7 +115,14 @@ def verify(
                 found, actor, episodes=episodes, seed=seed, engine=engine, progress=tell
             )
         bounds, measurements = judged(bounds, measurements, found)
-    chain = safety_chain(found, starts, bounds, measurements, policy)
+    attainable = None
+    if best:
+        with progress_bar("Best attainable safety") as tell:
+            attainable = best_for(problem, tell)
+    filtered = FilteredPolicy(
+        problem, tuple(conditions), knowledge, policy, closed_loop=closed_loop
+    )
+    chain = safety_chain(filtered, starts, bounds, measurements, attainable)
     config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
     title = title_of(known, arguments)
     answer = VerifyAnswer(title, config, policy, found, starts, bounds, measurements, chain)

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from safe_envs.compiled import program
-from safe_envs.compiled.cache import forget_old_programs
 from safe_envs.compiled.engine import compiled_or_none, periods_of_a_part, require_engine
 from safe_envs.compiled.formulas import Source
 from safe_envs.compiled.program import Program
@@ -156,15 +155,6 @@ def test_a_numba_that_does_not_work_leaves_the_work_to_numpy(
     monkeypatch.setattr(program, "is_available", lambda: True)
     with pytest.raises(NotCompilableError, match="cannot be imported"):
         small().compiled()
-
-
-def test_the_programs_used_last_remain(tmp_path: Path) -> None:
-    names = [f"{i:032x}" for i in range(70)]
-    for i, name in enumerate(["mine", *names]):
-        (tmp_path / name).mkdir()
-        os.utime(tmp_path / name, (i, i))
-    forget_old_programs(tmp_path)
-    assert {each.name for each in tmp_path.iterdir()} == {"mine", *names[6:]}
 
 
 def test_compiled_natives_give_what_plain_ones_give(folder: Path) -> None:

@@ -32,6 +32,33 @@ def brownian(
     )
 
 
+def mean_reverting(
+    theta: float, sigma: float, dt: float = 0.05, horizon: float = 2.0
+) -> SafetyProblem:
+    """dx = (u - theta x) dt + sigma dW from 0, which is to stay in [-1, 1], without an input."""
+    u = sp.Symbol("u", real=True)
+    system = ControlAffineSDE.from_rate((X,), (u,), [u - theta * X], diffusion=[sigma])
+    return state_problem(
+        system, 1 - X**2, box=(-1.0, 1.0), start=[0.0], dt=dt, horizon=horizon, nominal=0
+    )
+
+
+def mean_reverting_passage(
+    theta: float, sigma: float, dt: float = 0.05, horizon: float = 2.0, nodes: int = 600
+) -> float:
+    """P(|x| reaches 1 at one of the Euler steps of `mean_reverting`), by Nystrom's method: the
+    density of those that have not is known at the nodes of Gauss and Legendre."""
+    x, weights = np.polynomial.legendre.leggauss(nodes)
+    factor, deviation = 1.0 - theta * dt, sigma * math.sqrt(dt)
+    kernel = weights[:, None] * density(x[:, None] - factor * x, deviation)
+    leaving = norm.sf(1.0, factor * x, deviation) + norm.cdf(-1.0, factor * x, deviation)
+    mass, reached = weights * density(x, deviation), 2.0 * norm.sf(1.0, 0.0, deviation)
+    for _ in range(round(horizon / dt) - 1):
+        reached += leaving @ mass
+        mass = kernel @ mass
+    return float(reached)
+
+
 def density(x: np.ndarray, deviation: float) -> np.ndarray:
     """That of a normal variable with mean 0, without the checks of `scipy.stats`, which take longer
     than the exponential."""

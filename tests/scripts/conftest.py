@@ -27,12 +27,17 @@ def safe_envs_command(monkeypatch, capsys, tmp_path):
 
 
 def strictly(path):
-    """A file's strict JSON: no NaN, no infinity."""
+    """A file's strict JSON: no NaN, no infinity, and keys that can be typed."""
 
     def refuse(name):
         raise ValueError(f"{name} is not JSON")
 
-    return json.loads(Path(path).read_text(), parse_constant=refuse)
+    def typed(pairs):
+        wrong = [key for key, _ in pairs if not key.isprintable() or set(key) & set("\u00a0\u00ad")]
+        assert not wrong, wrong
+        return dict(pairs)
+
+    return json.loads(Path(path).read_text(), parse_constant=refuse, object_pairs_hook=typed)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ def _own_cache(tmp_path, monkeypatch):
     monkeypatch.setattr(closed_loop, "CELLS", {1: 400, 2: 400})
 
 
-def test_the_bounds_are_shown_and_verify_reads_them(safe_envs_command, tmp_path):
+def test_the_bounds_are_shown_by_evaluate_and_verify(safe_envs_command, tmp_path):
     asked = ("--filter", "none", "--filter", "scbf", "--filter", "srcbf", "--episodes", 50)
     status, out, _ = safe_envs_command(
         "evaluate", *SCALAR, *asked, "--closed-loop", "--json", "e.json"
@@ -31,7 +31,7 @@ def test_the_bounds_are_shown_and_verify_reads_them(safe_envs_command, tmp_path)
     assert text.count("certified, by a table of this policy, 401 cells") == 2
     assert "no bound, held input, for srcbf: the constraint of srcbf is not of the form" in text
     status, out, _ = safe_envs_command(
-        "verify", *SCALAR, "--filter", "scbf", "--episodes", 50, "--json", "v.json"
+        "verify", *SCALAR, "--filter", "scbf", "--episodes", 50, "--json", "v.json", "--closed-loop"
     )
     assert status == 0
     chain = json.loads((tmp_path / "v.json").read_text())["chain"]

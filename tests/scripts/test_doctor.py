@@ -32,8 +32,11 @@ def test_a_sound_installation_is_sound(safe_envs_command, quick):
     assert {"gymnasium", "torch", "proxsuite", "python"} <= {
         check["name"] for check in checks["packages"]
     }
-    assert [check["name"] for check in checks["solvers"]] == [
-        program.name for program in installation.KNOWN_QPS
+    names = [check["name"] for check in checks["solvers"]]
+    assert names == [
+        f"{program.name}{by}"
+        for program in installation.KNOWN_QPS
+        for by in ([""] if program.in_closed_form else [", by DAQP", ", by PROXQP"])
     ]
     assert [check["name"] for check in checks["envs"]] == [
         "safe_envs/Scalar-v0",
@@ -58,14 +61,22 @@ def test_each_solver_is_looked_at():
     assert all(check.ok for check in installation.solvers())
 
 
+def test_the_advice_names_the_solver_that_was_run(monkeypatch):
+    broken = [replace(program, feasible=not program.feasible) for program in installation.KNOWN_QPS]
+    monkeypatch.setattr(installation, "KNOWN_QPS", broken)
+    for check in installation.solvers():
+        solver = {"DAQP": "daqp, ", "PROXQP": "proxsuite, "}.get(check.name.rpartition(" ")[2], "")
+        assert check.advice == f"reinstall {solver}numpy and scipy"
+
+
 @pytest.mark.parametrize("change", [{"answer": (0.6, 0.5)}, {"feasible": False}])
 def test_a_wrong_answer_ends_with_status_1(safe_envs_command, quick, monkeypatch, change):
     monkeypatch.setattr(installation, "KNOWN_QPS", (replace(installation.KNOWN_QPS[0], **change),))
     status, out, _ = safe_envs_command("doctor", "--json", "found.json")
     assert status == 1
     assert "WRONG" in out
-    assert "reinstall proxsuite" in out
     document = strictly("found.json")
+    assert document["checks"]["solvers"][0]["advice"] == "reinstall numpy and scipy"
     assert not document["healthy"]
     assert document["steps_per_second"] == {}
 

@@ -301,9 +301,9 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
         "--filter",
         "scbf",
         "--episodes",
-        "200",
+        "1000",
         "--horizon",
-        "0.2",
+        "0.1",
     )
     status, out, err = safe_envs_command(
         *arguments, "--refine", "--confidence", ".9", "--json", "out.json", "--plot", "out.svg"
@@ -315,20 +315,21 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
         "dt = 0.05 s",
         "dt = 0.025 s",
         "dt = 0.0125 s",
-        "noise that is not coupled",
+        "on the same noise, in integration steps of 0.0125 s",
         "no further than 3 points",
     ):
         assert text in refined
     row = strictly("out.json")["refinement"]["rows"][1]
-    rates = [f"100.0 % [{100 * low:.1f}, 100.0]" for low in row["ci_low"]]
-    (line,) = [line for line in refined.splitlines() if line.startswith("scbf")]
-    assert line.split() == ["scbf", *" ".join(rates).split()]
+    lows = [*row["ci_low"], row["limit_low"]]
+    lines = [line for line in refined.splitlines() if line.startswith("scbf")]
+    shown = " ".join(" ".join(line.removeprefix("scbf").split()) for line in lines)
+    assert shown == " ".join(f"100.0 % [{100 * low:.1f}, 100.0]" for low in lows)
     assert (
-        f"scbf: converged, +0.0 points [{100 * row['change_low']:.1f},"
-        f" {100 * row['change_high']:.1f}]" in refined
+        f"  scbf: off its limit by +0.0 points [{100 * row['error_low']:.1f},"
+        f" {100 * row['error_high']:.1f}], converged" in refined
     )
     few = safe_envs_command(*arguments, "--episodes", "10", "--refine")[1]
-    assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
+    assert "], not resolved: more episodes are needed" in few
     coarse = (
         "--dt",
         ".1",
@@ -344,7 +345,10 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
     changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[
         1
     ]
-    assert "  none: still changing by -" in changing
+    assert "  none: off its limit by +" in changing
+    assert "], still changing" in changing
+    assert "converged\n" not in changing
+    assert "in the square root of the period" in changing
     picture = svg_texts("out.svg")
     assert "dt = 0.05 s" in picture
     assert "90 % band" in picture

@@ -32,6 +32,27 @@ def test_a_filter_is_compared_at_states_estimates_and_beliefs(safe_envs_command,
     assert ("scbf", "scbf@state") in named
 
 
+def test_without_a_filter_nothing_intervenes_at_states_and_at_estimates(safe_envs_command):
+    given = (*QUICK, "--no-bounds", "--json", "out.json")
+    status, out, _ = safe_envs_command(
+        "evaluate", DUBINS, "--filter", "none", "--filter", "scbf", *given
+    )
+    assert status == 0
+    rows = strictly("out.json")["rows"]
+    assert [(row["filter"], row["kind"]) for row in rows] == [
+        ("none@state", "unfiltered"),
+        ("none", "unfiltered"),
+        *((name, "filter") for name in ROWS),
+    ]
+    assert "0.0 %" not in next(
+        line for line in out.splitlines() if line.startswith("none@state") and " %" not in line
+    )
+    compared = [line for line in out.splitlines() if " points [" in line]
+    assert len(compared) == 3
+    assert "none" not in " ".join(compared)
+    assert "bound, continuous: not computed" in out
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

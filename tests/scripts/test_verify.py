@@ -73,15 +73,17 @@ def test_each_hypothesis_has_the_word_of_the_judge(verify):
 
 
 def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
-    chain = "safe_envs.agents.evaluation.safety_chain.best_at_hand"
-    monkeypatch.setattr(chain, lambda problem: attainable(0.2, 0.3))
+    best = "safe_envs.agents.evaluation.yardstick.best_for"
+    monkeypatch.setattr(best, lambda problem, progress: attainable(0.2, 0.3))
     arguments = ("Scalar-v0", "--start", "-1", "--horizon", 0.2, "--episodes", 40, "--json", "o.js")
     assert verify(*arguments)[0] == 0
+    assert strictly("o.js")["chain"]["best"] is None
+    assert verify(*arguments, "--best")[0] == 0
     found = strictly("o.js")["chain"]["best"]
     assert (found["upper"], found["lower"]) == (None, None)
     assert "scbf is safe in 100.0 %" in found["contradiction"]
-    monkeypatch.setattr(chain, lambda problem: attainable(0.9, 0.99981))
-    status, out, _ = verify(*arguments[:-2])
+    monkeypatch.setattr(best, lambda problem, progress: attainable(0.9, 0.99981))
+    status, out, _ = verify(*arguments[:-2], "--best")
     assert status == 0
     _, titles, _, cells, *_ = lines_of(out, "The env's own steps", "Shares")
     assert titles.split() == [

@@ -14,12 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from safe_envs.agents.evaluation.contradiction import SURE
 from safe_envs.agents.evaluation.greedy_episodes import SimulatedRate, simulate
 from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.evaluation.spec import Progress
-from safe_envs.agents.evaluation.statistics import rate_interval, require_confidence
+from safe_envs.agents.evaluation.statistics import exact_interval, require_confidence
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.errors import require_whole
+from safe_envs.outward_text import number_at_least, number_at_most
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.proved_starts import ProvedStarts
@@ -28,9 +30,6 @@ from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.starts import start_values
 from safe_envs.wrappers.value.table import ValueTable
 from safe_envs.wrappers.value.table_check import TableCheck, check_table
-
-SURE = 0.999
-"""Confidence of the intervals that may contradict a table: at 95 % one of forty true ones would."""
 
 _TABLE_WORK = 0.8
 """Part of the work that is the table's, for the progress."""
@@ -204,11 +203,11 @@ def judged(found: AttainableSafety) -> AttainableSafety:
     s = found.simulated
     if s is None or found.lower is None or found.upper is None:
         return found
-    low, high = rate_interval(s.safe, s.episodes, SURE)
+    low, high = exact_interval(s.safe, s.episodes, SURE)
     where = (
-        f"above the upper bound {found.upper:.6f}"
+        f"above the upper bound {number_at_most(found.upper, 6)}"
         if low > found.upper
-        else f"below the lower bound {found.lower:.6f}"
+        else f"below the lower bound {number_at_least(found.lower, 6)}"
         if high < found.lower
         else ""
     )
@@ -230,10 +229,11 @@ def contradicted(
     if found.upper is None:
         return found
     for name, safe, episodes in rates:
-        low, high = rate_interval(safe, episodes, SURE)
+        low, high = exact_interval(safe, episodes, SURE)
         if low > found.upper:
             told = f"{percent_in(safe / episodes, low, high)} ({100 * SURE:g} % interval)"
-            reason = f"{name} is safe in {told}, above the upper bound {found.upper:.6f}"
+            most = number_at_most(found.upper, 6)
+            reason = f"{name} is safe in {told}, above the upper bound {most}"
             return withheld(found, reason)
     return found
 

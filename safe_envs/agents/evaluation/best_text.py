@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.yardstick import TimesUnavoidable, times_unavoidable
+from safe_envs.outward_text import percents_between, rounded
 
 COMPUTED = (
     "computed in floating point by dynamic programming of the env's own step, with the error of the"
     " grid in both ends"
 )
 """What the ends of the best attainable safety are."""
-
-_MOST_DIGITS = 9
 
 
 def best_text(best: AttainableSafety | None) -> str:
@@ -32,40 +30,18 @@ def ends_text(lower: float | None, upper: float | None) -> str:
     """
     if lower is None or upper is None:
         return "-"
-    low, high = outwards(lower, upper)
+    low, high = percents_between(lower, upper)
     return f"{low} %" if low == high else f"{low}..{high} %"
-
-
-def outwards(lower: float, upper: float) -> tuple[str, str]:
-    """Return bounds in per cent, the lower one rounded down and the upper one rounded up.
-
-    There is a digit after the point, or as many as tell an upper bound below 1 from it.
-
-    Args:
-        lower: the lower one.
-        upper: the upper one.
-
-    Returns:
-        Two texts.
-    """
-    low, high = 100.0 * lower, 100.0 * upper
-    digits = next((d for d in range(1, _MOST_DIGITS) if upper == 1.0 or _up(high, d) < 100.0), 9)
-    return f"{0.0 - _up(-low, digits):.{digits}f}", f"{_up(high, digits):.{digits}f}"
-
-
-def _up(percentage: float, digits: int) -> float:
-    # What is a decimal number but for its last bits stays as it is.
-    return math.ceil(percentage * 10**digits - 1e-6) / 10**digits
 
 
 def times_text(times: TimesUnavoidable | None) -> str:
     """Return how many times the unavoidable violations, rounded outwards."""
     if times is None:
         return "-"
-    low = _rounded(times.low, math.floor)
+    low = _rounded(times.low, up=False)
     if times.high is None:
         return f">= {low}"
-    high = _rounded(times.high, math.ceil)
+    high = _rounded(times.high, up=True)
     return low if low == high else f"{low}..{high}"
 
 
@@ -98,7 +74,7 @@ def attainable_text(best: AttainableSafety | None) -> list[str]:
     """
     if best is None or best.lower is None or best.upper is None:
         return []
-    return [f"{'<= ' * is_certified(best)}{outwards(best.lower, best.upper)[1]} %"]
+    return [f"{'<= ' * is_certified(best)}{percents_between(best.lower, best.upper)[1]} %"]
 
 
 def is_certified(best: AttainableSafety) -> bool:
@@ -127,7 +103,6 @@ def best_notes(best: AttainableSafety | None) -> list[str]:
     ]
 
 
-def _rounded(value: float, towards: Callable[[float], int]) -> str:
+def _rounded(value: float, *, up: bool) -> str:
     """Return a number from 1 on as text: below 10 with a digit after the point, else without."""
-    scale = 10 if value < 10.0 else 1
-    return f"{towards(value * scale) / scale:.10g}"
+    return f"{float(rounded(value, 1 if value < 10.0 else 0, up=up)):.10g}"

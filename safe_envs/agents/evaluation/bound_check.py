@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.attainable import SURE
-from safe_envs.agents.evaluation.contradiction import by_rate, by_states, end_for
+from safe_envs.agents.evaluation.contradiction import by_rate, by_states, end_for, upper_ends
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
-from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.statistics import exact_upper_end
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
@@ -78,10 +77,10 @@ class MeasuredSafety:
     visited: tuple[VisitedStates, ...] = ()
 
     def ends(self, horizon: Horizon) -> tuple[float, float]:
-        """Return the upper ends of the intervals of its rate, of 95 % and of `SURE`."""
+        """Return the `upper_ends` of its rate at 95 %."""
         if self.repeats:
             return horizon.rate, horizon.rate
-        return horizon.ci_high, rate_interval(horizon.safe, self.episodes, SURE)[1]
+        return upper_ends(horizon.safe, self.episodes, 0.95)
 
 
 def judged(
@@ -274,7 +273,7 @@ def _compared(measurement: MeasuredSafety, horizon: Horizon, comparisons: int) -
     most = (
         horizon.rate
         if measurement.repeats
-        else _upper_end(horizon.safe, measurement.episodes, _ERROR / comparisons)
+        else exact_upper_end(horizon.safe, measurement.episodes, _ERROR / comparisons)
     )
     above = [
         b.name
@@ -282,19 +281,3 @@ def _compared(measurement: MeasuredSafety, horizon: Horizon, comparisons: int) -
         if b.value is not None and b.value - _DEVIATIONS * b.error > most
     ]
     return replace(horizon, contradicted=tuple(above))
-
-
-def _upper_end(successes: int, trials: int, error: float) -> float:
-    """Return Clopper and Pearson's one-sided upper end.
-
-    It is below the probability of success in at most the part `error` of all cases.
-
-    Wilson's is below more often where the probability is near 1, as that of safety is.
-    """
-    from scipy.special import betaincinv
-
-    return (
-        1.0
-        if successes == trials
-        else float(betaincinv(successes + 1, trials - successes, 1.0 - error))
-    )

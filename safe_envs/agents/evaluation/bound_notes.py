@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from safe_envs.agents.evaluation.held_input import NO_FILTER
 from safe_envs.agents.evaluation.promise_notes import computed_notes
 from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.outward_text import number_at_most
 from safe_envs.wrappers.conditions.text_parts import name_by_itself, names_promise
 
 CHAIN = "bound, held input <= safe <= attainable is a chain: all three are of the env's own steps."
@@ -37,7 +37,7 @@ def bound_notes(rows: Sequence[EvaluationRow]) -> list[str]:
     Args:
         rows: of the evaluation.
     """
-    filtered = [row for row in rows if row.filter != UNFILTERED]
+    filtered = [row for row in rows if row.kind == "filter"]
     known = [row for row in filtered if row.learning is None]
     none = (row for row in rows if row.held_bound is None)
     # That there is no filter needs no saying, but why its table of a closed loop is missing does.
@@ -89,8 +89,8 @@ def _of_drawn_starts(rows: Sequence[EvaluationRow]) -> list[str]:
         return []
     return [
         "bounds are means over the starts of these episodes, as the rates are; these starts are"
-        f" drawn, and over all starts the standard error of such a mean is {100 * error:.2g} points"
-        " at most."
+        f" drawn, and over all starts the standard error of such a mean is"
+        f" {number_at_most(100 * error, 2)} points at most."
     ]
 
 

@@ -6,32 +6,19 @@ Only what is proved, or certified, stands after ">=". Bounds are rounded down.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from decimal import ROUND_FLOOR, Decimal
 from typing import Any
 
 from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.outward_text import percent_at_least
 
 NO_BOUND = "-"
 
-_MOST_DIGITS = 9
 _FORMS: Mapping[str, str] = {
     "proved": ">= {} %",
     "certified": ">= {} %",
     "computed": "{} % comp.",
     "estimated": "{} % est.",
 }
-
-
-def rounded_down(bound: float) -> str:
-    """Return a bound in per cent, rounded down, with as many digits as tell it from 0.
-
-    Args:
-        bound: in [0, 1].
-    """
-    percentage = 100 * Decimal(repr(float(bound)))
-    steps = (Decimal(1).scaleb(-digits) for digits in range(1, _MOST_DIGITS))
-    found = (percentage.quantize(step, ROUND_FLOOR) for step in steps)
-    return f"{next((each for each in found if each or not percentage), Decimal('0.0')):f}"
 
 
 def bound_text(bound: float | None, word: str) -> str:
@@ -47,8 +34,8 @@ def bound_text(bound: float | None, word: str) -> str:
     if bound is None:
         return "withheld" if word == "withheld" else NO_BOUND
     if not bound:
-        return f"{rounded_down(bound)} %"
-    return _FORMS[word].format(rounded_down(bound))
+        return f"{percent_at_least(bound)} %"
+    return _FORMS[word].format(percent_at_least(bound))
 
 
 def held_text(row: BoundSummary) -> str:

@@ -12,11 +12,7 @@ from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shown
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.value.closed_loop import ClosedLoop, ClosedLoopTable
-from safe_envs.wrappers.value.closed_loop_cache import (
-    closed_loop_at_hand,
-    closed_loop_for,
-    is_any_at_hand,
-)
+from safe_envs.wrappers.value.closed_loop_cache import closed_loop_for
 
 _FORMULAS = ("nominal", "zero")
 """Policies that are formulas of the state."""
@@ -68,26 +64,20 @@ class ClosedLoopBound:
 
 
 def closed_loop_bound(of: FilteredPolicy) -> ClosedLoopBound | None:
-    """Return the bound of a table that is kept, or why there is none where it was asked for.
+    """Return the bound of a table, which is computed if need be, or why there is none.
 
     Args:
         of: the policy and the filter, or the policy alone.
 
     Returns:
-        None for a filter that acts by itself, and where no table was asked for and none is kept.
+        None for a filter that acts by itself, and where no table was asked for.
     """
-    if of.closed_loop is False or isinstance(of.parts, FilterSettings):
-        return None
-    if not (of.closed_loop or is_any_at_hand()):
+    if not of.closed_loop or isinstance(of.parts, FilterSettings):
         return None
     try:
-        loop = _loop_of(of)
-        table = closed_loop_at_hand(loop)
+        table = closed_loop_for(_loop_of(of))
     except SafeEnvsError as error:
-        # Where nobody has asked for it, there is none.
-        return ClosedLoopBound(None, str(error)) if of.closed_loop else None
-    if table is None:
-        return None
+        return ClosedLoopBound(None, str(error))
     cells = " x ".join(map(str, table.grid.shape))
     whose = "of this policy" if of.policy in _FORMULAS else "of every policy under the filter"
     return ClosedLoopBound(table, f"by a table {whose}, {cells} cells")

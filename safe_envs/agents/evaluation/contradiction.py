@@ -5,8 +5,9 @@ uses, is wrong: a start or a visited state has a b_j above the supremum c_j, the
 condition by more than the shortfall m, or the interval of the measured rate lies below the bound.
 See `safe_envs.wrappers.verification.guarantee.ChainGuarantee.contradiction` for the first two.
 
-A bound that is proved is withheld only where an interval lies below it that is so wide that this
-hardly happens by chance.
+The intervals are exact ones: see `safe_envs.agents.evaluation.statistics.exact_interval`. A bound
+that is proved is withheld only where an interval of 99.9 % lies below it, which happens by chance
+in at most .05 % of all cases.
 
 A bound for the env's own steps and the rates stand in a chain: bound <= rate <= what any policy can
 attain. Where the bound is above the last number, one of both is wrong; see `above_attainable`. A
@@ -20,9 +21,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeVar
 
-from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow
+from safe_envs.agents.evaluation.statistics import exact_interval
 from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.outward_text import percents_apart
 from safe_envs.wrappers.verification.guarantee import Guarantee
+
+SURE = 0.999
+"""Confidence of the intervals that may contradict what is proved, or a table."""
 
 Bounded = TypeVar("Bounded", bound=BoundSummary)
 
@@ -58,10 +64,32 @@ def by_rate(bound: float | None, ci_high: float, advice: str = ADVICE) -> str:
     """
     if bound is None or ci_high >= bound:
         return ""
-    return (
-        f"the interval of the measured rate ends at {100 * ci_high:.1f} %, below {100 * bound:.1f}"
-        f" %; {advice}"
-    )
+    end, least = percents_apart(ci_high, bound)
+    return f"the interval of the measured rate ends at {end} %, below {least} %; {advice}"
+
+
+def upper_ends(safe: int, episodes: int, confidence: float) -> tuple[float, float]:
+    """Return the upper ends of exact intervals of a rate, for `end_for`.
+
+    Args:
+        safe: number of safe episodes.
+        episodes: number of all.
+        confidence: of the first interval; that of the second is `SURE`.
+    """
+    high, sure_high = (exact_interval(safe, episodes, each)[1] for each in (confidence, SURE))
+    return high, max(high, sure_high)
+
+
+def upper_ends_of(row: EvaluationRow, confidence: float) -> tuple[float, float]:
+    """Return the `upper_ends` of a row's rate.
+
+    Args:
+        row: of an evaluation; over several identifications its own interval is all there is.
+        confidence: of the first interval.
+    """
+    if row.learning is not None and row.learning.repeats > 1:
+        return row.ci_high, row.ci_high
+    return upper_ends(row.safe, row.episodes, confidence)
 
 
 def end_for(word: str, ci_high: float, sure_high: float) -> float:
@@ -72,10 +100,10 @@ def end_for(word: str, ci_high: float, sure_high: float) -> float:
         ci_high: upper end of the interval of a rate.
         sure_high: that of a wider one, for what is proved.
     """
-    return max(ci_high, sure_high) if word in _SURE_WORDS else ci_high
+    return sure_high if word in _SURE_WORDS else ci_high
 
 
-def judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
+def judged(row: Bounded, ci_high: float, sure_high: float) -> Bounded:
     """Return a row without the bounds that a measured rate contradicts; `withheld` says why.
 
     Args:
@@ -88,7 +116,7 @@ def judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
     return continuous_judged(without_held(row, reason) if reason else row, ci_high, sure_high)
 
 
-def continuous_judged(row: Bounded, ci_high: float, sure_high: float = 0.0) -> Bounded:
+def continuous_judged(row: Bounded, ci_high: float, sure_high: float) -> Bounded:
     """Return a row without the bounds of continuous control that a rate contradicts.
 
     Args:
@@ -115,10 +143,8 @@ def above_attainable(row: BoundSummary, upper: float | None) -> str:
         return ""
     if row.held_bound - _DEVIATIONS * row.held_error <= upper:
         return ""
-    return (
-        f"the bound for held input, {100 * row.held_bound:.4f} %, is above what any policy can"
-        f" attain, {100 * upper:.4f} %"
-    )
+    most, least = percents_apart(upper, row.held_bound)
+    return f"the bound for held input, {least} %, is above what any policy can attain, {most} %"
 
 
 def without_held(row: Bounded, reason: str) -> Bounded:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.statistics import rate_interval, share
+from safe_envs.agents.evaluation.statistics import exact_interval, share
 from safe_envs.envs.info import Info
 from safe_envs.wrappers.estimation.consistency import Consistency, consistency_of
 
@@ -139,6 +139,6 @@ def summary_of(
     if delta is None:
         return EstimationSummary(*common)
     outside, episodes = int(found.outside.sum()), len(instants)
-    low, high = rate_interval(outside, episodes, confidence)
+    low, high = exact_interval(outside, episodes, confidence)
     word = "designed" if why_not_proved else "proved"
     return EstimationSummary(*common, outside / episodes, low, high, delta, word, why_not_proved)

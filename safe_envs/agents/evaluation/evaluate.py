@@ -32,8 +32,8 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     monitoring: str = "discrete",
-    best: bool | None = None,
-    closed_loop: bool | None = None,
+    best: bool = False,
+    closed_loop: bool = False,
     estimator: str | None = None,
     belief: float = 0.05,
     observe: str = "estimate",
@@ -84,9 +84,9 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         repeats: number of identifications of what is learned.
         monitoring: where h is checked, "discrete" or "continuous".
         best: whether to compute how safe any policy can be, see
-            `safe_envs.agents.evaluation.yardstick`; None to tell it if its table is in the cache.
+            `safe_envs.agents.evaluation.yardstick`.
         closed_loop: whether to compute certified tables for the bound of the env's own steps, see
-            `safe_envs.wrappers.value.closed_loop`; None to read those in the cache.
+            `safe_envs.wrappers.value.closed_loop`.
         estimator: of the state of a measured problem, "kf", "ekf" or "ukf".
         belief: probability of the rows with belief conditions.
         observe: what policies see with an estimator, "estimate" or "measurement".

@@ -12,7 +12,7 @@ from safe_envs.agents.evaluation.estimation import EstimationSummary
 from safe_envs.agents.evaluation.evaluation_data import EvaluationData, FilterTiming
 from safe_envs.agents.evaluation.rate_text import percent, percent_in, points_in
 from safe_envs.agents.evaluation.rows import EvaluationRow
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.outward_text import percent_at_most
 from safe_envs.text_lines import visible
 from safe_envs.text_tables import Column, FittedTable, arranged, without_empty
 from safe_envs.wrappers.estimation.consistency import Consistency
@@ -68,7 +68,8 @@ def evaluation_table(evaluation: EvaluationData, timing: bool = False) -> Evalua
     columns += _of_learning(rows)
     columns, empty = without_empty(columns, _NONE)
     facts = [f"attainable by any policy: {each}" for each in attainable_text(best)]
-    facts += [f"{title}: none of these has one" for title in empty]
+    why = "none of these has one" if evaluation.spec.bounds else "not computed"
+    facts += [f"{title}: {why}" for title in empty]
     columns += _behavior(rows) + _estimates(rows)
     if timing:
         columns += _timing(evaluation.timing.rows)
@@ -86,7 +87,8 @@ def compared(evaluation: EvaluationData) -> list[Comparison]:
     """Return the comparisons of filters with each other; none where nothing is random."""
     if evaluation.is_deterministic:
         return []
-    return [c for c in evaluation.comparisons if UNFILTERED not in (c.first, c.second)]
+    filters = {row.filter for row in evaluation.rows if row.kind == "filter"}
+    return [c for c in evaluation.comparisons if filters.issuperset((c.first, c.second))]
 
 
 def p_text(p: float) -> str:
@@ -127,7 +129,7 @@ def _of_learning(rows: Sequence[EvaluationRow]) -> list[Column]:
 
 def _behavior(rows: Sequence[EvaluationRow]) -> list[Column]:
     def share(row: EvaluationRow, rate: float | None) -> str:
-        return percent(rate) if row.filter != UNFILTERED else _NONE
+        return percent(rate) if row.kind == "filter" else _NONE
 
     efforts = (row.effort_mean for row in rows)
     cells = {
@@ -173,7 +175,7 @@ def _outside(found: EstimationSummary | None) -> str:
 def _unsafe_at_most(found: EstimationSummary | None) -> str:
     if found is None or found.unsafe_at_most is None:
         return _NONE
-    return f"{percent(found.unsafe_at_most)} {found.bound_word}"
+    return f"{percent_at_most(found.unsafe_at_most)} % {found.bound_word}"
 
 
 def _timing(rows: Sequence[FilterTiming]) -> list[Column]:

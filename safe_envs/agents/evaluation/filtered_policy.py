@@ -18,8 +18,7 @@ class FilteredPolicy:
         knowledge: of the filter, "model" or "plant".
         policy: its name, "nominal" for the problem's own; "" for an object.
         objective: of the filter, "nearest" or "clf".
-        closed_loop: whether a table of its closed loop was asked for; None to read one that is
-            kept.
+        closed_loop: whether a table of its closed loop was asked for.
     """
 
     problem: SafetyProblem
@@ -27,4 +26,4 @@ class FilteredPolicy:
     knowledge: str
     policy: str
     objective: str = "nearest"
-    closed_loop: bool | None = None
+    closed_loop: bool = False

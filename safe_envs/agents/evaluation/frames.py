@@ -70,7 +70,7 @@ def row_columns(evaluation: EvaluationData) -> dict[str, np.ndarray]:
 
 def _make(kind: str) -> Callable[[list[Any]], np.ndarray]:
     """Return what makes a column of the values of a field, by its annotation."""
-    if "str" in kind or "Word" in kind:
+    if any(word in kind for word in ("str", "Word", "Kind")):
         return _texts
     return _wholes if kind == "int" else _floats
 

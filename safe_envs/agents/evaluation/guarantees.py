@@ -20,10 +20,14 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
 from safe_envs.wrappers.conditions.parts import with_parts
 from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
-from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
+from safe_envs.wrappers.verification.chain_guarantee import NOTHING, ChainGuarantee
 from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
 from safe_envs.wrappers.verification.judge import Word
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
+
+SECONDS = 6.0
+"""Processor time of the search and of the judge for each filter: what is not decided by then is
+undecided."""
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""
@@ -73,7 +77,7 @@ class GuaranteeAverager:
         self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str
     ) -> None:
         try:
-            self._found = guarantee_of(problem, conditions, knowledge)
+            self._found = guarantee_of(problem, conditions, knowledge, SECONDS)
             self._why_none = self._found.note or _refuted(self._found) or None
         except SafeEnvsError as error:
             # The search covers the whole safe set, where the episodes may never be.
@@ -133,7 +137,7 @@ class GuaranteeAverager:
             return None, self._why_none
         mean, remark = self._values.mean, self._found.remark
         if not mean:
-            return None, remark or "it is 0 at these starts up to this horizon"
+            return None, remark or NOTHING
         return mean, "; ".join(filter(None, [remark, _undecided(self._found)]))
 
 

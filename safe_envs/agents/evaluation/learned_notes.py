@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
+from safe_envs.outward_text import number_at_most
 from safe_envs.problem.problem import SafetyProblem
 
 
@@ -46,11 +47,12 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
             notes.append(f"bound of {name} over the posterior: {bound.note}")
         if bound and bound.delta is not None:
             word = "" if bound.probability is None else f" {bound.word} given the posterior,"
+            numbers = (bound.delta, bound.shortfall, bound.bias, bound.supremum)
+            delta, m, e, c = (number_at_most(value or 0.0, 3) for value in numbers)
             notes.append(
                 f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,{word}"
-                f" with probability delta = {bound.delta:.3g} that the identification"
-                f" does not contain the system, shortfall m = {bound.shortfall:.3g}, bias of the"
-                f" steps e = {bound.bias:.3g}, c = {bound.supremum:.3g}."
+                f" with probability delta = {delta} that the identification does not contain the"
+                f" system, shortfall m = {m}, bias of the steps e = {e}, c = {c}."
             )
     return notes
 

@@ -22,6 +22,10 @@ left one undecided, which a search did not find to fail; episodes contradict it;
 none."""
 
 
+RowKind = Literal["filter", "unfiltered"]
+"""What a row is of: a filter, or the env without one."""
+
+
 @dataclass(frozen=True)
 class EpisodeResults:
     """What became of each episode, in their order: arrays of shape (E,).
@@ -232,18 +236,20 @@ class EvaluationRow(BoundSummary, EpisodeSummary):
     Attributes:
         filter: its name, "none" without one.
         policy: name of the policy.
+        kind: what the row is of.
         learning: what was learned for the filter; None where nothing was.
         estimation: how good the estimates were; None at the true state.
     """
 
     filter: str
     policy: str
+    kind: RowKind
     learning: LearningSummary | None = None
     estimation: EstimationSummary | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as JSON-able data."""
-        head = {"filter": self.filter, "policy": self.policy}
+        head = {"filter": self.filter, "policy": self.policy, "kind": self.kind}
         bound = self.posterior_bound
         found = head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
         if self.estimation is None:

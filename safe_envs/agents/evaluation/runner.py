@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.bound_averages import BoundAverager
 from safe_envs.agents.evaluation.closed_loop_bound import compute_closed_loop
 from safe_envs.agents.evaluation.comparison import compare_all
-from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.contradiction import judged, upper_ends_of
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
 from safe_envs.agents.evaluation.episodes_file import episodes_file
 from safe_envs.agents.evaluation.evaluation_data import FilterTiming, Timing
@@ -28,7 +28,7 @@ from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.evaluation.views import View, views_of
 from safe_envs.agents.evaluation.work_parts import WorkParts
-from safe_envs.agents.evaluation.yardstick import best_at_hand, best_for, chained, sure_high
+from safe_envs.agents.evaluation.yardstick import best_for, chained
 
 
 class EvaluationRunner:
@@ -109,14 +109,8 @@ class EvaluationRunner:
         )
 
     def _best(self) -> AttainableSafety | None:
-        """Return how safe any policy can be, if it is asked for or known already."""
-        resolved = self._resolved
-        if self._spec.best:
-            return best_for(resolved.truth, self._work.part())
-        third_party = resolved.target.filter_spec is not None
-        if self._spec.best is False or third_party or self._spec.monitoring == "continuous":
-            return None
-        return best_at_hand(resolved.truth)
+        """Return how safe any policy can be, if it is asked for."""
+        return best_for(self._resolved.truth, self._work.part()) if self._spec.best else None
 
     def _bounded(self, view: View) -> list[FilteredPolicy]:
         """Return what the bounds of a filter are of, for each identification."""
@@ -176,12 +170,13 @@ class EvaluationRunner:
         row = EvaluationRow(
             filter=view.name,
             policy=policy,
+            kind=view.kind,
             learning=learning,
             estimation=view.estimation([each.estimation for each in totals], spec.confidence),
             **vars(pooled(summaries, spec.confidence)),
             **vars(together(bounds)),
         )
-        return judged(row, row.ci_high, sure_high(row))
+        return judged(row, *upper_ends_of(row, spec.confidence))
 
     def _timing(
         self, view: View, totals: Sequence[EpisodeStatistics], player: Player, seconds: float

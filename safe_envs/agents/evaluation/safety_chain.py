@@ -19,9 +19,9 @@ from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.held_input import HeldAverager, held_bound_of
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.agents.evaluation.yardstick import against_attainable, best_at_hand
+from safe_envs.agents.evaluation.yardstick import against_attainable
 from safe_envs.wrappers import spec_of
-from safe_envs.wrappers.verification.feasibility import Verification
+from safe_envs.wrappers.conditions.filter_settings import FilterSettings
 from safe_envs.wrappers.verification.results import HOLDING, Bound
 
 
@@ -34,7 +34,7 @@ class SafetyChain:
         rate: measured from the problem's start, up to its horizon; None where it was not.
         ci_low: lower end of the 95 % interval of the rate.
         ci_high: upper end.
-        best: attainable safety, if its table is in the cache.
+        best: attainable safety, if it was asked for.
     """
 
     bounds: BoundSummary
@@ -58,24 +58,24 @@ _SHOWN = (
 
 
 def safety_chain(
-    verification: Verification,
+    filtered: FilteredPolicy,
     starts: np.ndarray,
     bounds: Sequence[Bound],
     measurements: Sequence[MeasuredSafety],
-    policy: str = "nominal",
+    best: AttainableSafety | None = None,
 ) -> SafetyChain:
     """Return the chain of conditions, without what contradicts another part of it.
 
     Args:
-        verification: of the conditions.
+        filtered: the conditions, and the policy that was simulated.
         starts: over which the bounds are averaged, shape (B, n).
         bounds: for continuous control, as far as they are not contradicted.
         measurements: of the problem's start first; none without a simulation.
-        policy: name of the one that was simulated.
+        best: attainable safety, if it was asked for.
     """
-    formulas = verification.formulas
-    problem, name = formulas.problem, spec_of(formulas.conditions)
-    filtered = FilteredPolicy(problem, tuple(formulas.conditions), formulas.knowledge, policy)
+    problem = filtered.problem
+    assert not isinstance(filtered.parts, FilterSettings)
+    name = spec_of(filtered.parts)
     averager = HeldAverager(held_bound_of(filtered))
     averager.add(starts)
     first = measurements[0] if measurements else None
@@ -85,7 +85,6 @@ def safety_chain(
         summary = averager.put_in(summary, each)
         if summary.withheld:
             break
-    best = best_at_hand(problem)
     rates = None, None, None
     if first is not None:
         h = first.horizons[0]

@@ -18,6 +18,7 @@ from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition, FilterSpec, spec_of
+from safe_envs.wrappers.conditions.names import AT_STATE
 from safe_envs.wrappers.learning import LearnedModel
 
 UNFILTERED = "none"
@@ -28,6 +29,8 @@ KNOWLEDGE = ("model", "plant")
 
 OBJECTIVES = ("nearest", "clf")
 """Objectives of filters."""
+
+_FLAGS = ("trust", "bounds", "best", "closed_loop", "compare_estimates")
 
 Progress = Callable[[float], None]
 """Is called with the number, or the part, of the work that is done."""
@@ -65,10 +68,9 @@ class EvaluationSpec:
             it; 1 where nothing is.
         monitoring: where h is checked: "discrete" at control instants, "continuous" between them
             too.
-        best: whether to compute how safe any policy can be; None to tell that only where the table
-            for it is in the cache.
+        best: whether to compute how safe any policy can be.
         closed_loop: whether to compute certified tables of the closed loops, which bound from below
-            how safe each filter is with this policy; None to read only those in the cache.
+            how safe each filter is with this policy.
         estimator: of the state of a measured problem: "kf", "ekf" or "ukf", with settings. Then
             each filter gets several rows; see `safe_envs.agents.evaluation.views`.
         belief: probability of the rows with belief conditions.
@@ -96,8 +98,8 @@ class EvaluationSpec:
     bounds: bool = True
     repeats: int = 1
     monitoring: str = "discrete"
-    best: bool | None = None
-    closed_loop: bool | None = None
+    best: bool = False
+    closed_loop: bool = False
     estimator: str | None = None
     belief: float = 0.05
     observe: str = "estimate"
@@ -110,18 +112,13 @@ class EvaluationSpec:
             value = getattr(self, name)
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
-        for name in ("trust", "bounds", "compare_estimates"):
+        for name in _FLAGS:
             if not isinstance(getattr(self, name), bool | np.bool_):
                 raise ConfigurationError(
                     f"{name} = {shown(getattr(self, name))}; give True or False"
                 )
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
-        for name in ("best", "closed_loop"):
-            if not isinstance(getattr(self, name), bool | None):
-                raise ConfigurationError(
-                    f"{name} = {shown(getattr(self, name))}; give True, False or None"
-                )
         if self.best and self.monitoring == "continuous":
             raise ConfigurationError(
                 "best = True with monitoring = 'continuous': the best attainable safety is of"
@@ -152,10 +149,7 @@ class EvaluationSpec:
             ("learned", tuple(learned)),
             ("policy", str(self.policy) if isinstance(self.policy, Path) else self.policy),
             *((name, int(getattr(self, name))) for name in ("episodes", "seed", "repeats")),
-            *(
-                (name, bool(getattr(self, name)))
-                for name in ("trust", "bounds", "compare_estimates")
-            ),
+            *((name, bool(getattr(self, name))) for name in _FLAGS),
             ("confidence", float(self.confidence)),
         ):
             object.__setattr__(self, name, value)
@@ -271,6 +265,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError
+
+
+def is_unfiltered(filter_text: str) -> bool:
+    """Return whether the text of a filter is that of none, at the true state or at an estimate."""
+    return filter_text.removesuffix(AT_STATE) == UNFILTERED
 
 
 def listed(filters: Sequence[Filter] | Filter | None) -> Sequence[Filter] | None:

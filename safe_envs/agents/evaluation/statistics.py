@@ -52,6 +52,37 @@ def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tupl
     return float(low), float(high)
 
 
+def exact_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return Clopper and Pearson's interval for the probability of success.
+
+    Each of its ends is beyond the truth in at most (1 - confidence)/2 of all cases, whatever the
+    truth. That of Wilson's interval is in several times as many where the truth is near 0 or 1: so
+    claims are held against this one.
+
+    For arguments and errors see `wilson_interval`.
+    """
+    require_confidence(confidence)
+    _counts(successes, trials)
+    tail = (1.0 - confidence) / 2.0
+    low = 1.0 - exact_upper_end(trials - successes, trials, tail)
+    return low, exact_upper_end(successes, trials, tail)
+
+
+def exact_upper_end(successes: int, trials: int, error: float) -> float:
+    """Return Clopper and Pearson's one-sided upper end for the probability of success.
+
+    Args:
+        successes: how many of the trials succeeded.
+        trials: at least 1.
+        error: part of all cases in which the end is below the truth, at most.
+    """
+    from scipy.special import betaincinv
+
+    if successes == trials:
+        return 1.0
+    return float(betaincinv(successes + 1, trials - successes, 1.0 - error))
+
+
 def rate_band(
     successes: np.ndarray, trials: int, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,7 @@ from safe_envs.agents.evaluation.estimation import (
     summary_of,
 )
 from safe_envs.agents.evaluation.resolved import FilterParts, ResolvedEvaluation, conditions_of
+from safe_envs.agents.evaluation.rows import RowKind
 from safe_envs.agents.evaluation.spec import (
     UNFILTERED,
     EvaluationSpec,
@@ -47,6 +48,11 @@ class View(NamedTuple):
     name: str
     base: str
     resolved: ResolvedEvaluation
+
+    @property
+    def kind(self) -> RowKind:
+        """What the row is of."""
+        return "unfiltered" if self.base == UNFILTERED else "filter"
 
     @property
     def estimates(self) -> bool:

@@ -22,23 +22,22 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from safe_envs.agents.evaluation.attainable import (
-    SURE,
     AttainableSafety,
     attainable_safety,
     contradicted,
-    of_table,
     withheld,
 )
 from safe_envs.agents.evaluation.contradiction import Bounded, above_attainable, without_held
 from safe_envs.agents.evaluation.countings import leaves_safely
+from safe_envs.agents.evaluation.kept_attainable import (
+    keep_attainable,
+    kept_attainable,
+    place_of,
+)
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
-from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.look_ahead import LookAhead
 from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.table_cache import table_at_hand
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,9 @@ def evaluation_settings(problem: SafetyProblem) -> ValueSettings:
 
 
 def best_for(problem: SafetyProblem, progress: Progress | None = None) -> AttainableSafety:
-    """Return the best attainable safety as `evaluate` counts, and compute it if need be.
+    """Return the best attainable safety as `evaluate` counts.
+
+    It is computed if need be, and kept in the user's cache.
 
     Args:
         problem: with the starts.
@@ -110,19 +111,15 @@ def best_for(problem: SafetyProblem, progress: Progress | None = None) -> Attain
     Raises:
         ConfigurationError: There is no table of the problem.
     """
-    return attainable_safety(problem, evaluation_settings(problem), episodes=0, progress=progress)[
-        0
-    ]
-
-
-def best_at_hand(problem: SafetyProblem) -> AttainableSafety | None:
-    """Return the best attainable safety if its table is in the cache; nothing is computed."""
-    try:
-        table = table_at_hand(problem, evaluation_settings(problem))
-        return None if table is None else of_table(problem, table, LookAhead(table, problem))
-    except SafeEnvsError:
-        # A problem without a table, or a file that is damaged: nobody has asked for it.
-        return None
+    settings = evaluation_settings(problem)
+    place = place_of(problem.unmeasured, settings)
+    found = kept_attainable(place)
+    if found is None:
+        found, _ = attainable_safety(problem, settings, episodes=0, progress=progress)
+        keep_attainable(found, place)
+    elif progress is not None:
+        progress(1.0)
+    return found
 
 
 def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> AttainableSafety:
@@ -135,17 +132,6 @@ def held_against(best: AttainableSafety, rows: Sequence[EvaluationRow]) -> Attai
     """
     judging = [r for r in rows if r.learning is None or r.learning.repeats == 1]
     return contradicted(best, [(row.filter, row.safe, row.episodes) for row in judging])
-
-
-def sure_high(row: EvaluationRow) -> float:
-    """Return the upper end of the interval of a row's rate that a proved bound is held against.
-
-    Args:
-        row: of an evaluation; over several identifications its own interval is all there is.
-    """
-    if row.learning is not None and row.learning.repeats > 1:
-        return row.ci_high
-    return rate_interval(row.safe, row.episodes, SURE)[1]
 
 
 def chained(

@@ -10,14 +10,13 @@ from typing import Any
 
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, listed
-from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.statistics import exact_interval
 from safe_envs.agents.evaluation.work_parts import WorkParts
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, optimal_tilt
-from safe_envs.agents.rare_events.particles import PathPlayer
-from safe_envs.agents.rare_events.path_players import player_of
-from safe_envs.agents.rare_events.rows import BETTER, PlainEpisodes, RareEstimate, RareRow, verdict
-from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
+from safe_envs.agents.rare_events.path_players import ChosenPlayer, player_of
+from safe_envs.agents.rare_events.rows import PlainEpisodes, RareEstimate, RareRow, doubt_of
+from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Pilot, Repetitions, Splitting
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.actuators import require_direct
@@ -29,6 +28,13 @@ REPETITIONS = 20
 
 _EPISODES = 10
 """Plain episodes that take NumPy as long as a particle with all of its continuations, about."""
+
+_BETTER = 2.0
+"""How many times smaller the error of importance sampling has to be, as predicted."""
+
+_MOST_DEVIATION = 2.0
+"""Deviation of the weights, relative to the probability, up to which they are taken: larger ones
+have heavy tails, and a sample of them does not show how large they can be."""
 
 _FEWEST_PARTICLES = 20
 _FEWEST_REPETITIONS = 10
@@ -65,7 +71,7 @@ def estimate_rare(
     policy: Any = "nominal",
     filters: Sequence[Filter] | Filter | None = None,
     *,
-    particles: int = PARTICLES,
+    particles: int | None = None,
     repetitions: int = REPETITIONS,
     num_envs: int = 4096,
     engine: str = "auto",
@@ -76,9 +82,10 @@ def estimate_rare(
 
     See `safe_envs.agents.rare_events.splitting.Splitting`.
 
-    The violating paths of splitting predict the error of importance sampling by a drift, see
-    `safe_envs.agents.rare_events.importance_sampling.optimal_tilt`. If that is less than half of
-    splitting's relative error, it is tried; see `safe_envs.agents.rare_events.rows.verdict`.
+    A pilot, whose noise has a seed of its own, chooses how: the score on which paths are split, the
+    number of particles, and whether importance sampling by a drift is used, see
+    `safe_envs.agents.rare_events.importance_sampling.optimal_tilt`. The choice knows nothing of the
+    estimate, which therefore remains unbiased.
 
     An episode is safe as in `safe_envs.agents.evaluation.evaluate.evaluate`. The intervals are
     those of independent repetitions, see
@@ -89,7 +96,8 @@ def estimate_rare(
         problem: as for `evaluate`, but no third-party env, whose state cannot be restored.
         policy: as for `evaluate`, without memory.
         filters: as for `evaluate`.
-        particles: episodes of a repetition.
+        particles: episodes of a repetition; by default 250, or as many, up to 4000, as make the
+            repetitions differ little.
         repetitions: independent ones, at least 10.
         num_envs: the most episodes that NumPy simulates side by side; all but `timing` is the same,
             to the last bit, for any.
@@ -106,7 +114,7 @@ def estimate_rare(
         NumericalError: A simulation or a condition left the finite numbers.
     """
     for name, value, least in (
-        ("particles", particles, _FEWEST_PARTICLES),
+        ("particles", PARTICLES if particles is None else particles, _FEWEST_PARTICLES),
         ("repetitions", repetitions, _FEWEST_REPETITIONS),
         ("num_envs", num_envs, 1),
     ):
@@ -143,7 +151,7 @@ class _Estimator:
     """Estimates the probability of a violation, filter by filter."""
 
     resolved: ResolvedEvaluation
-    particles: int
+    particles: int | None
     repetitions: int
     num_envs: int
     engine: str
@@ -151,50 +159,72 @@ class _Estimator:
 
     def row(self, name: str, policy: str) -> tuple[RareRow, dict[str, Any]]:
         """Return the row of a filter, and its timing."""
-        resolved = self.resolved
         nothing = RareRow(filter=name, policy=policy, status="none")
-        if resolved.is_frozen:
+        if self.resolved.is_frozen:
             reason = (
                 "nothing is random after the start, so that copies of an episode go on like it;"
                 " plain episodes find all that there is"
             )
             speed = {"seconds": 0.0, "steps_per_second": 0.0, "engine": "numpy", "jobs": 1}
             return replace(nothing, reason=reason), speed
-        periods = _EPISODES * self.particles * self.repetitions * resolved.problem.steps
-        chosen = player_of(resolved, resolved.filters[name][0], self.num_envs, self.engine, periods)
+        # What compiles, or is read from disk, is no part of the time.
+        chosen = self._player(name, 2 * self._first)
         begun = time.perf_counter()
-        row = self._estimated(nothing, chosen.player)
+        pilot = Splitting(chosen.player, self.resolved.spec.seed).pilot(
+            self._first, self.repetitions, self.work.part()
+        )
         seconds = time.perf_counter() - begun
+        particles = self.particles or pilot.enough()
+        if chosen.engine != "compiled":
+            chosen = self._player(name, particles)
+        begun = time.perf_counter()
+        row = self._estimated(nothing, pilot, particles, chosen)
+        seconds += time.perf_counter() - begun
         speed = {"seconds": seconds, "steps_per_second": row.steps / seconds}
         return row, {**speed, "engine": chosen.engine, "jobs": chosen.jobs}
 
-    def _estimated(self, nothing: RareRow, player: PathPlayer) -> RareRow:
+    @property
+    def _first(self) -> int:
+        """Particles of a pilot."""
+        return min(self.particles or PARTICLES, PARTICLES)
+
+    def _player(self, name: str, particles: int) -> ChosenPlayer:
+        """Return who simulates repetitions of so many particles under a filter."""
+        periods = _EPISODES * particles * self.repetitions * self.resolved.problem.steps
+        conditions = self.resolved.filters[name][0]
+        return player_of(self.resolved, conditions, self.num_envs, self.engine, periods)
+
+    def _estimated(
+        self, nothing: RareRow, pilot: Pilot, particles: int, chosen: ChosenPlayer
+    ) -> RareRow:
         """Fill the row of a filter.
 
         Args:
             nothing: the row without an estimate.
-            player: simulates the paths.
+            pilot: which chooses how.
+            particles: of splitting.
+            chosen: simulates the paths.
         """
-        spec, problem = self.resolved.spec, self.resolved.problem
-        how = (player, spec.seed)
-        splitting, work = Splitting(*how), self.work
-        power, pilot_steps = splitting.choose(self.particles, work.part())
-        found = splitting.estimate(power, self.particles, self.repetitions, work.part())
-        paths = found.paths
-        low, high = rate_interval(found.first, paths.lowest.size, spec.confidence)
-        plain = PlainEpisodes(
-            paths.lowest.size, found.first, low, high, paths.outside, paths.kept_length
-        )
-        steps = paths.steps + pilot_steps
-        nothing = replace(nothing, levels=float(found.levels.mean()), steps=steps, plain=plain)
-        if found.stuck or found.endless:
-            return replace(nothing, reason=_why_none(found, self.particles, problem, plain))
-        by = "splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)"
-        split = RareEstimate.of(by, found.estimates, spec.confidence)
-        if not found.levels.any():
-            split = replace(split, method="plain episodes", ci_low=low, ci_high=high)
-        drift, drift_steps = self._by_drift(ImportanceSampling(*how), found, split.relative_error)
-        best, check, doubt = verdict(split, drift, plain)
+        spec, steps = self.resolved.spec, pilot.run.paths.steps
+        seen, levels, check = pilot.run, pilot.run.levels[pilot.part], None
+        best, drift_steps = self._by_drift(pilot, particles, chosen)
+        size, steps = self._first, steps + drift_steps
+        if best is None:
+            size, splitting = particles, Splitting(chosen.player, spec.seed)
+            seen = splitting.estimate(pilot.power, size, self.repetitions, self.work.part())
+            levels, steps = seen.levels, steps + seen.paths.steps
+        plain, mean = _plain(seen, spec.confidence), float(levels.mean())
+        nothing = replace(nothing, levels=mean, steps=steps, plain=plain, particles=size)
+        by = f"splitting on h{'/sqrt(T - t)' * (pilot.power != POWERS[0])}"
+        if best is not None:
+            check = RareEstimate.of(by, pilot.estimates, spec.confidence)
+        elif seen.stuck or seen.endless:
+            return replace(nothing, reason=_why_none(seen, particles, self.resolved.problem, plain))
+        else:
+            best = RareEstimate.of(by, seen.estimates, spec.confidence)
+            if not levels.any():
+                ends = {"ci_low": plain.ci_low, "ci_high": plain.ci_high}
+                best = replace(best, method="plain episodes", **ends)
         p, error = best.probability, best.relative_error
         needed = (1.0 - p) / (p * error**2) if error else None
         return replace(
@@ -202,35 +232,46 @@ class _Estimator:
             status="estimated",
             **vars(best),
             plain_episodes_needed=needed,
-            plain_steps_needed=None if needed is None else needed * found.length,
-            doubt=doubt,
+            plain_steps_needed=None if needed is None else needed * seen.length,
+            doubt=doubt_of(best, check, plain),
             check=check,
-            steps=steps + drift_steps,
         )
 
     def _by_drift(
-        self,
-        drifting: ImportanceSampling,
-        found: Repetitions,
-        to_beat: float,
+        self, pilot: Pilot, particles: int, chosen: ChosenPlayer
     ) -> tuple[RareEstimate | None, int]:
         """Return the estimate by importance sampling, and the control periods that it took.
 
-        There is none unless it is predicted to be much better.
+        There is none unless the pilot predicts that it is much better.
         """
-        duration, sizes = self.resolved.problem.duration, (self.particles, self.repetitions)
-        length, deviation = optimal_tilt(*found.violating(), duration)
-        if not BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
+        if pilot.often or not (pilot.estimates > 0.0).all():
             return None, 0
+        length, deviation = optimal_tilt(
+            *pilot.run.violating(pilot.part), self.resolved.problem.duration
+        )
+        predicted = pilot.deviation * math.sqrt(pilot.particles / particles)
+        worth = _BETTER * deviation / math.sqrt(self._first) < predicted
+        if deviation > _MOST_DEVIATION or not worth:
+            return None, 0
+        drifting = ImportanceSampling(chosen.player, self.resolved.spec.seed)
         try:
-            estimates, steps = drifting.estimate(length, *sizes)
+            estimates, steps = drifting.estimate(length, self._first, self.repetitions)
         except NumericalError:
             # Pushed far out, a system may leave the finite numbers.
             return None, 0
         if not (estimates > 0.0).all():
             return None, steps
+        if (done := self.work.part()) is not None:
+            done(1.0)
         method = f"drift of {length:.3g}/sqrt(s)"
         return RareEstimate.of(method, estimates, self.resolved.spec.confidence), steps
+
+
+def _plain(found: Repetitions, confidence: float) -> PlainEpisodes:
+    """Return the episodes with which repetitions begin."""
+    paths, count = found.paths, found.paths.lowest.size
+    low, high = exact_interval(found.first, count, confidence)
+    return PlainEpisodes(count, found.first, low, high, paths.outside, paths.kept_length)
 
 
 def _why_none(

@@ -1,4 +1,4 @@
-"""Estimates of rare violations, and which of two is the result."""
+"""Estimates of rare violations, and what contradicts them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ import numpy as np
 
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 
-BETTER = 2.0
-"""How many times smaller the relative error of importance sampling has to be."""
-
-_ROUGH = 1.0
-"""Standard deviation of the logarithms of repetitions above which their interval is rough."""
+_ROUGH = 0.4
+"""Standard deviation of the logarithms of repetitions above which their interval is doubted."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class RareEstimate:
             estimates: of the repetitions.
             confidence: of the interval.
         """
-        low, high = log_normal_interval(estimates, confidence)
+        low, high = skewed_interval(estimates, confidence)
         p = math.fsum(estimates) / len(estimates)
         error = float(np.std(estimates, ddof=1)) / math.sqrt(len(estimates)) / p
         return cls(method, p, low, min(high, 1.0), error, estimates.tolist())
@@ -94,7 +91,8 @@ class RareRow:
         plain_episodes_needed: for the same relative error without splitting.
         plain_steps_needed: control periods of these.
         doubt: what contradicts the estimate.
-        check: the other estimate, if there are two.
+        check: that of the pilot, by another method.
+        particles: episodes of a repetition.
         levels: mean number of levels.
         steps: control periods that were simulated.
         plain: the episodes at the beginning.
@@ -114,6 +112,7 @@ class RareRow:
     plain_steps_needed: float | None = None
     doubt: str | None = None
     check: RareEstimate | None = None
+    particles: int = 0
     levels: float = 0.0
     steps: int = 0
     plain: PlainEpisodes | None = None
@@ -123,40 +122,57 @@ class RareRow:
         return asdict(self) | {"estimates": list(self.estimates)}
 
 
-def verdict(
-    split: RareEstimate, drift: RareEstimate | None, plain: PlainEpisodes
-) -> tuple[RareEstimate, RareEstimate | None, str | None]:
-    """Return which of two estimates is the result, which its check, and what contradicts it.
+def skewed_interval(estimates: np.ndarray, confidence: float) -> tuple[float, float]:
+    """Return an interval for the mean of positive estimates, of which the largest are the rarest.
 
-    Importance sampling's is the result if its relative error is less than half of splitting's and
-    their intervals overlap.
+    It is that for nearly normal logarithms, see
+    `safe_envs.agents.evaluation.statistics.log_normal_interval`. Some estimates are more skewed
+    than that, on the side on which a probability is taken for too small: the upper end is that of
+    Johnson's interval where this is larger, which has the third moment in place of a distribution.
 
     Args:
-        split: by splitting.
-        drift: by importance sampling, if there is one.
+        estimates: of the repetitions, shape (R,).
+        confidence: of the two-sided interval.
+
+    Source: N. J. Johnson, Modified t tests and confidence intervals for asymmetrical populations,
+        Journal of the American Statistical Association 73 (1978) 536-544.
+    """
+    from scipy.special import stdtrit
+
+    low, high = log_normal_interval(estimates, confidence)
+    count, mean = len(estimates), float(np.mean(estimates))
+    deviation = float(np.std(estimates, ddof=1))
+    spread = float(np.std(estimates))
+    skew = float(np.mean((estimates - mean) ** 3)) / spread**3 if spread else 0.0
+    t = float(stdtrit(count - 1, 0.5 + confidence / 2.0)) / math.sqrt(count)
+    return low, max(high, mean + deviation * (t + skew * (1.0 / (6.0 * count) + t**2 / 3.0)))
+
+
+def doubt_of(found: RareEstimate, check: RareEstimate | None, plain: PlainEpisodes) -> str | None:
+    """Return what contradicts an estimate; None if nothing does.
+
+    Args:
+        found: the estimate.
+        check: that of the pilot, by another method; None if it is by the same.
         plain: the plain episodes.
     """
-    agree = drift is None or _overlap(split, drift)
-    found, check = split, drift
-    if drift is not None and agree and BETTER * drift.relative_error < split.relative_error:
-        found, check = drift, split
-    doubt = None
-    if check is not None and not agree:
-        doubt = (
-            f"importance sampling says {check.probability:.2g} [{check.ci_low:.2g},"
+    if check is not None and not _overlap(found, check):
+        return (
+            f"{check.method} says {check.probability:.2g} [{check.ci_low:.2g},"
             f" {check.ci_high:.2g}]: take more particles"
         )
-    elif not _overlap(found, plain):
-        doubt = (
-            f"its first episodes are plain ones, and {plain.violations} violations among"
+    if not _overlap(found, plain):
+        return (
+            f"the first episodes are plain ones, and {plain.violations} violations among"
             f" {plain.episodes} contradict it: take more particles"
         )
-    elif float(np.std(np.log(found.estimates))) > _ROUGH:
-        doubt = (
-            "its repetitions differ by large factors, so that the interval is rough: take more"
-            " particles"
+    spread = float(np.std(np.log(found.estimates), ddof=1))
+    if spread > _ROUGH:
+        return (
+            f"its repetitions differ, with a standard deviation of {spread:.2g} of their"
+            " logarithms, so that the interval may miss the probability: take more particles"
         )
-    return found, check, doubt
+    return None
 
 
 def _overlap(one: RareEstimate, other: RareEstimate | PlainEpisodes) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,8 +22,13 @@ POWERS = (0.0, 0.5)
 """Of the time that is left, in the two scores: see
 `safe_envs.agents.rare_events.heights.Heights`."""
 
-_PILOT_REPETITIONS = 10
-_FEWEST_PARTICLES = 50
+TARGET = 0.25
+"""Standard deviation of the logarithms of estimates that the number of particles is chosen for: a
+pilot knows it to some 20 %, and what it comes to is to be below .3."""
+
+_MOST_TIMES = 16
+"""By how much the number of particles of a pilot is raised at most."""
+
 _OFTEN = 0.1
 
 
@@ -51,27 +57,36 @@ class Splitting:
     seed: int
     killed: float = KILLED
 
-    def choose(
-        self, particles: int, progress: Callable[[float], None] | None = None
-    ) -> tuple[float, int]:
-        """Find the power whose estimates differ less, in a few small repetitions with each.
+    def pilot(
+        self,
+        particles: int,
+        repetitions: int,
+        progress: Callable[[float], None] | None = None,
+    ) -> Pilot:
+        """Run some repetitions with each score, with noise of their own.
 
-        It is 0 if violations are frequent.
+        Both scores are unbiased, so that the better one has the estimates that lie higher: a large
+        part of the probability that few repetitions find makes the others too low, and the spread
+        of what they agree on does not show it.
 
         Args:
-            particles: of the estimation that is to come.
+            particles: N.
+            repetitions: R of each score.
             progress: called with the part that is done.
 
         Returns:
-            One of `POWERS`, and the control periods that were simulated.
+            The better score, with its estimates; the first one if violations are frequent.
+
+        Raises:
+            ConfigurationError: the policy has a memory.
         """
-        count = max(particles // 5, _FEWEST_PARTICLES)
-        run = Repetitions(self, np.repeat(POWERS, _PILOT_REPETITIONS), count, PILOTS)
+        run = Repetitions(self, np.repeat(POWERS, repetitions), particles, PILOTS)
         often = run.first > _OFTEN * run.paths.lowest.size
         if not often:
             run.finish(progress)
-        spreads = [_spread(part) for part in np.split(run.estimates, len(POWERS))]
-        return (POWERS[0] if often else POWERS[spreads.index(min(spreads))]), run.paths.steps
+        parts = [range(k * repetitions, (k + 1) * repetitions) for k in range(len(POWERS))]
+        chosen = 0 if often else _better(*(run.estimates[part] for part in parts))
+        return Pilot(POWERS[chosen], particles, often, run, parts[chosen])
 
     def estimate(
         self,
@@ -99,13 +114,18 @@ class Splitting:
         return run
 
 
-def _spread(estimates: np.ndarray) -> tuple[int, float]:
-    """Return how much estimates differ.
-
-    First counts how many there are none, then the deviation of the logarithms of the others.
-    """
-    found = estimates[estimates > 0.0]
-    return len(estimates) - len(found), float(np.std(np.log(found))) if len(found) else 0.0
+def _better(first: np.ndarray, second: np.ndarray) -> int:
+    """Return the index of the unbiased estimates that lose less; of the first ones in doubt."""
+    if (lost := [np.count_nonzero(each == 0.0) for each in (first, second)])[0] != lost[1]:
+        return lost.index(min(lost))
+    logs = [np.log(each[each > 0.0]) for each in (first, second)]
+    if min(map(len, logs)) < 2:
+        return 0
+    (mean, variance), (other_mean, other_variance) = (
+        (float(each.mean()), float(each.var(ddof=1))) for each in logs
+    )
+    error = math.sqrt(variance / len(logs[0]) + other_variance / len(logs[1]))
+    return int(other_mean - other_variance / 2.0 - (mean - variance / 2.0) > error)
 
 
 class Repetitions:
@@ -156,16 +176,21 @@ class Repetitions:
                 progress(1.0 - float(levels.mean()) / highest)
             self.paths.branch(killed, parents, levels)
 
-    def violating(self) -> tuple[np.ndarray, np.ndarray]:
+    def violating(self, part: range | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the `girsanov_integrals` of the paths that violate, and their shares.
 
         The share is the part of the estimated probability for which each stands.
+
+        Args:
+            part: of the repetitions; None for all.
         """
+        part = part or range(len(self.estimates))
         violate = self.paths.lowest.reshape(len(self.estimates), self._particles) <= 0.0
-        each = self.estimates / (np.maximum(violate.sum(axis=1), 1) * len(self.estimates))
-        return self.paths.girsanov_integrals(np.flatnonzero(violate)), np.repeat(
-            each, violate.sum(axis=1)
-        )
+        counts = violate[part].sum(axis=1)
+        each = self.estimates[part] / (np.maximum(counts, 1) * len(part))
+        own = np.zeros_like(violate)
+        own[part] = violate[part]
+        return self.paths.girsanov_integrals(np.flatnonzero(own)), np.repeat(each, counts)
 
     def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return which paths to kill, which to continue in their place, and from which level.
@@ -188,3 +213,41 @@ class Repetitions:
             return None
         parents = self._generators[r].choice(survivors, killed.size)
         return killed, parents, np.full(killed.size, level)
+
+
+@dataclass(frozen=True)
+class Pilot:
+    """What repetitions of their own say about an estimation that is to come.
+
+    Attributes:
+        power: of the better score.
+        particles: N.
+        often: whether violations are frequent, so that nothing has to be split.
+        run: the repetitions, with all scores.
+        part: those with the better one.
+    """
+
+    power: float
+    particles: int
+    often: bool
+    run: Repetitions
+    part: range
+
+    @property
+    def estimates(self) -> np.ndarray:
+        """Estimates with the better score, 0 for those that were given up, shape (R,)."""
+        return self.run.estimates[self.part]
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the logarithms of the estimates that were not given up."""
+        found = self.estimates[self.estimates > 0.0]
+        return float(np.std(np.log(found), ddof=1)) if len(found) > 1 else 0.0
+
+    def enough(self) -> int:
+        """Return how many particles make the spread small, as far as that is affordable."""
+        lost = np.count_nonzero(self.estimates == 0.0)
+        if self.often or 2 * lost > len(self.part):
+            return self.particles  # Where hardly any repetition gets there, more do not either.
+        times = (self.deviation / TARGET) ** 2
+        return math.ceil(self.particles * min(max(times, 4.0 if lost else 1.0), _MOST_TIMES))

@@ -11,7 +11,6 @@ from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.frontier_results import Frontier
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.yardstick import (
-    best_at_hand,
     best_for,
     evaluation_settings,
 )
@@ -215,15 +214,14 @@ def frontiers_of(
 
 
 def attainable_of(
-    env_ids: Sequence[str], out: Path, compute: bool | None, progress: Callable[[float], None]
+    env_ids: Sequence[str], out: Path, compute: bool, progress: Callable[[float], None]
 ) -> dict[str, AttainableSafety | str]:
     """Return the best attainable safety of envs, counted as the rows of the leaderboard are.
 
     Args:
         env_ids: full ids.
         out: folder of the leaderboard, which keeps it.
-        compute: compute what is missing; None to look for its table in the cache; False for
-            neither.
+        compute: compute what is missing.
         progress: receives the part of the work that is done, from 0 to 1.
 
     Returns:
@@ -246,18 +244,13 @@ def attainable_of(
             with reading(store.path(key)):
                 found[env_id] = AttainableSafety(**document["best"])
             continue
+        if not compute:
+            continue
         try:
-            best = (
-                best_for(problem, lambda part, k=k: progress((k + part) / len(env_ids)))
-                if compute
-                else best_at_hand(problem)
-                if compute is None
-                else None
-            )
+            best = best_for(problem, lambda part, k=k: progress((k + part) / len(env_ids)))
         except ConfigurationError as error:
             found[env_id] = str(error)
             continue
-        if best is not None:
-            store.keep(key, configuration, {"best": vars(best)})
-            found[env_id] = best
+        store.keep(key, configuration, {"best": vars(best)})
+        found[env_id] = best
     return found

@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.setting_text import describe_system
-from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.policies.names import POLICY_FILE
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.figures.evaluation_plane import draw_plane
@@ -176,9 +175,10 @@ def _policy_name(path: Path) -> str:
 
 
 def _looks(evaluation: Evaluation) -> _Looks:
-    others = [row.filter for row in evaluation.rows if row.filter != UNFILTERED]
+    filters = [row.filter for row in evaluation.rows if row.kind == "filter"]
+    looks = {name: look(i) for i, name in enumerate(filters)}
     unfiltered = {"color": WARM, "linestyle": UNFILTERED_DASHES}
-    return {UNFILTERED: unfiltered} | {name: look(i) for i, name in enumerate(others)}
+    return {row.filter: looks.get(row.filter, unfiltered) for row in evaluation.rows}
 
 
 def _faintness(evaluation: Evaluation) -> float:

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.spec import is_unfiltered
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.scripts.figures.labels import labelled, plain, symbol
 from safe_envs.scripts.figures.saving import save
@@ -175,7 +175,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
         of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
         rates = {position[place]: _rate(_at(of_kind, layout.x, place)) for place in places}
         found = {at: rate for at, rate in rates.items() if rate is not None}
-        unfiltered = kind == UNFILTERED
+        unfiltered = isinstance(kind, str) and is_unfiltered(kind)
         style = {
             "color": WARM if unfiltered else colors[k % len(colors)],
             "linestyle": UNFILTERED_DASHES if unfiltered else look(k)["linestyle"],

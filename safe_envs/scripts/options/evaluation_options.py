@@ -125,28 +125,36 @@ Confidence = Annotated[
 Refine = Annotated[
     bool,
     typer.Option(
-        "--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged."
+        "--refine",
+        help="Repeat with dt/2 and dt/4, and extrapolate the safety rate to dt -> 0.",
+    ),
+]
+Bounds = Annotated[
+    bool,
+    typer.Option(
+        "--bounds/--no-bounds",
+        help="Look for bounds of the safety, which takes some seconds for each filter.",
+        show_default=False,
     ),
 ]
 Best = Annotated[
-    bool | None,
+    bool,
     typer.Option(
         "--best/--no-best",
         help=(
             "Compute the best attainable safety, and how many times the unavoidable violations each"
-            " filter has. By default they are shown if a table is in the cache."
+            " filter has."
         ),
         show_default=False,
     ),
 ]
 ClosedLoop = Annotated[
-    bool | None,
+    bool,
     typer.Option(
         "--closed-loop/--no-closed-loop",
         help=(
             "Compute a certified lower bound for each filter whose controller has a formula, by"
-            " tables of closed loops: up to two states, about a minute each. By default those"
-            " in the cache are read."
+            " tables of closed loops: up to two states, about a minute each."
         ),
         show_default=False,
     ),
@@ -169,7 +177,8 @@ Rare = Annotated[
 Particles = Annotated[
     int | None,
     typer.Option(
-        show_default="250", help="With --rare, in place of --episodes: episodes of a repetition."
+        show_default="250 to 4000, as many as make the repetitions differ little",
+        help="With --rare, in place of --episodes: episodes of a repetition.",
     ),
 ]
 Repetitions = Annotated[

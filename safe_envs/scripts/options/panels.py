@@ -16,7 +16,7 @@ PANELS: dict[str, str] = {
         "n-timesteps set action intervention-penalty promise-curriculum curriculum-part cost-limit"
         " violation-limit eval-freq eval-episodes resume train"
     ),
-    "Tables and proofs": "best closed-loop leaving cells inputs table spec check prices arb",
+    "Tables and proofs": "best closed-loop bounds leaving cells inputs table spec check prices arb",
     "Statistics": (
         "episodes attained seed seeds repeats confidence refine monitoring rare particles"
         " repetitions simulate states"
@@ -24,7 +24,7 @@ PANELS: dict[str, str] = {
     "Speed": "num-envs jobs engine threads quick seconds",
     "Output": (
         "out folder json latex episodes-out timing plot size pictures markdown page worst"
-        " tensorboard compare float32 name quiet"
+        " tensorboard compare float32 name clear quiet"
     ),
     "Other": "version install-completion show-completion help",
 }
@@ -89,6 +89,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sweep-report": ("safe-envs sweep-report found --x noise --lines filter",),
     "list": ("safe-envs list", "safe-envs list --json -"),
     "doctor": ("safe-envs doctor",),
+    "cache": ("safe-envs cache", "safe-envs cache --clear"),
     "demo": ("safe-envs demo --folder demo-results",),
     "benchmark": (
         "safe-envs benchmark --json today.json",

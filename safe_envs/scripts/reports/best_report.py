@@ -9,12 +9,14 @@ from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.best_text import COMPUTED, outwards
+from safe_envs.agents.evaluation.best_text import COMPUTED
 from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.outward_text import number_at_most, percents_between
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.quantities import size_text
 from safe_envs.scripts.reports.tables import print_rows
 
 _COUNTED = {
@@ -67,7 +69,7 @@ def print_best(console: Console, answer: BestAnswer) -> None:
     if found.lower is None or found.upper is None:
         ends = ("withheld", "withheld")
     else:
-        ends = tuple(f"{end} %" for end in outwards(found.lower, found.upper))
+        ends = tuple(f"{end} %" for end in percents_between(found.lower, found.upper))
     rows.append(("lower", ends[0], word[1]))
     s = found.simulated
     if s is not None:
@@ -102,9 +104,9 @@ def _word_lines(found: AttainableSafety, problem: SafetyProblem) -> list[str]:
         return [f"Note: lower and upper are {COMPUTED}. They are not proved."]
     both = check.upper is not None
     ends = "lower and upper are" if both else "lower is"
-    taken = f"{check.lower:.2g} is taken off the lower one"
-    if both:
-        taken += f", {check.upper:.2g} added to the upper one"
+    taken = f"{number_at_most(check.lower, 2)} is taken off the lower one"
+    if check.upper is not None:
+        taken += f", {number_at_most(check.upper, 2)} added to the upper one"
     told = (
         f"Note: {ends} certified: every cell at every step was checked by outward-rounded"
         f" arithmetic, in {check.seconds:.3g} s; {taken}."
@@ -126,9 +128,5 @@ def _grid_lines(found: AttainableSafety) -> list[str]:
     return [
         f"Coordinates: {'; '.join(found.coordinates)}",
         f"Grid: {count} cells, {found.inputs} inputs, {found.steps} steps; computed in"
-        f" {found.seconds:.3g} s, table of {_bytes(found.memory)}",
+        f" {found.seconds:.3g} s, table of {size_text(found.memory)}",
     ]
-
-
-def _bytes(count: int) -> str:
-    return f"{count / 1e9:.3g} GB" if count >= 1e9 else f"{count / 1e6:.3g} MB"

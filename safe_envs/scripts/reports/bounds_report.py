@@ -13,9 +13,9 @@ from safe_envs.agents.evaluation.bound_text import (
     bound_text,
     continuous_text,
     held_text,
-    rounded_down,
 )
 from safe_envs.agents.evaluation.rate_text import percent_in
+from safe_envs.outward_text import percent_at_least
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.quantities import share_text, state_text
 from safe_envs.scripts.reports.tables import print_rows
@@ -149,7 +149,7 @@ def _value(bound: Bound) -> str:
     if bound.status == "proved":
         return bound_text(bound.value, "proved")
     if bound.status == "estimated" and bound.value is not None:
-        return f"{rounded_down(bound.value)} %"
+        return f"{percent_at_least(bound.value)} %"
     return f"({share_text(bound.value)})" if _in_brackets(bound) else share_text(bound.value)
 
 

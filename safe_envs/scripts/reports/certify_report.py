@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,17 @@ from rich.text import Text
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.errors import ConfigurationError
+from safe_envs.outward_text import (
+    number_at_least,
+    number_at_most,
+    percent_at_least,
+    percent_at_most,
+)
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate
 from safe_envs.wrappers.synthesis.certify import Certification
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.starts import start_values
-from safe_envs.wrappers.value.table_cache import table_at_hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,7 @@ class CertifyAnswer:
         config: what was asked for, as JSON.
         problem: of the env.
         found: the certificate, and what was tried.
-        upper: of the best attainable safety of the env's step; None where no table of it is kept.
+        upper: of the best attainable safety of the env's step; None where it was not asked for.
         out: file of the certificate, if one was asked for.
     """
 
@@ -54,7 +56,7 @@ class CertifyAnswer:
             degrees.append(
                 {
                     "degree": a.degree,
-                    "coeffi\u00adcients": a.members,
+                    "coefficients": a.members,
                     "program": c and c.program,
                     "sampled": c and c.mean,
                     "proved": j and (None if j.numbers.reason else j.mean),
@@ -76,19 +78,6 @@ class CertifyAnswer:
             "seconds": found.seconds,
             "file": None if self.out is None or found.certificate is None else str(self.out),
         }
-
-
-def attainable_upper(problem: SafetyProblem) -> float | None:
-    """Return how safe any policy can be at most, if `best` has computed it; see `table_at_hand`.
-
-    Args:
-        problem: of the env.
-    """
-    try:
-        table = table_at_hand(problem, ValueSettings(leaving="safe"))
-        return table and start_values(LookAhead(table, problem), problem).upper
-    except ConfigurationError:  # No grid takes the problem.
-        return None
 
 
 def print_certification(console: Console, answer: CertifyAnswer) -> None:
@@ -113,7 +102,7 @@ def print_certification(console: Console, answer: CertifyAnswer) -> None:
             str(a.members),
             percent(c.program if c else None),
             percent(c.mean if c else None),
-            "-" if j is None else "undecided" if j.numbers.reason else percent(j.mean),
+            proved_cell(j and j.mean, j.numbers.reason if j else ""),
             f"{c.bound.rate:g}" if c else "-",
             f"{j.numbers.boxes:,}" if j else "-",
             f"{a.seconds + (j.seconds if j else 0.0):.1f}",
@@ -132,21 +121,11 @@ def _result_lines(answer: CertifyAnswer) -> list[str]:
     found, certificate = answer.found, answer.found.certificate
     if certificate is None:
         return ["No bound above 0 is proved."]
-    a, m, c, horizon = (
-        f"{float(v):.6g}"
-        for v in (
-            certificate.rate,
-            certificate.shortfall,
-            certificate.supremum,
-            certificate.horizon,
-        )
-    )
-    margin = "" if found.starts == 1 else f" - {100 * found.margin:.2g} %"
-    of = "from the start" if found.starts == 1 else f"mean over {found.starts:,} starts"
+    numbers = (certificate.rate, certificate.shortfall, certificate.supremum)
+    a, m, c = (number_at_most(v, 6) for v in numbers)
     lines = [
-        f"Proved: P(safe for {horizon} s, or until the workspace is left) >="
-        f" {percent(found.mean)}{margin}, {of}"
-        + ("" if found.starts == 1 else "; the margin of the mean is one at 99.99 %"),
+        f"Proved: P(safe for {number_at_least(certificate.horizon, 6)} s, or until the workspace is"
+        f" left) {proved_mean(found.mean, found.margin, found.starts)}",
         f"psi of degree {certificate.psi.degree}, a = {a} 1/s, m = {m} 1/s, c = {c};"
         f" found and proved in {found.seconds:.3g} s",
     ]
@@ -159,14 +138,43 @@ def _result_lines(answer: CertifyAnswer) -> list[str]:
         )
     if answer.upper is not None:
         lines.append(
-            f"No policy is safer than {percent(answer.upper)} with the env's own held input"
-            " (computed; another claim than this one, of continuous control)"
+            f"No policy is safer than {percent_at_most(answer.upper)} % with the env's own held"
+            " input (computed; another claim than this one, of continuous control)"
         )
     lines.append(
         "Note: the bound is of continuous control; the env holds its input for"
         f" {answer.problem.dt:g} s."
     )
     return lines
+
+
+def proved_cell(mean: float | None, reason: str) -> str:
+    """Return the bound of a degree as the cell of a table.
+
+    Args:
+        mean: of the bound; None where the judge was not asked.
+        reason: why it is undecided; "" where it is proved.
+    """
+    if mean is None:
+        return "-"
+    return "undecided" if reason else f"{percent_at_least(mean)} %"
+
+
+def proved_mean(mean: float, margin: float, starts: int) -> str:
+    """Return ">=" and a proved bound, as one number, and what it is of.
+
+    Args:
+        mean: of the bound over the starts.
+        margin: by which the mean over all starts may be lower, at 99.99 % confidence.
+        starts: how many there are; 1 where none is drawn.
+    """
+    if starts == 1:
+        return f">= {percent_at_least(mean)} %, from the start"
+    least = max(Decimal(repr(mean)) - Decimal(repr(margin)), Decimal(0))
+    return (
+        f">= {percent_at_least(least)} %, mean over the starts: that over {starts:,} drawn ones,"
+        f" less {percent_at_most(margin)} %, at 99.99 % confidence"
+    )
 
 
 def say_written(console: Console, out: Path | None) -> None:

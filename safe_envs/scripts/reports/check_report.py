@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ import sympy as sp
 from rich.console import Console
 
 from safe_envs.errors import shortened
+from safe_envs.outward_text import number_at_least, number_at_most, percent_at_least
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.certificates.certificate import AnyCertificate, HeldCertificate
@@ -104,6 +104,13 @@ def _numbers(c: AnyCertificate) -> dict[str, Any]:
     return {"a": c.rate, "m": c.shortfall, "c": c.supremum, "horizon": c.horizon}
 
 
+def _number_text(name: str, value: Any) -> str:
+    """Return a number of a certificate, on the side on which the certificate states less."""
+    if name in ("period", "steps"):
+        return f"{float(value):.9g}"
+    return (number_at_least if name == "horizon" else number_at_most)(value, 9)
+
+
 def _formula(c: AnyCertificate) -> str:
     """Return the bound that a certificate states."""
     if isinstance(c, HeldCertificate):
@@ -129,7 +136,7 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     control = "one policy" if c.plant.policy else "every input that meets its constraint"
     say(console, f"{shortened(answer.file)}: barrier certificate of {shortened(whose)}")
     say(console, f"psi has degree {c.psi.degree} in {names}; it is for {control}")
-    told = ", ".join(f"{name} = {float(v):.9g}" for name, v in _numbers(c).items())
+    told = ", ".join(f"{name} = {_number_text(name, v)}" for name, v in _numbers(c).items())
     say(console, f"{told}; {_formula(c)}")
     say(console, answer.env.text)
     for name, result in answer.found.items():
@@ -147,8 +154,8 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     if answer.starts:
         rows = []
         for start, bound in zip(answer.starts, answer.bounds(), strict=True):
-            percent = math.floor(1e4 * bound) / 1e2
-            rows.append((", ".join(f"{x:g}" for x in start), f">= {percent:.2f} %"))
+            place = ", ".join(f"{x:g}" for x in start)
+            rows.append((place, f">= {percent_at_least(bound, 2)} %"))
         titles = (names, "bound" if answer.word == "checked" else "not proved")
         console.print()
         print_rows(console, "pr", titles, rows)

@@ -27,10 +27,11 @@ from safe_envs.scripts.reports.tables import print_columns, print_rows
 from safe_envs.text_lines import visible
 
 _VERDICTS = {
-    "converged": "converged, {}",
-    "not resolved": "not resolved, {}: more episodes are needed",
-    "still changing": "still changing by {}",
-    "contradicted": "changed by {}, but not called converged: its bound is withheld, {}",
+    "converged": "converged",
+    "not resolved": "not resolved: more episodes are needed",
+    "still changing": "still changing",
+    "integration": "the rate depends on the integration step too: raise substeps",
+    "contradicted": "not called converged, since its bound is withheld: {}",
 }
 
 
@@ -69,31 +70,41 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         console: to print on.
         refinement: to print.
     """
-    interval = interval_name(refinement.evaluations[0])
+    interval, given = interval_name(refinement.given), refinement.given
+    smallest = refinement.periods[-1] / given.problem.substeps
     say(
         console,
-        f"\nRefinement: safe [{interval}] with smaller control periods, from the same seeds but"
-        " with noise that is not coupled",
+        f"\nRefinement: safe [{interval}] with smaller control periods, on the same noise, in"
+        f" integration steps of {smallest:g} s",
     )
     rows = []
     for row in refinement.rows:
-        rates = zip(row.safety_rate, row.ci_low, row.ci_high, strict=True)
+        rates = [*zip(row.safety_rate, row.ci_low, row.ci_high, strict=True)]
+        if not given.is_deterministic:
+            rates.append((row.limit, row.limit_low, row.limit_high))
         rows.append([row.filter, *(percent_in(*rate) for rate in rates)])
     titles = ("filter", *(f"dt = {dt:g} s" for dt in refinement.periods))
+    titles += ("dt -> 0",) * (not given.is_deterministic)
     console.print()
     print_rows(console, "lr", titles, rows)
     console.print()
-    if refinement.evaluations[0].is_deterministic:
+    if given.is_deterministic:
         say(console, "Nothing is random here: what changes with the period, changes for sure.")
         return
     for row in refinement.rows:
-        change = points_in(row.change, row.change_low, row.change_high)
-        say(console, f"  {row.filter}: {_VERDICTS[row.verdict].format(change, row.withheld)}")
-    reach = f"{100 * TOLERANCE:g} points"
+        off = points_in(row.error, row.error_low, row.error_high)
+        verdict = _VERDICTS[row.verdict].format(row.withheld)
+        say(console, f"  {row.filter}: off its limit by {off}, {verdict}")
+    power = "the square root of the period" if refinement.order == 0.5 else "the period"
     say(
         console,
-        f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach}"
-        " either way.",
+        f"dt -> 0: extrapolated from the two smallest periods, in {power}; the interval has the"
+        " terms of higher order too, as the largest period shows them.",
+    )
+    say(
+        console,
+        f"Converged: the {interval} of the distance of the rate with dt from this limit reaches no"
+        f" further than {100 * TOLERANCE:g} points either way.",
     )
 
 

@@ -8,8 +8,9 @@ from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.agents.evaluation.setting_text import describe_system
+from safe_envs.outward_text import percent_at_least
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 
@@ -45,7 +46,7 @@ def print_report(console: Console, title: str, found: Frontier) -> None:
             percent_in(point.violation_rate, point.violation_low, point.violation_high),
             _return(point),
             f"{found.cost(point):.4g}",
-            percent(found.needed(point)),
+            f"{percent_at_least(found.needed(point))} %",
         )
         for point in (*found.points, *found.attained)
     ]

@@ -12,9 +12,10 @@ from rich.text import Text
 from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.outward_text import number_at_most
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.certify_report import say_written
+from safe_envs.scripts.reports.certify_report import proved_cell, proved_mean, say_written
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.synthesis.held_synthesis import HeldAttempt, HeldCertification
 
@@ -77,7 +78,7 @@ class HeldCertifyAnswer:
                 str(a.members),
                 percent(None if a.program is None else max(0.0, a.program)),
                 percent(None if a.program is None else a.sampled),
-                "-" if b is None else "undecided" if b.reason else percent(a.proved),
+                proved_cell(None if b is None else a.proved, b.reason if b else ""),
                 f"{b.boxes:,}" if b else "-",
                 f"{a.seconds:.1f}",
             )
@@ -105,16 +106,14 @@ class HeldCertifyAnswer:
             )
         if c is None:
             return ["No bound above 0 is proved.", *notes]
-        margin = "" if found.starts == 1 else f" - {100 * found.margin:.2g} %"
-        of = "from the start" if found.starts == 1 else f"mean over {found.starts:,} starts"
-        lost = float(c.shortfall + c.sag + c.tail)
-        m1, m2, e, top = (f"{float(v):.3g}" for v in (c.shortfall, c.sag, c.tail, c.supremum))
+        lost = (c.shortfall + c.sag + c.tail) * c.steps
+        parts = (c.shortfall, c.sag, c.tail, c.supremum)
+        m1, m2, e, top = (number_at_most(v, 3) for v in parts)
         lines = [
-            f"Proved: P(safe and in the workspace for {c.steps} steps of {float(c.period):g} s) >="
-            f" {percent(found.mean)}{margin}, {of}"
-            + ("" if found.starts == 1 else "; the margin of the mean is one at 99.99 %"),
+            f"Proved: P(safe and in the workspace for {c.steps} steps of {float(c.period):g} s)"
+            f" {proved_mean(found.mean, found.margin, found.starts)}",
             f"psi of degree {c.psi.degree}, c = {top}; in a step it falls by at most m1 + m2 + e ="
-            f" {m1} + {m2} + {e}, which costs {100 * lost * c.steps:.2g} % of c = 1",
+            f" {m1} + {m2} + {e}, which costs {number_at_most(100 * lost, 2)} % of c = 1",
             f"found and proved in {found.seconds:.3g} s",
         ]
         return [*lines, *notes]

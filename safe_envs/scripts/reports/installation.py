@@ -23,6 +23,9 @@ from safe_envs.systems import ENV_IDS
 _NEEDED = ""
 """In place of an extra: what is needed in any case."""
 
+_PACKAGES = {"daqp": "daqp", "proxqp": "proxsuite"}
+"""Of the solvers of QPs without a closed form."""
+
 _TOLERANCE = 1e-6
 _STEPS = 20
 
@@ -94,16 +97,22 @@ def required() -> list[tuple[str, str]]:
 def solvers() -> Iterator[Check]:
     """Check the solvers on QPs with known answers."""
     for qp in KNOWN_QPS:
-        yield _check(qp.name, partial(_solve, qp), "reinstall proxsuite, numpy and scipy")
+        if not qp.in_closed_form:
+            for solver, package in _PACKAGES.items():
+                name = f"{qp.name}, by {solver.upper()}"
+                advice = f"reinstall {package}, numpy and scipy"
+                yield _check(name, partial(_solve, qp, solver), advice)
+        else:
+            yield _check(qp.name, partial(_solve, qp, "daqp"), "reinstall numpy and scipy")
 
 
-def _solve(qp: KnownQP) -> tuple[bool, str]:
+def _solve(qp: KnownQP, solver: str) -> tuple[bool, str]:
     from safe_envs.wrappers.qp.dispatch import project_floats
 
     m, k = len(qp.proposed), len(qp.b)
     low, high, ones = [-qp.bound] * m, [qp.bound] * m, [1.0] * m
     action, _, _, feasible = project_floats(
-        qp.a, qp.b, list(qp.proposed), low, high, ones, [1.0] * k
+        qp.a, qp.b, list(qp.proposed), low, high, ones, [1.0] * k, solver
     )
     if feasible != qp.feasible:
         return False, f"said to be {'' if feasible else 'in'}feasible, and is not"

@@ -27,6 +27,11 @@ class KnownQP:
     answer: tuple[float, ...]
     feasible: bool = True
 
+    @property
+    def in_closed_form(self) -> bool:
+        """Whether no solver is needed."""
+        return len(self.b) == 1 or len(self.proposed) < 3
+
 
 KNOWN_QPS = (
     KnownQP("one constraint, in closed form", ((-1.0, -1.0),), (1.0,), (1.0, 1.0), 5.0, (0.5, 0.5)),

@@ -37,6 +37,14 @@ def number_text(value: float) -> str:
     return "infinite" if math.isinf(value) else f"{value:.5g}"
 
 
+def size_text(count: int) -> str:
+    """Return a number of bytes with its unit."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count} bytes"
+
+
 def share_text(share: float | None) -> str:
     """Return a share in per cent, with two digits below 1 %, so that it does not read as 0."""
     if share is None or share == 0.0 or share >= 0.01:

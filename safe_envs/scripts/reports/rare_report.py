@@ -18,6 +18,7 @@ from safe_envs.scripts.reports.tables import print_rows
 
 _COLUMNS = (
     "method",
+    "particles",
     "levels",
     "simu\u00adlated steps",
     "plain episodes needed",
@@ -35,7 +36,7 @@ def print_rare(console: Console, answer: RareEvaluation, timing: bool = False) -
     """
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
-    how = f"{config['repetitions']} repetitions of {config['particles']} particles"
+    how = f"{config['repetitions']} repetitions"
     say(console, heading_of(config, answer.problem, f"rare violations, {how}"))
     titles = ("filter", f"P(violation) [{interval}]", *_COLUMNS, *["steps/s"] * timing)
     rows = [
@@ -66,6 +67,7 @@ def _cells(row: RareRow) -> list[str]:
         if row.probability is None
         else f"{row.probability:.3g} [{row.ci_low:.3g}, {row.ci_high:.3g}]",
         row.method or "-",
+        str(row.particles) if row.steps else "-",
         f"{row.levels:.1f}" if row.steps else "-",
         _large(row.steps) if row.steps else "-",
         _large(needed) if needed else "-",

@@ -10,7 +10,7 @@ from rich.console import Console
 from safe_envs.agents.evaluation.best_text import ends_text, times_text
 from safe_envs.agents.evaluation.bound_text import bound_cells
 from safe_envs.agents.evaluation.rate_text import percent, rate_of
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.spec import is_unfiltered
 from safe_envs.agents.evaluation.yardstick import times_between
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_columns
@@ -78,7 +78,7 @@ def _columns(rows: Sequence[Row]) -> list[Column]:
 
 
 def _share(row: Row, name: str) -> str:
-    return percent(row[name] if row["filter"] != UNFILTERED else None)
+    return percent(row[name] if not is_unfiltered(row["filter"]) else None)
 
 
 def report_document(index: dict[str, Any], rows: Sequence[Row], worst: int) -> dict[str, Any]:

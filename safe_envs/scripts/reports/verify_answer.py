@@ -49,7 +49,7 @@ class VerifyAnswer:
             return []
         found = self.verification.guarantee.statements
         # Where no number is proved, none is finite.
-        return [(text.replace("<= inf", "is finite"), verdict) for text, verdict in found]
+        return [(text.replace("<= infinite", "is finite"), verdict) for text, verdict in found]
 
     @property
     def judged_region(self) -> str:

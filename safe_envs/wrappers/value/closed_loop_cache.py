@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import weakref
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -14,7 +13,7 @@ from pathlib import Path
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.file_locks import locked
 from safe_envs.package_version import package_version
-from safe_envs.user_cache import cache_folder
+from safe_envs.user_cache import cache_folder, make_room, mark_used
 from safe_envs.wrappers.value.closed_loop import ClosedLoop, ClosedLoopTable
 from safe_envs.wrappers.value.closed_loop_files import (
     FORMAT,
@@ -22,13 +21,10 @@ from safe_envs.wrappers.value.closed_loop_files import (
     save_closed_loop,
 )
 from safe_envs.wrappers.value.grid import Grid
-from safe_envs.wrappers.value.table_cache import forget_old_tables
 from safe_envs.wrappers.value.table_files import ValueFileError
 
 FOLDER = "closed-loops"
 """Name of their folder in the user's cache."""
-
-MOST_BYTES_KEPT = 1_000_000_000
 
 _LOG = logging.getLogger("safe_envs")
 
@@ -71,31 +67,6 @@ def closed_loop_for(
     return table
 
 
-def closed_loop_at_hand(loop: ClosedLoop) -> ClosedLoopTable | None:
-    """Return the table of a closed loop if it is kept; nothing is computed.
-
-    Args:
-        loop: the closed loop.
-
-    Raises:
-        ConfigurationError: No table of it takes minutes and fits into memory.
-    """
-    if not is_any_at_hand():
-        return None
-    grid = loop.grid()
-    key = _key(loop, grid)
-    folder = cache_folder(FOLDER)
-    return _kept(loop, grid, key, None if folder is None else folder / f"{key}.npz")
-
-
-def is_any_at_hand() -> bool:
-    """Return whether any table is kept: most users have none, and to look for one takes time."""
-    if _IN_USE:
-        return True
-    folder = cache_folder(FOLDER)
-    return folder is not None and next(folder.glob("*.npz"), None) is not None
-
-
 def _key(loop: ClosedLoop, grid: Grid) -> str:
     """Return the name of a table; another version of the package may compute another one."""
     described = [FORMAT, package_version(), loop.fingerprint(), list(grid.shape)]
@@ -112,8 +83,7 @@ def _kept(loop: ClosedLoop, grid: Grid, key: str, place: Path | None) -> ClosedL
     except ValueFileError as error:
         _LOG.warning("%s; it is computed again where it is asked for", error)
         return None
-    with suppress(OSError):
-        os.utime(place)
+    mark_used(place)
     _IN_USE[key] = table
     return table
 
@@ -123,7 +93,7 @@ def _keep(table: ClosedLoopTable, loop: ClosedLoop, place: Path) -> None:
         save_closed_loop(table, loop, place)
     except ConfigurationError as error:
         _LOG.warning("the table is not kept: %s", error)
-    forget_old_tables(place.parent, MOST_BYTES_KEPT)
+    make_room()
 
 
 def _tell(loop: ClosedLoop) -> None:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 import os
-import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from safe_envs.errors import ConfigurationError, shown
 from safe_envs.file_locks import locked
 from safe_envs.package_version import package_version
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.user_cache import cache_folder
+from safe_envs.user_cache import cache_folder, make_room, mark_used
 from safe_envs.wrappers.value.reduction import reduced
 from safe_envs.wrappers.value.settings import ValueSettings
 from safe_envs.wrappers.value.solve import Progress, solve
@@ -31,11 +30,7 @@ from safe_envs.wrappers.value.table_files import (
 FOLDER = "values"
 """Name of their folder in the user's cache."""
 
-MOST_BYTES_KEPT = 8_000_000_000
-
 _LOG = logging.getLogger("safe_envs")
-_DIGITS = 64
-_DAY = 86_400.0
 
 
 def table_for(
@@ -65,9 +60,7 @@ def table_for(
     folder = cache_folder(FOLDER)
     if folder is None:
         return solve(problem, settings, progress)
-    fingerprint = reduced(
-        problem, settings.knowledge, settings.intervals, settings.specification
-    ).fingerprint
+    fingerprint = _fingerprint(problem, settings)
     place = folder / f"{_key(fingerprint, settings)}.npz"
     table = _kept(place, fingerprint, settings)
     if table is not None:
@@ -82,8 +75,8 @@ def table_for(
     return table
 
 
-def table_at_hand(problem: SafetyProblem, settings: ValueSettings) -> ValueTable | None:
-    """Return the table of a problem if it is kept; nothing is computed.
+def table_key(problem: SafetyProblem, settings: ValueSettings) -> str:
+    """Return 64 hexadecimal digits, which are the same for what has the same table.
 
     Args:
         problem: whose values are asked for.
@@ -92,40 +85,7 @@ def table_at_hand(problem: SafetyProblem, settings: ValueSettings) -> ValueTable
     Raises:
         ConfigurationError: No grid takes the problem.
     """
-    folder = cache_folder(FOLDER)
-    # The fingerprint takes some time, and most users have no table at all.
-    if folder is None or next(folder.glob("[0-9a-f]" * _DIGITS + ".npz"), None) is None:
-        return None
-    fingerprint = reduced(
-        problem, settings.knowledge, settings.intervals, settings.specification
-    ).fingerprint
-    return _kept(folder / f"{_key(fingerprint, settings)}.npz", fingerprint, settings)
-
-
-def forget_old_tables(folder: Path, most: int = MOST_BYTES_KEPT) -> None:
-    """Remove the tables that were not used for longest, and what killed processes have left.
-
-    The table that was used last remains, whatever its size, and all files of other names.
-
-    Args:
-        folder: of the tables.
-        most: bytes that may remain.
-    """
-    used = {}
-    for place in folder.glob("[0-9a-f]" * _DIGITS + ".npz"):
-        with suppress(OSError):  # Another process may have removed it.
-            state = place.stat()
-            used[place] = (state.st_mtime, state.st_size)
-    total = 0
-    for i, (place, (_, size)) in enumerate(sorted(used.items(), key=lambda each: -each[1][0])):
-        total += size
-        if i and total > most:
-            with suppress(OSError):
-                place.unlink()
-    for part in folder.glob(f".{'[0-9a-f]' * 8}*.npz"):
-        with suppress(OSError):
-            if part.stat().st_mtime < time.time() - _DAY:
-                part.unlink()
+    return _key(_fingerprint(problem, settings), settings)
 
 
 def _of_file(
@@ -142,10 +102,15 @@ def _of_file(
     return table
 
 
+def _fingerprint(problem: SafetyProblem, settings: ValueSettings) -> str:
+    given = (settings.knowledge, settings.intervals, settings.specification)
+    return reduced(problem, *given).fingerprint
+
+
 def _key(fingerprint: str, settings: ValueSettings) -> str:
     """Return the name of a table; another version of the package may compute another one."""
     described = [FORMAT, package_version(), fingerprint, settings.as_dict()]
-    return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:_DIGITS]
+    return hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()
 
 
 def _kept(place: Path, fingerprint: str, settings: ValueSettings) -> ValueTable | None:
@@ -160,8 +125,7 @@ def _kept(place: Path, fingerprint: str, settings: ValueSettings) -> ValueTable 
         return None
     if table.fingerprint != fingerprint:
         return None
-    with suppress(OSError):
-        os.utime(place)
+    mark_used(place)
     return table
 
 
@@ -170,7 +134,7 @@ def _keep(table: ValueTable, place: Path) -> None:
         save_table(table, place)
     except ConfigurationError as error:
         _LOG.warning("the table is not kept: %s", error)
-    forget_old_tables(place.parent)
+    make_room()
 
 
 def _tell(problem: SafetyProblem) -> None:

@@ -23,7 +23,7 @@ class Budget:
 
     Attributes:
         boxes: most boxes that are looked at.
-        seconds: most processor time of the wall clock.
+        seconds: most processor time.
     """
 
     boxes: int = 2_000_000
@@ -50,7 +50,7 @@ class BranchAndBound:
         self._width = high - low
         self._settled = -math.inf
         self._stuck: np.ndarray | None = None
-        self._begun = time.monotonic()
+        self._begun = time.process_time()
         self.best, self.best_state, self.boxes = -math.inf, None, 0
         self.guide = -math.inf
         self.margin = 0.0
@@ -77,7 +77,7 @@ class BranchAndBound:
         """Why the search has to end, in words; empty where it need not."""
         if self.boxes >= self._budget.boxes:
             return f"{self._left} after {self.boxes} boxes; allow more, or a larger margin"
-        if time.monotonic() - self._begun > self._budget.seconds:
+        if time.process_time() - self._begun > self._budget.seconds:
             return f"{self._left} after {self._budget.seconds:g} s; allow more, or a larger margin"
         return ""
 

@@ -29,15 +29,19 @@ from safe_envs.wrappers.verification.results import (
     Candidate,
     Stages,
     Status,
-    of_order_one,
-    of_stages,
-    surely_safe,
+    candidates_for,
+    holds_up_to_a_time,
+    stages_of,
 )
-from safe_envs.wrappers.verification.safe_set import sample
+from safe_envs.wrappers.verification.safe_set import draw_starts, sample
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 from safe_envs.wrappers.verification.search import largest
 
+NOTHING = "it is 0 at these starts up to this horizon"
+"""What there is to say of a bound that is 0."""
+
 _SAMPLES = 2048
+_STARTS = 1024
 _EMPTY = "the sets C_j have no state in common"
 
 
@@ -51,21 +55,34 @@ class ChainGuarantee:
     Args:
         formulas: the chains and conditions, compiled.
         analysis: of the safe set, if there is one; made when it is needed otherwise.
+        seconds: of processor time, for the search for the shortfall and for the judge each. Then
+            the judge is not asked either for what would be 0 at the starts. None for no limit.
     """
 
-    def __init__(self, formulas: Formulas, analysis: SafeSetAnalysis | None = None) -> None:
-        self.formulas, self._given = formulas, analysis
+    def __init__(
+        self,
+        formulas: Formulas,
+        analysis: SafeSetAnalysis | None = None,
+        seconds: float | None = None,
+    ) -> None:
+        self.formulas, self._given, self._seconds = formulas, analysis, seconds
 
     @cached_property
     def analysis(self) -> SafeSetAnalysis:
         """What was found in the safe set."""
-        return self._given or SafeSetAnalysis(self.formulas)
+        seconds = math.inf if self._seconds is None else self._seconds
+        return self._given or SafeSetAnalysis(self.formulas, seconds=seconds)
 
     @cached_property
     def proof(self) -> ChainProof:
         """What the judge proves of the hypotheses and numbers."""
-        shortfall, state = self.analysis.max_shortfall
-        return ChainProof(self.formulas, self.analysis.suprema.tolist(), shortfall, state[None])
+        # What several conditions lack together is proved, or not, without knowing it.
+        shortfall, hints = 0.0, np.empty((0, self.formulas.problem.plant.n))
+        if self.formulas.joint:
+            shortfall, state = self.analysis.max_shortfall
+            hints = state[None]
+        suprema = self.analysis.suprema.tolist()
+        return ChainProof(self.formulas, suprema, shortfall, hints, self._seconds)
 
     @property
     def statements(self) -> list[tuple[str, JudgeResult]]:
@@ -89,7 +106,11 @@ class ChainGuarantee:
             reason = _EMPTY
         if not reason:
             reason = next(filter(None, self._against), "")
-        if not reason and self.formulas.certain and not self._certain_up_to_a_time:
+        if (
+            not reason
+            and self.formulas.certain
+            and not holds_up_to_a_time(self.formulas, self.stages)
+        ):
             reason = self.remark
         return reason
 
@@ -97,8 +118,25 @@ class ChainGuarantee:
     def _against(self) -> Iterator[str]:
         """Reasons why there is no bound, the cheapest first; a proof only where it decides."""
         yield from failures(self.analysis)
+        if self._seconds is not None and self._surely_nothing:
+            # What several conditions lack together takes long to search for.
+            yield (self.remark if self.formulas.joint else "") or NOTHING
         yield self._unbounded
         yield from self._unverified
+
+    @property
+    def _surely_nothing(self) -> bool:
+        """Whether the bound is 0 at the starts whatever the judge proves.
+
+        The numbers that the search found are too small, if anything, and make it too large.
+        """
+        suprema = self.analysis.suprema
+        if self.formulas.certain or not np.isfinite(suprema).all():
+            return False
+        b = self.formulas.chain(draw_starts(self.formulas.problem, _STARTS))
+        stages = stages_of(self.formulas, suprema.tolist(), 0.0)
+        found = candidates_for(self.formulas, b, stages, self.formulas.problem.duration)
+        return not found[-1].values.any()
 
     @property
     def _unbounded(self) -> str:
@@ -130,29 +168,17 @@ class ChainGuarantee:
     @cached_property
     def stages(self) -> Stages:
         """The stages of all barriers."""
-        rates, shortfalls = [], []
         shortfall = self.proof.shortfall.value
         if math.isinf(shortfall):
             shortfall = self.analysis.max_shortfall[0]
-        for condition, stage in zip(self.formulas.conditions, self.formulas.stages, strict=True):
-            degree = stage.stop - stage.start
-            rates += condition.chain_rates(degree) or (math.nan,) * degree
-            shortfalls += [*[0.0] * (degree - 1), shortfall]
-        # Where every path is safe, no supremum matters.
-        suprema = (1.0,) * len(rates) if self.formulas.certain else self._suprema
-        return Stages(tuple(rates), tuple(suprema), tuple(shortfalls))
+        suprema = None if self.formulas.certain else self._suprema
+        return stages_of(self.formulas, suprema, shortfall)
 
     @property
     def _suprema(self) -> list[float]:
         """The suprema that are proved or, where none is, those that the search found."""
         pairs = zip(self.proof.suprema, self.analysis.suprema.tolist(), strict=True)
         return [n.value if math.isfinite(n.value) else found for n, found in pairs]
-
-    @property
-    def _certain_up_to_a_time(self) -> bool:
-        """Whether a shortfall, if there is one, is known not to matter up to some time."""
-        noisy, stages = self.formulas.noisy, self.stages
-        return not any(stages.shortfalls) or not (noisy or any(map(math.isnan, stages.rates)))
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
         """Return the largest bound on P(safe up to the horizon) whose hypotheses hold.
@@ -165,7 +191,9 @@ class ChainGuarantee:
             Values in [0, 1], shape (B,); 0 where there is no bound.
         """
         b = self.formulas.chain(np.asarray(starts, dtype=np.float64))
-        return np.zeros(len(b)) if self.note else self._candidates(b, horizon)[-1].values
+        if self.note:
+            return np.zeros(len(b))
+        return candidates_for(self.formulas, b, self.stages, horizon)[-1].values
 
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
@@ -210,7 +238,8 @@ class ChainGuarantee:
             return [Bound("all of them", None, "hypothesis fails", outside(formulas, b))]
         share = f"{100 * (1 - inside.mean()):.1f} %"
         partly = [f"0 at the {share} of the starts that are outside some C_j"] * (not inside.all())
-        found = [self._judged(candidate, partly) for candidate in self._candidates(b, horizon)]
+        candidates = candidates_for(formulas, b, self.stages, horizon)
+        found = [self._judged(candidate, partly) for candidate in candidates]
         high = above_suprema(formulas, self.stages.suprema, starts)
         return [bound.without(high) for bound in found]
 
@@ -245,37 +274,6 @@ class ChainGuarantee:
         where = "C" if formulas.first_order else "the intersection of the C_j"
         conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
         return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
-
-    def _candidates(self, b: np.ndarray, horizon: float) -> list[Candidate]:
-        """Return the results that suit the conditions; the last one has the weakest hypotheses.
-
-        Args:
-            b: b_0..b_(r-1) of every barrier at the starts, shape (B, sum of the r).
-            horizon: T in s.
-        """
-        stages = self.stages
-        if self.formulas.certain:
-            found = [Candidate(self._name_of_certainty, (b > 0.0).all(axis=1).astype(float), True)]
-            if any(stages.shortfalls) and self._certain_up_to_a_time:
-                name = "no noise, in spite of the shortfall: safe up to T"
-                values = surely_safe(stages, b, horizon)
-                found.append(Candidate(name, values, allows_shortfall=True))
-            return found
-        found = (
-            of_order_one(b[:, 0], stages, horizon)
-            if b.shape[1] == 1
-            else of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
-        )
-        if any(stages.shortfalls):
-            name = f"repaired for the shortfall m = {max(stages.shortfalls):.4g}, up to T"
-            values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
-            found.append(Candidate(name, values, allows_shortfall=True))
-        return found
-
-    @property
-    def _name_of_certainty(self) -> str:
-        noisy = self.formulas.noisy
-        return "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: no path leaves"
 
     def best_start(self, seed: int = 0) -> np.ndarray | None:
         """Return the state (n,) where the printed bound is largest; None without such a bound.

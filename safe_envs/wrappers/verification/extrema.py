@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -105,7 +107,11 @@ def _origin(region: Region) -> list[sp.Expr]:
 
 
 def max_shortfall(
-    formulas: Formulas, level: Score, points: np.ndarray, rng: np.random.Generator
+    formulas: Formulas,
+    level: Score,
+    points: np.ndarray,
+    rng: np.random.Generator,
+    seconds: float = math.inf,
 ) -> tuple[float, np.ndarray]:
     """Return the largest shortfall of the conditions over {level >= 0}, and the state of it.
 
@@ -118,6 +124,7 @@ def max_shortfall(
         level: nonnegative in the set.
         points: of the set, shape (B, n).
         rng: of all randomness.
+        seconds: of processor time after which a search ends with what it has.
 
     Returns:
         The shortfall in the units of b_(r-1) per s, 0 if there is none, and a state (n,).
@@ -125,7 +132,7 @@ def max_shortfall(
     tried = (
         np.concatenate([points, _pool(points, formulas.region, rng)]) if formulas.joint else points
     )
-    reach = formulas.reach(points)
+    reach, deadline = formulas.reach(points), time.process_time() + seconds
     wider = [reach * k for k in _REACHES if reach * k < _WIDE]
     for part in wider:
         population, _ = search(
@@ -133,6 +140,7 @@ def max_shortfall(
             tried,
             formulas.region,
             rng,
+            deadline=deadline,
         )
         tried = np.concatenate([population, tried])
     if wider:
@@ -140,7 +148,11 @@ def max_shortfall(
             [*_without_control(formulas, tried[: _CONFLICTS * len(wider)]), tried]
         )
     population, values = search(
-        lambda x: where_inside(level, x, formulas.shortfall), tried, formulas.region, rng
+        lambda x: where_inside(level, x, formulas.shortfall),
+        tried,
+        formulas.region,
+        rng,
+        deadline=deadline,
     )
     best = int(values.argmax())
     if formulas.joint or values[best] <= 0.0:

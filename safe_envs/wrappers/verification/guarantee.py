@@ -24,7 +24,10 @@ a `remark` where it is weak, and the `contradiction` by states that were seen.""
 
 
 def guarantee_of(
-    problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model"
+    problem: SafetyProblem,
+    conditions: Sequence[Condition],
+    knowledge: str = "model",
+    seconds: float | None = None,
 ) -> Guarantee:
     """Estimate the bound of conditions, deterministically and with no more search than it needs.
 
@@ -36,6 +39,7 @@ def guarantee_of(
         problem: whose barriers, input bounds, ranges and system are taken.
         conditions: one for each barrier.
         knowledge: what they know, "model" or "plant".
+        seconds: see `ChainGuarantee`.
 
     Returns:
         The bound, or why there is none.
@@ -50,4 +54,4 @@ def guarantee_of(
         return certificate_guarantee(problem, conditions)
     if any(c.credible_set is not None for c in conditions):
         return posterior_guarantee(problem, conditions)
-    return ChainGuarantee(Formulas(problem, conditions, knowledge))
+    return ChainGuarantee(Formulas(problem, conditions, knowledge), seconds=seconds)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import sympy as sp
 
+from safe_envs.outward_text import number_at_most
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.verification.assumptions import JOINT
 from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.certificate_statements import rounded_up
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.input_terms import (
     exact_number,
@@ -25,8 +26,10 @@ from safe_envs.wrappers.verification.judge import JudgeResult, Word, judge, supr
 from safe_envs.wrappers.verification.statements import Statement
 
 BUDGET = Budget(boxes=300_000, seconds=60.0)
-"""Of each statement of a bound: a second or two, so that an evaluation does not wait for it, and
+"""Of each statement of a bound: a second or two where there are few states and barriers, and
 counted in boxes, so that its numbers do not depend on the machine."""
+
+Verdict = TypeVar("Verdict")
 
 _RELATIVE = 1e-3
 _SMALL = 1e-7
@@ -59,6 +62,7 @@ class ChainProof:
         suprema: of the b_j, as a search found them.
         shortfall: the largest one, as a search found it.
         hints: states where the conditions may fail, shape (B, n).
+        seconds: for all statements together; None for as long as each takes.
         budget: of each statement.
     """
 
@@ -68,10 +72,11 @@ class ChainProof:
         suprema: Sequence[float],
         shortfall: float,
         hints: np.ndarray,
+        seconds: float | None = None,
         budget: Budget = BUDGET,
     ) -> None:
         self._formulas, self._found, self._lack = formulas, suprema, shortfall
-        self._hints, self._budget = hints, budget
+        self._hints, self._budget, self._seconds = hints, budget, seconds
         exact, system = formulas.system.exact, formulas.system
         self._chain = tuple(exact(e) for e in formulas.chain_expressions)
         self._region = Statement(
@@ -86,10 +91,14 @@ class ChainProof:
             for v, angle in zip(self._formulas.problem.states, periodic, strict=True)
         )
 
-    @property
-    def _quick(self) -> Budget:
-        """Of what either takes few boxes or fails."""
-        return replace(self._budget, boxes=round(_QUICK * self._budget.boxes))
+    def _within(self, decide: Callable[[Budget], Verdict], part: float = 1.0) -> Verdict:
+        """Let the judge decide something with a part of its boxes, in the time that is left."""
+        budget, begun = self._budget, time.process_time()
+        seconds = budget.seconds if self._seconds is None else min(self._seconds, budget.seconds)
+        found = decide(Budget(round(part * budget.boxes), max(seconds, 0.0)))
+        if self._seconds is not None:
+            self._seconds -= time.process_time() - begun
+        return found
 
     @cached_property
     def bounded(self) -> JudgeResult:
@@ -116,9 +125,8 @@ class ChainProof:
                 continue
             box = (*self._region.box[:i], beyond, *self._region.box[i + 1 :])
             name = f"C is bounded in {self._region.states[i]}"
-            verdict = judge(
-                replace(self._region, name=name, box=box, claim=sp.Integer(-1)), self._quick
-            )
+            empty = replace(self._region, name=name, box=box, claim=sp.Integer(-1))
+            verdict = self._within(lambda budget, s=empty: judge(s, budget), _QUICK)
             if verdict.word != "proved":
                 reason = f"{name} is not established"
                 return JudgeResult("undecided", verdict.boxes, box=verdict.box, reason=reason)
@@ -127,9 +135,8 @@ class ChainProof:
     @cached_property
     def smooth(self) -> JudgeResult:
         """Whether all b_j are twice continuously differentiable on G."""
-        return judge(
-            replace(self._region, name="the barrier on G", smooth=self._chain), self._budget
-        )
+        statement = replace(self._region, name="the barrier on G", smooth=self._chain)
+        return self._within(lambda budget: judge(statement, budget))
 
     @cached_property
     def continuous(self) -> JudgeResult:
@@ -139,7 +146,8 @@ class ChainProof:
             e for part in (system.drift, system.input_matrix, system.diffusion) for e in part
         ]
         asked = not_polynomial([system.exact(e) for e in entries], system.states)
-        return judge(replace(self._region, name="the system on G", continuous=asked), self._budget)
+        statement = replace(self._region, name="the system on G", continuous=asked)
+        return self._within(lambda budget: judge(statement, budget))
 
     @property
     def regular(self) -> bool:
@@ -160,13 +168,8 @@ class ChainProof:
     ) -> JudgedNumber:
         """Prove an upper bound of an expression on G that is near what a search found."""
         wanted = max(_RELATIVE * abs(found) if math.isfinite(found) else 0.0, self._negligible)
-        result = supremum(
-            replace(self._region, name=name),
-            expression,
-            wanted,
-            self._budget,
-            None if supremum_hints else self._hints,
-        )
+        statement, hints = replace(self._region, name=name), None if supremum_hints else self._hints
+        result = self._within(lambda budget: supremum(statement, expression, wanted, budget, hints))
         upper = max(result.upper, 0.0) if not math.isnan(result.upper) else math.inf
         if math.isfinite(upper):
             return JudgedNumber(name, upper, JudgeResult("proved", result.boxes))
@@ -187,9 +190,10 @@ class ChainProof:
             return JudgeResult("undecided", 0, reason=rows)
         name = "the condition can be met everywhere on G"
         if self._formulas.independent:
-            best = sp.Min(*[self._best(row) for row in rows])
+            best = sp.Min(*[self._best(row) for row in rows], evaluate=False)
             # Where the claim is 0 somewhere no budget suffices, but a small shortfall is proved.
-            return judge(replace(self._region, name=name, claim=best), self._quick, self._hints)
+            one = replace(self._region, name=name, claim=best)
+            return self._within(lambda budget: judge(one, budget, self._hints), _QUICK)
         inputs = self._formulas.system.inputs
         claims = [
             sum(a * u for a, u in zip(self._coefficients(row), inputs, strict=True))
@@ -199,11 +203,11 @@ class ChainProof:
         statement = replace(
             self._region,
             name="all conditions can be met at once on G",
-            claim=sp.Min(*claims),
+            claim=sp.Min(*claims, evaluate=False),
             witnesses=inputs,
             witness=self._common_input,
         )
-        verdict = judge(statement, self._budget)
+        verdict = self._within(lambda budget: judge(statement, budget))
         if verdict.word != "refuted":
             return verdict
         # The input that fails is one of many.
@@ -221,7 +225,7 @@ class ChainProof:
             return JudgedNumber(name, math.inf, JudgeResult("undecided", 0, reason=rows))
         if not self._formulas.independent:
             return JudgedNumber(name, math.inf, JudgeResult("undecided", 0, reason=JOINT))
-        worst = sp.Max(*[-self._best(row) for row in rows])
+        worst = sp.Max(*[-self._best(row) for row in rows], evaluate=False)
         return self._number(name, worst, self._lack)
 
     @property
@@ -266,11 +270,15 @@ class ChainProof:
             ("the barrier is twice differentiable on G", self.smooth),
         ]
         if not certain:
-            found += [(f"{n.name} <= {_shown(n.value)}", n.verdict) for n in self.suprema]
+            found += [
+                (f"{n.name} <= {number_at_most(n.value, _SHOWN)}", n.verdict) for n in self.suprema
+            ]
         found.append(("the condition can be met everywhere on G", self.feasible))
         if self.feasible.word != "proved":
             number = self.shortfall
-            amount = f" by at most {_shown(number.value)}" * math.isfinite(number.value)
+            amount = f" by at most {number_at_most(number.value, _SHOWN)}" * math.isfinite(
+                number.value
+            )
             found.append((f"the best input violates it{amount}", number.verdict))
         return found
 
@@ -289,8 +297,3 @@ class ChainProof:
                 if verdict.word == word:
                     return word, verdict.reason
         return "proved", ""
-
-
-def _shown(value: float) -> str:
-    """Return a proved upper bound in few digits, not below it."""
-    return f"{float(rounded_up(value, _SHOWN)) if math.isfinite(value) else value:.{_SHOWN}g}"

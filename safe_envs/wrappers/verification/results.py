@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from safe_envs.outward_text import number_at_most
 from safe_envs.wrappers.verification import bounds
+from safe_envs.wrappers.verification.formulas import Formulas
 
 Status = Literal[
     "proved", "estimated", "withheld", "hypothesis fails", "no bound", "not established"
@@ -55,11 +58,31 @@ class Stages(NamedTuple):
         rates: of each stage, in 1/s; NaN where a chain has none.
         suprema: c_j of each.
         shortfalls: m_j of each, 0 except for the last one of a barrier.
+        barriers: how many there are.
     """
 
     rates: tuple[float, ...]
     suprema: tuple[float, ...]
     shortfalls: tuple[float, ...]
+    barriers: int = 1
+
+
+def stages_of(formulas: Formulas, suprema: Sequence[float] | None, shortfall: float) -> Stages:
+    """Return the stages of conditions.
+
+    Args:
+        formulas: of the conditions.
+        suprema: of the chain functions; None where every path is safe, so that none matters.
+        shortfall: by which any of them may be violated.
+    """
+    rates: list[float] = []
+    shortfalls: list[float] = []
+    for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
+        degree = stage.stop - stage.start
+        rates += condition.chain_rates(degree) or (math.nan,) * degree
+        shortfalls += [*[0.0] * (degree - 1), shortfall]
+    numbers = tuple(suprema or (1.0,) * len(rates))
+    return Stages(tuple(rates), numbers, tuple(shortfalls), len(formulas.stages))
 
 
 class Candidate(NamedTuple):
@@ -131,6 +154,48 @@ def of_stages(b: np.ndarray, stages: Stages, horizon: float, several: bool) -> l
     product = bounds.theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
     gap = "its proof conditions on the future"
     return [Candidate(f"{name}, {length}", product, forever, gap), union]
+
+
+def holds_up_to_a_time(formulas: Formulas, stages: Stages) -> bool:
+    """Return whether a shortfall, if there is one, is known not to matter up to some time.
+
+    Args:
+        formulas: of conditions that no path leaves.
+        stages: of all barriers.
+    """
+    noisy = formulas.noisy or any(map(math.isnan, stages.rates))
+    return not (any(stages.shortfalls) and noisy)
+
+
+def candidates_for(
+    formulas: Formulas, b: np.ndarray, stages: Stages, horizon: float
+) -> list[Candidate]:
+    """Return the results that suit conditions; the last one has the weakest hypotheses.
+
+    Args:
+        formulas: of the conditions.
+        b: values of all chain functions at the starts, shape (B, sum of the r).
+        stages: of all barriers.
+        horizon: T in s.
+    """
+    if formulas.certain:
+        name = "no noise: no path leaves"
+        name = "Prop. 4.2.2: safe with probability 1" if formulas.noisy else name
+        found = [Candidate(name, (b > 0.0).all(axis=1).astype(float), True)]
+        if any(stages.shortfalls) and holds_up_to_a_time(formulas, stages):
+            name = "no noise, in spite of the shortfall: safe up to T"
+            found.append(Candidate(name, surely_safe(stages, b, horizon), allows_shortfall=True))
+        return found
+    if b.shape[1] == 1:
+        found = of_order_one(b[:, 0], stages, horizon)
+    else:
+        found = of_stages(b, stages, horizon, stages.barriers > 1)
+    if any(stages.shortfalls):
+        most = number_at_most(max(stages.shortfalls))
+        values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
+        name = f"repaired for the shortfall m = {most}, up to T"
+        found.append(Candidate(name, values, allows_shortfall=True))
+    return found
 
 
 def surely_safe(stages: Stages, b: np.ndarray, horizon: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -39,13 +40,21 @@ class SafeSetAnalysis:
         formulas: the chains and conditions, compiled.
         samples: number of states in C at which the drawing ends.
         seed: of all randomness.
+        seconds: of processor time for the search for the shortfall.
 
     Raises:
         ConfigurationError: no state of C was found.
     """
 
-    def __init__(self, formulas: Formulas, samples: int = SAMPLES, seed: int = 0) -> None:
+    def __init__(
+        self,
+        formulas: Formulas,
+        samples: int = SAMPLES,
+        seed: int = 0,
+        seconds: float = math.inf,
+    ) -> None:
         self.formulas, self.region, self._seed = formulas, formulas.region, seed
+        self._seconds = seconds
         self.safe = sample("C", formulas.barrier_level, self.region, samples, self.rng(0))
         self.starts = draw_starts(formulas.problem, _STARTS)
         self.invariant_set = self._invariant_set()
@@ -103,7 +112,8 @@ class SafeSetAnalysis:
             level, points = self.formulas.barrier_level, self.safe.points
         else:
             level, points = self.formulas.invariant_level, self.invariant_set
-        return max_shortfall(self.formulas, level, self.with_starts(points, level), self.rng(2))
+        points = self.with_starts(points, level)
+        return max_shortfall(self.formulas, level, points, self.rng(2), self._seconds)
 
     @cached_property
     def infeasible(self) -> float:

@@ -9,6 +9,7 @@ steps of all sizes, which follow ridges, nor periodic states.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -139,6 +140,7 @@ def search(
     region: Region,
     rng: np.random.Generator,
     until: Callable[[np.ndarray], bool] | None = None,
+    deadline: float = math.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Differential evolution, twice: the final population and its scores.
 
@@ -153,11 +155,18 @@ def search(
         region: see `largest`.
         rng: see `largest`.
         until: ends the search, given the scores of the population.
+        deadline: processor time, as `time.process_time` has it, at which the search ends.
     """
     values = _scores(score, points)
     best = np.argsort(-values)[: _POPULATION // 2]
     x, value = _evolved(
-        score, *_joined(points, values, best, region, score, rng), region, rng, _ROUNDS[0], until
+        score,
+        *_joined(points, values, best, region, score, rng),
+        region,
+        rng,
+        _ROUNDS[0],
+        until,
+        deadline,
     )
     if until is not None:
         return x, value
@@ -170,6 +179,7 @@ def search(
         rng,
         _ROUNDS[1],
         until,
+        deadline,
     )
 
 
@@ -204,8 +214,11 @@ def _evolved(
     rng: np.random.Generator,
     rounds: int,
     until: Callable[[np.ndarray], bool] | None,
+    deadline: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(rounds):
+        if time.process_time() > deadline:
+            break
         lowest, highest = float(value.min()), float(value.max())
         if math.isfinite(lowest) and highest - lowest <= _CONVERGED * abs(highest):
             break

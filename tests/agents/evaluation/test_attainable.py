@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +13,15 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import attainable, yardstick
 from safe_envs.agents.evaluation.attainable import AttainableSafety, attainable_safety
 from safe_envs.agents.evaluation.countings import leaves_safely
-from safe_envs.agents.evaluation.greedy_episodes import simulate
+from safe_envs.agents.evaluation.greedy_episodes import SimulatedRate, simulate
 from safe_envs.agents.evaluation.yardstick import (
     TimesUnavoidable,
-    best_at_hand,
+    best_for,
     held_against,
     times_unavoidable,
 )
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value import table_cache
+from safe_envs.user_cache import VARIABLE, entries
 from safe_envs.wrappers.value.settings import ValueSettings
 from tests.agents.policies.coarse import COARSE, SHORT, coarse
 
@@ -29,8 +30,8 @@ NEAR_THE_EDGE = {**SHORT, "start": [0.8], "noise": 1.5}
 
 @pytest.fixture
 def empty_cache(monkeypatch, tmp_path):
-    """Tables are kept in an empty folder."""
-    monkeypatch.setattr(table_cache, "cache_folder", lambda name: tmp_path)
+    """What is computed is kept in an empty folder."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
 
 
 def made_up(lower, upper) -> AttainableSafety:
@@ -103,6 +104,22 @@ def test_bounds_that_the_greedy_policy_contradicts_are_withheld(lower, upper, wh
     assert where in judged.contradiction
     assert (judged.lower is None) == (judged.upper is None) == bool(where)
     assert bool(judged.contradiction) == bool(where)
+
+
+@pytest.mark.parametrize(("safe", "lower", "kept"), [(999, 0.99999, True), (990, 0.99999, False)])
+def test_a_single_violation_contradicts_no_lower_bound(safe, lower, kept):
+    rate = SimulatedRate(
+        safe=safe,
+        episodes=1000,
+        rate=safe / 1000,
+        low=0.0,
+        high=1.0,
+        confidence=0.95,
+        leave_rate=0.0,
+        seed=0,
+    )
+    judged = attainable.judged(replace(made_up(lower, 1.0), simulated=rate))
+    assert (judged.lower == lower) == kept
 
 
 def test_bounds_that_a_row_exceeds_are_withheld():
@@ -179,18 +196,30 @@ def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache)
     times = times_unavoidable(best, computed.rows[0].ci_low, computed.rows[0].ci_high)
     assert times is not None
     assert shown["times_unavoidable"] == {"none": {"low": times.low, "high": times.high}}
-    # It is in the cache now.
-    assert evaluate("Scalar-v0", **given).best == best
-    assert evaluate("Scalar-v0", best=False, **given).best is None
-    assert evaluate("Scalar-v0", monitoring="continuous", **given).best is None
+    # It is in the cache now, and shown only where it is asked for.
+    assert evaluate("Scalar-v0", **given).best is None
 
 
-def test_what_has_no_table_is_an_error_only_if_it_is_asked_for(empty_cache, tmp_path):
-    (tmp_path / f"{'0' * 64}.npz").touch()  # Another table is there.
+def test_what_is_attainable_from_the_starts_is_computed_once(monkeypatch, empty_cache):
+    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
+    found = best_for(problem)
+    (kept,) = entries("attainable")
+    with monkeypatch.context() as patch:
+        patch.setattr(yardstick, "attainable_safety", lambda *_, **__: pytest.fail("again"))
+        assert best_for(problem) == found
+        # From other starts something else is attainable.
+        with pytest.raises(pytest.fail.Exception):
+            best_for(make_problem("Scalar-v0", **{**NEAR_THE_EDGE, "start": [0.5]}))
+    for damaged in ("", "[]", "{}", json.dumps({**vars(found), "lower": 2.0})):
+        kept.place.write_text(damaged)
+        assert best_for(problem) == found
+
+
+def test_what_has_no_table_is_an_error(empty_cache):
     with pytest.raises(ConfigurationError, match="12 coordinates"):
         evaluate("Quadrotor-v0", best=True)
-    assert best_at_hand(make_problem("Quadrotor-v0")) is None
     with pytest.raises(ConfigurationError, match="monitoring = 'continuous'"):
         evaluate("Scalar-v0", best=True, monitoring="continuous")
-    with pytest.raises(ConfigurationError, match="give True, False or None"):
+    with pytest.raises(ConfigurationError, match="give True or False"):
         evaluate("Scalar-v0", best="yes")  # pyright: ignore[reportArgumentType]

@@ -134,19 +134,6 @@ def test_an_unknown_policy_is_an_error():
         measure(verify_once(problem, parse_conditions("scbf", problem), samples=512), "nobody")
 
 
-@pytest.mark.parametrize(("trials", "error"), [(50, 0.005), (500, 0.00125)])
-def test_the_upper_end_errs_as_seldom_as_it_says(trials, error):
-    from scipy.stats import binom
-
-    successes = np.arange(trials + 1)
-    ends = np.array([bound_check._upper_end(int(s), trials, error) for s in successes])
-    for unsafe in np.geomspace(1e-6, 0.5, 60):
-        assert binom.pmf(successes, trials, 1 - unsafe)[ends < 1 - unsafe].sum() <= error * (
-            1 + 1e-9
-        )
-    assert (np.diff(ends) > 0).all()
-
-
 def test_a_mean_over_starts_may_be_off_by_its_error():
     bound = Bound("a", 0.9, "estimated", "", error=0.01)
     nowhere = Horizon(1.0, 1750, 0.875, 0.87, 0.88, (bound,))

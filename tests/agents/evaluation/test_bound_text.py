@@ -3,38 +3,14 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from safe_envs.agents.evaluation.bound_text import (
     bound_cells,
     bound_text,
     continuous_text,
     held_text,
-    rounded_down,
 )
 from safe_envs.agents.evaluation.rows import BoundSummary
-
-
-@pytest.mark.parametrize(
-    ("bound", "text"),
-    [
-        (0.4229, "42.2"),
-        (0.29, "29.0"),
-        (0.9999, "99.9"),
-        (1.0, "100.0"),
-        (0.0, "0.0"),
-        (0.00049, "0.04"),
-        (6e-19, "0.0"),
-    ],
-)
-def test_a_bound_is_rounded_down(bound, text):
-    assert rounded_down(bound) == text
-
-
-@given(st.floats(0.0, 1.0))
-def test_no_digit_says_more_than_the_bound(bound):
-    assert float(rounded_down(bound)) <= 100.0 * bound * (1.0 + 1e-15)
 
 
 def test_only_what_is_proved_or_certified_stands_after_a_sign():

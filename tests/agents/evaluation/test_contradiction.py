@@ -9,11 +9,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import sympy as sp
+from scipy.stats import binom
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import bound_check, refinement
-from safe_envs.agents.evaluation.contradiction import above_attainable, by_rate, judged
+from safe_envs.agents.evaluation.contradiction import (
+    above_attainable,
+    by_rate,
+    end_for,
+    judged,
+    upper_ends,
+)
 from safe_envs.agents.evaluation.refinement import refine
 from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 from safe_envs.wrappers import parse_conditions
@@ -191,12 +198,16 @@ def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
 def test_a_rate_with_a_smaller_period_withholds_too():
     (row,) = evaluate("Scalar-v0", filters="scbf", episodes=2, bounds=False).rows
     row = replace(row, continuous_bound=0.5, continuous_word="estimated", continuous_note="")
+    spec = SimpleNamespace(confidence=0.95)
     finer = [
-        SimpleNamespace(row=lambda _, high=high: replace(row, ci_high=high)) for high in (0.6, 0.4)
+        SimpleNamespace(
+            spec=spec, row=lambda _, safe=safe: replace(row, safe=safe, episodes=10_000)
+        )
+        for safe in (5000, 3000)
     ]
     assert refinement._judged(row, finer[:1]) == row
     assert refinement._judged(row, finer).withheld.startswith(
-        "the interval of the measured rate ends at 40.0 %, below 50.0 %"
+        "the interval of the measured rate ends at 31.0 %, below 50.0 %"
     )
     # What is of the env's own steps is of its own period.
     held = replace(row, continuous_bound=None, held_bound=0.5, held_word="proved")
@@ -241,21 +252,35 @@ def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, re
         BoundSummary(continuous_bound=bound, continuous_word="estimated"),
         BoundSummary(held_bound=bound, held_word="proved"),
     ):
-        assert (judged(row, high) == row) == (not reason)
+        assert (judged(row, high, high) == row) == (not reason)
+
+
+def test_what_is_proved_is_contradicted_by_chance_as_seldom_as_it_says():
+    counts = np.arange(1001)
+    ends = np.array([upper_ends(int(safe), 1000, 0.95) for safe in counts])
+    for unsafe in np.geomspace(1e-6, 0.9, 40):
+        bound, chance = 1.0 - unsafe, binom.pmf(counts, 1000, 1.0 - unsafe)
+        for word, most in (("proved", 5e-4), ("certified", 5e-4), ("computed", 0.025)):
+            against = [bool(by_rate(bound, end_for(word, *each))) for each in ends]
+            assert chance[against].sum() <= most * (1.0 + 1e-9)
+
+
+def test_a_contradiction_shows_numbers_that_differ():
+    assert "ends at 99.991 %, below 99.993 %" in by_rate(0.99993, 0.999905)
 
 
 def test_one_claim_is_withheld_without_the_other():
     row = BoundSummary(
         held_bound=0.9, held_word="proved", continuous_bound=0.4, continuous_word="estimated"
     )
-    found = judged(row, 0.85)
+    found = judged(row, 0.85, 0.85)
     assert (found.held_bound, found.held_word, found.held_error) == (None, "withheld", 0.0)
     assert found.held_note == f"withheld: {found.withheld}"
     assert "report an error" in found.withheld
     assert (found.continuous_bound, found.continuous_word) == (0.4, "estimated")
-    both = judged(replace(row, continuous_bound=0.95), 0.85)
+    both = judged(replace(row, continuous_bound=0.95), 0.85, 0.85)
     assert (both.held_word, both.continuous_word) == ("withheld", "withheld")
-    other = judged(replace(row, continuous_bound=0.95), 0.92)
+    other = judged(replace(row, continuous_bound=0.95), 0.92, 0.92)
     assert (other.held_bound, other.continuous_word) == (0.9, "withheld")
     assert "try a smaller dt" in other.withheld
 
@@ -274,16 +299,14 @@ def test_a_held_bound_above_what_is_attainable_is_a_contradiction():
     row = BoundSummary(held_bound=0.9, held_word="computed", held_error=0.01)
     assert above_attainable(row, None) == ""
     assert above_attainable(row, 0.88) == ""
-    assert "90.0000 %, is above what any policy can attain, 86.0000 %" in above_attainable(
-        row, 0.86
-    )
+    assert "90.0 %, is above what any policy can attain, 86.0 %" in above_attainable(row, 0.86)
     assert above_attainable(BoundSummary(), 0.1) == ""
 
 
 def test_a_posterior_keeps_its_numbers_where_its_bound_is_withheld():
     bound = PosteriorSummary(0.9, "", "estimated", delta=0.1)
     row = BoundSummary(continuous_note="learned", posterior_bound=bound)
-    found = judged(row, 0.2)
+    found = judged(row, 0.2, 0.2)
     note = f"withheld: {found.withheld}"
     assert found.posterior_bound == PosteriorSummary(None, note, "withheld", delta=0.1)
     assert found.continuous_note == "learned"

@@ -19,10 +19,11 @@ def test_columns_that_are_the_same_in_all_rows_are_lines(evaluated):
     table = evaluation_table(evaluated)
     assert table.facts == ["attainable by any policy: 99.99 %"]
     bare = replace(evaluated, rows=evaluated.rows[:1], best=None)
-    assert evaluation_table(bare).facts == [
-        "bound, held input: none of these has one",
-        "bound, continuous: none of these has one",
-    ]
+    claims = ("bound, held input", "bound, continuous")
+    assert not bare.spec.bounds
+    assert evaluation_table(bare).facts == [f"{claim}: not computed" for claim in claims]
+    looked = replace(bare, spec=replace(bare.spec, bounds=True))
+    assert evaluation_table(looked).facts == [f"{claim}: none of these has one" for claim in claims]
     titles = [column.plain_title for column in evaluation_table(bare).columns]
     assert titles[:2] == ["safe [95 % interval]", "violations"]
 

@@ -1,9 +1,10 @@
-"""Refinement of the control period: three evaluations, and what they say together."""
+"""Refinement of the control period: evaluations on the same noise, and what they say together."""
 
 from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pyarrow.parquet as pq
 import pytest
@@ -13,53 +14,90 @@ from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.comparison import pair_counts
 from safe_envs.agents.evaluation.refinement import TOLERANCE, refine, verdict
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
-from tests.oracles.laws import survival
+from tests.oracles.laws import mean_reverting
 
 pytestmark = pytest.mark.slow
 
-SCALAR = {"start": [0.5], "noise": 0.8, "box": [-100.0, 100.0]}
 
-
-@pytest.mark.slow
-def test_rates_are_those_of_evaluations_with_smaller_periods():
-    options = {"horizon": 1.0, "noise": 0.4, "dt": 0.1}
+def test_rates_are_those_of_evaluations_on_the_same_noise():
+    options = {"horizon": 0.4, "noise": 0.4, "dt": 0.1, "substeps": 2}
+    given = {"episodes": 24, "seed": 2, "confidence": 0.8}
     answer = refine(
-        "StochasticDubins-v0",
-        filters=["none", "scbf"],
-        options=options,
-        episodes=24,
-        seed=2,
-        confidence=0.8,
-        num_envs=16,
+        "StochasticDubins-v0", filters=["none", "scbf"], options=options, num_envs=16, **given
     )
     assert answer.periods == [0.1, 0.05, 0.025]
-    assert [e.problem.steps for e in answer.evaluations] == [10, 20, 40]
-    for i, dt in enumerate(answer.periods):
-        arguments = {"options": {**options, "dt": dt}, "episodes": 24, "seed": 2, "confidence": 0.8}
-        wanted = evaluate(
-            "StochasticDubins-v0", filters=["none", "scbf"], bounds=i == 0, **arguments
-        )
+    assert [e.problem.steps for e in answer.evaluations] == [4, 8, 16]
+    assert [e.problem.substeps for e in answer.evaluations] == [8, 4, 2]
+    filters = {"filters": ["none", "scbf"], "bounds": False}
+    for i, (dt, steps) in enumerate(zip(answer.periods, (8, 4, 2), strict=True)):
+        other = {**options, "dt": dt, "substeps": steps}
+        wanted = evaluate("StochasticDubins-v0", options=other, **filters, **given)
         assert wanted.rows == answer.evaluations[i].rows
         for row, refined in zip(wanted.rows, answer.rows, strict=True):
             assert refined.filter == row.filter
             for key in ("safe", "safety_rate", "ci_low", "ci_high"):
                 assert getattr(refined, key)[i] == getattr(row, key)
+    own = evaluate("StochasticDubins-v0", options=options, **filters, **given)
+    assert [row.safe for row in own.rows] == [row.safe for row in answer.given.rows]
     for row in answer.rows:
         assert row.change == pytest.approx((row.safe[2] - row.safe[1]) / 24)
         fine, coarse = (e.safe[row.filter][0] for e in answer.evaluations[:0:-1])
-        table = pair_counts(fine, coarse)
-        assert table[0] + table[1] == row.safe[2]
-        assert table[0] + table[2] == row.safe[1]
-        assert (row.change_low, row.change_high) == paired_difference_interval(*table, 0.8)
+        assert (row.change_low, row.change_high) == paired_difference_interval(
+            *pair_counts(fine, coarse), 0.8
+        )
 
 
-@pytest.mark.parametrize(("episodes", "verdict"), [(200, "converged"), (100, "not resolved")])
+def walled(dt=0.025):
+    """Brownian motion, to stay in (-1, 1) up to 1 s: a rate of 37.08 % in continuous time."""
+    return replace(mean_reverting(0.0, 1.0), dt=dt, horizon=1.0)
+
+
+CONTINUOUS = sum(
+    4 / math.pi * (-1) ** k / (2 * k + 1) * math.exp(-(((2 * k + 1) * math.pi) ** 2) / 8)
+    for k in range(9)
+)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rates_of_a_diffusion_are_extrapolated_in_the_square_root_of_the_period(seed):
+    answer = refine(walled(), filters=["none"], episodes=2000, seed=seed, bounds=False)
+    (row,) = answer.rows
+    assert answer.order == 0.5
+    # The same paths are seen more often: what is safe with the small period is with the large one.
+    flags = [evaluation.safe["none"][0].array for evaluation in answer.evaluations]
+    assert (flags[2] <= flags[1]).all()
+    assert (flags[1] <= flags[0]).all()
+    assert row.limit_low < CONTINUOUS < row.limit_high < row.limit_low + 0.09
+    assert row.error_low < row.safety_rate[0] - row.limit < row.error_high
+    # It changes by less than 3 points from dt/2 to dt/4, and is not called converged.
+    assert abs(row.change) < TOLERANCE
+    assert row.verdict == "still changing"
+
+
+def test_other_rates_are_extrapolated_in_the_period():
+    few = {"filters": ["none"], "episodes": 4}
+    assert refine(walled(), monitoring="continuous", **few).order == 1.0
+    assert refine("DubinsDisk-v0", options={"horizon": 0.2}, **few).order == 1.0
+
+
+@pytest.mark.parametrize(("episodes", "verdict"), [(1000, "converged"), (100, "not resolved")])
 def test_rates_that_do_not_change_have_converged_if_there_are_episodes_enough(episodes, verdict):
-    (row,) = refine("ACC-v0", filters=["scbf"], options={"horizon": 0.2}, episodes=episodes).rows
+    (row,) = refine("ACC-v0", filters=["scbf"], options={"horizon": 0.1}, episodes=episodes).rows
     assert row.safety_rate == [1.0, 1.0, 1.0]
-    assert row.change_low == pytest.approx(-row.change_high)
-    assert (row.change_high <= TOLERANCE) == (verdict == "converged")
+    assert (row.limit, row.limit_high, row.error) == (1.0, 1.0, 0.0)
+    # What is unsafe with dt/4 alone would show up with a weight of 3.4 in the limit.
+    assert row.limit_low == pytest.approx(1.0 - row.error_high)
+    assert row.error_high == pytest.approx(2**0.5 / (2**0.5 - 1) * (1.0 - row.ci_low[0]))
+    assert (row.error_high <= TOLERANCE) == (verdict == "converged")
     assert row.verdict == verdict
+
+
+def test_a_rate_that_the_integration_step_changes_is_said_to():
+    # Euler's step of this decay is unstable with dt, and stable with dt/4.
+    options = {"dt": 0.25, "horizon": 2.0}
+    problem = replace(mean_reverting(10.0, 0.8), **options)
+    (row,) = refine(problem, filters=["none"], episodes=300, bounds=False).rows
+    assert row.verdict == "integration"
 
 
 @pytest.mark.parametrize(
@@ -79,25 +117,12 @@ def test_verdicts(low, high, wanted):
     assert verdict(low, high) == wanted
 
 
-@pytest.mark.slow
-def test_a_rate_that_still_changes_is_said_to():
-    # dh = -h dt + sigma dW: the less often one looks, the fewer of its violations are seen.
-    options = {**SCALAR, "dt": 0.4, "horizon": 1.6}
-    answer = refine("Scalar-v0", filters=["none"], options=options, episodes=4000)
-    (row,) = answer.rows
-    for dt, low, high in zip(answer.periods, row.ci_low, row.ci_high, strict=True):
-        exact = survival(0.5, round(1.6 / dt), 1 - dt, 0.8 * math.sqrt(dt))
-        assert low - 0.01 < exact < high + 0.01
-    assert row.change_low < row.change < row.change_high < 0
-    assert row.verdict == "still changing"
-
-
 def test_horizons_that_are_no_multiple_of_the_period_stay_as_simulated():
     answer = refine("Scalar-v0", filters=["none"], options={"dt": 0.03, "horizon": 0.1}, episodes=4)
     assert [e.problem.steps for e in answer.evaluations] == [3, 6, 12]
     ends = [e.rows[0].curve.time[-1] for e in answer.evaluations]
     assert ends == [pytest.approx(0.09)] * 3
-    assert answer.evaluations[0].config["problem"]["horizon"] == 0.1
+    assert answer.given.config["problem"]["horizon"] == 0.1
 
 
 def test_document_is_that_of_the_given_period_and_the_refinement():
@@ -109,10 +134,11 @@ def test_document_is_that_of_the_given_period_and_the_refinement():
     assert document["config"] == json.loads(json.dumps(plain.config))
     assert document["refinement"]["dt"] == [0.01, 0.005, 0.0025]
     assert document["refinement"]["rows"] == [vars(row) for row in answer.rows]
-    assert [len(e.trajectories) for e in answer.evaluations] == [2, 0, 0]
+    assert len(answer.given.trajectories) == 2
+    assert [len(e.trajectories) for e in answer.evaluations] == [0, 0, 0]
 
 
-def test_progress_goes_over_all_three():
+def test_progress_goes_over_all_evaluations():
     told = []
     refine(
         "Scalar-v0",
@@ -124,7 +150,7 @@ def test_progress_goes_over_all_three():
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.05
     assert told[-1] == 1.0
-    for share in (1 / 14, 1 / 7, 2 / 7, 3 / 7, 5 / 7):
+    for share in (1 / 16, 1 / 8, 2 / 8, 4 / 8):
         assert any(abs(t - share) < 1e-12 for t in told)
 
 
@@ -139,7 +165,7 @@ def test_errors_are_those_of_an_evaluation():
             refine("Scalar-v0", **arguments)
 
 
-def test_the_file_of_episodes_is_of_the_first_evaluation(tmp_path):
+def test_the_file_of_episodes_is_of_the_evaluation_as_given(tmp_path):
     path = tmp_path / "out.parquet"
     answer = refine(
         "Scalar-v0",
@@ -150,6 +176,6 @@ def test_the_file_of_episodes_is_of_the_first_evaluation(tmp_path):
         episodes=12,
     )
     table = pq.read_table(path)
-    first = answer.evaluations[0]
+    first = answer.given
     assert table["return"].to_pylist() == first.episode_columns()["return"].tolist()
     assert max(table["length"].to_pylist()) == first.problem.steps

@@ -10,6 +10,7 @@ import pytest
 
 from safe_envs.agents.evaluation import safety_chain as of
 from safe_envs.agents.evaluation.bound_check import Horizon, MeasuredSafety
+from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.safety_chain import safety_chain
 from safe_envs.agents.evaluation.yardstick import against_attainable, chained
@@ -24,21 +25,15 @@ FAILS = Bound("c", 0.9, "hypothesis fails", "no action meets it")
 
 
 @pytest.fixture
-def verification():
-    problem = problem_of("safe_envs/Scalar-v0")
-    conditions = parse_conditions("scbf", problem)
-    formulas = SimpleNamespace(problem=problem, conditions=conditions, knowledge="model")
-    return SimpleNamespace(formulas=formulas)
-
-
-@pytest.fixture
-def chain_of(verification, monkeypatch):
+def chain_of(monkeypatch):
     """Makes a chain with a bound for held input, or a reason, and a table, if there is one."""
 
     def made(bounds=(PROVED,), measured=(), held="no table", best=None):
-        monkeypatch.setattr(of, "best_at_hand", lambda problem: best)
+        problem = problem_of("safe_envs/Scalar-v0")
+        conditions = tuple(parse_conditions("scbf", problem))
+        filtered = FilteredPolicy(problem, conditions, "model", "nominal")
         monkeypatch.setattr(of, "held_bound_of", lambda *_: held)
-        return safety_chain(verification, np.zeros((1, 1)), list(bounds), list(measured))
+        return safety_chain(filtered, np.zeros((1, 1)), list(bounds), list(measured), best)
 
     return made
 
@@ -105,9 +100,7 @@ def test_a_bound_above_the_interval_is_withheld(chain_of):
 def test_a_bound_above_what_is_attainable_withholds_the_table(chain_of, word, left):
     found = chain_of(held=held_of(0.8, word), best=attainable(0.1, 0.7))
     assert found.best.upper is None
-    assert found.best.contradiction.startswith(
-        "scbf: the bound for held input, 80.0000 %, is above"
-    )
+    assert found.best.contradiction.startswith("scbf: the bound for held input, 80.0 %, is above")
     assert found.bounds.held_bound == left
 
 

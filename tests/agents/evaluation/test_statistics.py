@@ -13,6 +13,8 @@ from scipy.stats import binom, binomtest, multinomial, norm
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.running_sum import RunningMean, RunningSum
 from safe_envs.agents.evaluation.statistics import (
+    exact_interval,
+    exact_upper_end,
     log_normal_interval,
     mcnemar_p,
     paired_difference_interval,
@@ -127,6 +129,28 @@ def test_rate_interval_covers_as_often_as_it_says():
     assert coverage(low_rates).mean() > 0.95
     # Where a failure is unlikely to be seen at all, the exact interval of none holds the rate.
     assert coverage([1 - 0.975 ** (1 / trials)])[0] >= 0.975 - 1e-12
+
+
+@pytest.mark.parametrize(("trials", "error"), [(50, 0.005), (500, 0.00125)])
+def test_the_upper_end_errs_as_seldom_as_it_says(trials, error):
+    successes = np.arange(trials + 1)
+    ends = np.array([exact_upper_end(int(s), trials, error) for s in successes])
+    for unsafe in np.geomspace(1e-6, 0.5, 60):
+        assert binom.pmf(successes, trials, 1 - unsafe)[ends < 1 - unsafe].sum() <= error * (
+            1 + 1e-9
+        )
+    assert (np.diff(ends) > 0).all()
+
+
+@pytest.mark.parametrize(("trials", "confidence"), [(20, 0.9), (1000, 0.999)])
+def test_an_exact_interval_is_wrong_on_either_side_as_seldom_as_it_says(trials, confidence):
+    counts = np.arange(trials + 1)
+    low, high = np.array([exact_interval(int(s), trials, confidence) for s in counts]).T
+    assert ((low <= counts / trials) & (counts / trials <= high)).all()
+    for p in (*np.geomspace(1e-6, 0.5, 30), *(1.0 - np.geomspace(1e-6, 0.5, 30))):
+        weights = binom.pmf(counts, trials, p)
+        tail = (1.0 - confidence) / 2.0 * (1.0 + 1e-9)
+        assert max(weights[high < p].sum(), weights[low > p].sum()) <= tail
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,12 @@ from safe_envs.agents.rare_events.importance_sampling import (
     log_ratio,
     optimal_tilt,
 )
-from safe_envs.agents.rare_events.rows import PlainEpisodes, RareEstimate, verdict
+from safe_envs.agents.rare_events.rows import (
+    PlainEpisodes,
+    RareEstimate,
+    doubt_of,
+    skewed_interval,
+)
 from safe_envs.agents.rare_events.splitting import Splitting
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from tests.agents.rare_events.conftest import paths_of
@@ -152,9 +157,9 @@ def test_without_noise_chance_may_come_from_the_policy():
     assert found.ci_high > 1 - plain.ci_high
 
 
-def row(p, width, error, spread=0.1):
+def estimate(p, width, spread=0.1):
     estimates = p * np.exp(spread * np.resize((-1, 1), 20))
-    return RareEstimate("", p, p / width, p * width, error, estimates.tolist())
+    return RareEstimate("splitting on h", p, p / width, p * width, 0.1, estimates.tolist())
 
 
 NOTHING_SEEN = PlainEpisodes(5000, 0, 0.0, 7e-4)
@@ -162,39 +167,37 @@ FEW_SEEN = PlainEpisodes(5000, 5, 4e-4, 2e-3)
 
 
 @pytest.mark.parametrize(
-    ("split", "drift", "plain", "answer", "doubt"),
+    ("found", "check", "plain", "doubt"),
     [
-        (row(1e-7, 1.5, 0.2), None, NOTHING_SEEN, "split", None),
-        (row(1e-7, 1.5, 0.2), row(1.2e-7, 1.1, 0.05), NOTHING_SEEN, "drift", None),
-        (row(1e-7, 1.5, 0.2), row(1.2e-7, 1.2, 0.11), NOTHING_SEEN, "split", None),
-        (
-            row(1e-7, 1.5, 0.2),
-            row(2e-7, 1.1, 0.05),
-            NOTHING_SEEN,
-            "split",
-            "importance sampling says 2e-07",
-        ),
-        (
-            row(1e-7, 1.5, 0.2),
-            row(5e-7, 1.1, 0.19),
-            NOTHING_SEEN,
-            "split",
-            "importance sampling says 5e-07",
-        ),
-        (row(1e-7, 1.5, 0.2), None, FEW_SEEN, "split", "5 violations among 5000 contradict it"),
-        (
-            row(1e-7, 1.5, 0.2),
-            row(1.2e-7, 1.1, 0.05),
-            FEW_SEEN,
-            "drift",
-            "5 violations among 5000 contradict it",
-        ),
-        (row(1e-7, 1.5, 0.2, 1.1), None, NOTHING_SEEN, "split", "differ by large factors"),
-        (row(1e-7, 1.5, 0.2, 1.1), row(1.2e-7, 1.1, 0.05), NOTHING_SEEN, "drift", None),
+        (estimate(1e-7, 1.5), None, NOTHING_SEEN, None),
+        (estimate(1e-7, 1.1), estimate(1.2e-7, 1.5), NOTHING_SEEN, None),
+        (estimate(1e-7, 1.1), estimate(2e-7, 1.5), NOTHING_SEEN, "splitting on h says 2e-07"),
+        (estimate(1e-7, 1.5), None, FEW_SEEN, "5 violations among 5000 contradict it"),
+        (estimate(1e-7, 1.5, 0.38), None, NOTHING_SEEN, None),
+        (estimate(1e-7, 1.5, 0.45), None, NOTHING_SEEN, "standard deviation of 0.46"),
     ],
 )
-def test_which_estimate_is_the_answer(split, drift, plain, answer, doubt):
-    found, check, told = verdict(split, drift, plain)
-    assert found is (split if answer == "split" else drift)
-    assert check is (drift if answer == "split" else split)
+def test_what_contradicts_an_estimate(found, check, plain, doubt):
+    told = doubt_of(found, check, plain)
     assert (told is None) if doubt is None else (doubt in told)
+
+
+def test_an_interval_of_skewed_estimates_reaches_further_up():
+    even = np.array([0.9, 1.0, 1.1] * 7)
+    assert skewed_interval(even, 0.95) == log_normal_interval(even)
+    skewed = np.array([1.0] * 19 + [3.0])
+    (low, high), (coxs_low, coxs_high) = skewed_interval(skewed, 0.95), log_normal_interval(skewed)
+    assert (low, high > coxs_high) == (coxs_low, True)
+    assert skewed_interval(np.array([2.0, 2.0]), 0.95) == (2.0, 2.0)
+
+
+@pytest.mark.parametrize("skew", [0.0, 1.0])
+def test_an_interval_of_skewed_estimates_covers(skew):
+    # Sums of log-normal numbers and of rarer, larger ones: of mean 1 and a deviation of .3.
+    rng = np.random.default_rng(0)
+    parts = np.exp(0.25 * rng.standard_normal((2000, 20)) - 0.25**2 / 2)
+    rare = 1.0 * (rng.random(parts.shape) < 0.03)
+    estimates = (parts + skew * rare) / (1.0 + 0.03 * skew)
+    ends = [skewed_interval(each, 0.95) for each in estimates]
+    covered = np.mean([low < 1.0 < high for low, high in ends])
+    assert covered > 0.935

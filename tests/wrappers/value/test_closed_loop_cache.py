@@ -15,7 +15,7 @@ from safe_envs.registry import make_problem
 from safe_envs.wrappers.conditions.spec_text import conditions_for
 from safe_envs.wrappers.value import closed_loop, closed_loop_cache
 from safe_envs.wrappers.value.closed_loop import ClosedLoop, require_few_states
-from safe_envs.wrappers.value.closed_loop_cache import closed_loop_at_hand, closed_loop_for
+from safe_envs.wrappers.value.closed_loop_cache import closed_loop_for
 from safe_envs.wrappers.value.closed_loop_files import load_closed_loop, save_closed_loop
 from safe_envs.wrappers.value.table_files import ValueFileError
 from tests.wrappers.value.systems import scalar
@@ -45,7 +45,6 @@ def refuse(*_, **__):
 
 
 def test_a_second_process_reads_what_the_first_one_kept(tmp_path, monkeypatch):
-    assert closed_loop_at_hand(loop()) is None
     done = []
     bounds = closed_loop_for(loop(), done.append).start_bounds(POINTS)
     assert done[-1] == 1.0
@@ -53,19 +52,18 @@ def test_a_second_process_reads_what_the_first_one_kept(tmp_path, monkeypatch):
     # Nothing of this process holds the table any longer.
     assert not closed_loop_cache._IN_USE
     monkeypatch.setattr(ClosedLoop, "table", refuse)
-    for found in (closed_loop_at_hand(loop()), closed_loop_for(loop())):
-        assert found is not None
-        assert (found.start_bounds(POINTS) == bounds).all()
-        assert found.lower.shape == (2, found.grid.cells)
+    found = closed_loop_for(loop())
+    assert (found.start_bounds(POINTS) == bounds).all()
+    assert found.lower.shape == (2, found.grid.cells)
     assert len(files(tmp_path)) == 1
 
 
 def test_a_table_in_use_needs_no_folder(monkeypatch):
     monkeypatch.setenv("SAFE_ENVS_CACHE", "")
     table = closed_loop_for(loop())
-    assert closed_loop_at_hand(loop()) is table
+    assert closed_loop_for(loop()) is table
     del table
-    assert closed_loop_at_hand(loop()) is None
+    assert not closed_loop_cache._IN_USE
 
 
 def test_each_closed_loop_has_a_table_of_its_own():
@@ -115,7 +113,6 @@ def test_a_damaged_file_is_no_table(tmp_path, how, caplog):
     right = closed_loop_for(loop()).start_bounds(POINTS)
     (kept,) = files(tmp_path)
     path.replace(kept)
-    assert closed_loop_at_hand(loop()) is None
     assert (closed_loop_for(loop()).start_bounds(POINTS) == right).all()
     assert "computed again" in caplog.text
 

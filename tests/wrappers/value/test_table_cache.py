@@ -6,7 +6,6 @@ import dataclasses
 import logging
 import os
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from safe_envs.file_locks import locked
 from safe_envs.user_cache import VARIABLE
 from safe_envs.wrappers.value import table_cache
 from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.table_cache import forget_old_tables, table_for
+from safe_envs.wrappers.value.table_cache import table_for
 from safe_envs.wrappers.value.table_files import FORMAT, ValueFileError, load_table, save_table
 from tests.wrappers.value.systems import scalar, solved, x
 from tests.wrappers.value.test_table_files import PROBLEM, table_of
@@ -163,23 +162,6 @@ def test_who_finds_another_at_work_waits_for_its_table(folder, computed, caplog)
     assert len(computed) == 1
     np.testing.assert_array_equal(found.upper, table.upper)
     assert list(folder.iterdir()) == [place]
-
-
-def test_the_tables_used_last_remain(tmp_path):
-    names = [f"{i:064x}.npz" for i in range(5)]
-    for i, name in enumerate(names):
-        (tmp_path / name).write_bytes(b"x" * 10)
-        os.utime(tmp_path / name, (i, i))
-    (tmp_path / "mine.npz").write_bytes(b"x" * 1000)
-    for name, age in ((f".{'0' * 40}.abc.npz", 90_000), (f".{'1' * 40}.abc.npz", 60)):
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (time.time() - age, time.time() - age))
-    forget_old_tables(tmp_path, 25)
-    left = {each.name for each in tmp_path.iterdir()}
-    assert left == {"mine.npz", f".{'1' * 40}.abc.npz", *names[3:]}
-    forget_old_tables(tmp_path, 5)
-    assert {each.name for each in tmp_path.iterdir()} >= {names[4]}
-    assert not (tmp_path / names[3]).exists()
 
 
 def test_a_file_by_name_is_read_or_written(folder, computed, tmp_path):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import sympy as sp
 
+from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers import parse_conditions
+from safe_envs.wrappers.verification import proof
 from safe_envs.wrappers.verification.extrema import unbounded
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
@@ -369,3 +373,52 @@ def test_the_error_of_a_mean_is_known():
     values = found.formulas.chain(starts)[:, 0]
     assert bound.error == pytest.approx(values.std(ddof=1) / 16)
     assert by_name(found.guarantee.applicable_bounds(starts[:1], 1.0), "4.2.8").error == 0.0
+
+
+def crowd(noise):
+    """Return four robots in the plane on a circle, with a barrier for each pair."""
+    x, u = sp.symbols("x:8", real=True), sp.symbols("u:8", real=True)
+    system = ControlAffineSDE.from_rate(x, u, u, diffusion=noise * sp.eye(8))
+    barriers = [
+        (x[2 * i] - x[2 * j]) ** 2 + (x[2 * i + 1] - x[2 * j + 1]) ** 2 - 0.09
+        for i, j in itertools.combinations(range(4), 2)
+    ]
+    angles = 2.0 * np.pi * np.arange(4) / 4
+    start = 2.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1).ravel()
+    return state_problem(
+        system,
+        barriers,
+        box=(-1.0, 1.0),
+        start=start.tolist(),
+        dt=0.05,
+        horizon=5.0,
+        workspace=dict.fromkeys(x, (-4, 4)),
+    )
+
+
+def test_the_judge_is_not_asked_for_what_is_0_at_the_starts_anyway(monkeypatch):
+    for name in ("judge", "supremum"):
+        monkeypatch.setattr(proof, name, lambda *_: pytest.fail("it was asked"))
+    problem = crowd(0.05)
+    found = guarantee_of(problem, parse_conditions("scbf", problem), seconds=6.0)
+    assert found.note == "it is 0 at these starts up to this horizon"
+
+
+def test_search_and_judge_end_with_their_time():
+    problem = crowd(0.0)
+    begun = time.process_time()
+    found = guarantee_of(problem, parse_conditions("cbf:alpha=2", problem), seconds=0.2)
+    assert found.note == "the shortfall of several conditions together is not established"
+    verdict = found.proof.feasible
+    assert (verdict.word, "boxes are left after" in verdict.reason) == ("undecided", True)
+    assert time.process_time() - begun < 10.0
+
+
+def test_what_is_decided_in_time_is_the_same():
+    problem = problem_of("safe_envs/CubicSDEDisk-v0")
+    starts = np.array([[-0.1, 0.7]])
+    values = [
+        guarantee_of(problem, parse_conditions("scbf", problem), seconds=each).at(starts, 1.0)
+        for each in (None, 60.0)
+    ]
+    assert values[0] == values[1] > 0.0
