@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,7 @@ import sympy as sp
 from rich.console import Console
 
 from safe_envs.errors import shortened
+from safe_envs.outward_text import percent_at_least
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.wrappers.certificates.certificate import AnyCertificate, HeldCertificate
@@ -51,9 +51,12 @@ class CheckAnswer:
         words += ["refuted"] if self.env.word == "differs" else []
         return next((word for word in ("refuted", "undecided") if word in words), "checked")
 
-    def bounds(self) -> list[float]:
-        """Return the bound that is stated at each start, 0 outside of G, rounded down."""
-        c, bounds = self.certificate, []
+    def bounds(self) -> list[float | None]:
+        """Return the bound at each start, 0 outside of G, rounded down; None unless it is checked.
+        """
+        if self.word != "checked":
+            return [None] * len(self.starts)
+        c, bounds = self.certificate, list[float | None]()
         plant = c.plant
         for start in self.starts:
             known = dict(zip(plant.states, map(sp.Float, start), strict=True))
@@ -130,7 +133,7 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     say(console, f"{shortened(answer.file)}: barrier certificate of {shortened(whose)}")
     say(console, f"psi has degree {c.psi.degree} in {names}; it is for {control}")
     told = ", ".join(f"{name} = {float(v):.9g}" for name, v in _numbers(c).items())
-    say(console, f"{told}; {_formula(c)}")
+    say(console, f"It states, with {told}: {_formula(c)}")
     say(console, answer.env.text)
     for name, result in answer.found.items():
         say(console, f"\nBy {_BY[name]}:")
@@ -147,11 +150,11 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     if answer.starts:
         rows = []
         for start, bound in zip(answer.starts, answer.bounds(), strict=True):
-            percent = math.floor(1e4 * bound) / 1e2
-            rows.append((", ".join(f"{x:g}" for x in start), f">= {percent:.2f} %"))
-        titles = (names, "bound" if answer.word == "checked" else "not proved")
+            place = ", ".join(f"{x:g}" for x in start)
+            text = "not proved" if bound is None else f">= {percent_at_least(bound, 2)} %"
+            rows.append((place, text))
         console.print()
-        print_rows(console, "pr", titles, rows)
+        print_rows(console, "pr", (names, "bound"), rows)
         console.print()
     proof = "a proof of its bound" if answer.word == "checked" else "no proof of its bound"
     held = (

@@ -26,6 +26,7 @@ from safe_envs.wrappers.verification.proof import ChainProof
 from safe_envs.wrappers.verification.results import (
     Bound,
     Candidate,
+    Extremum,
     Stages,
     Status,
     of_order_one,
@@ -69,11 +70,27 @@ class ChainGuarantee:
     @property
     def statements(self) -> list[tuple[str, JudgeResult]]:
         """The hypotheses with the judge's word; none where no theorem applies."""
-        return (
-            []
-            if no_bound(self.formulas) or self.analysis.invariant_set is None
-            else self.proof.statements
-        )
+        return self.proof.statements if self._is_judged else []
+
+    @cached_property
+    def _is_judged(self) -> bool:
+        """Whether a theorem applies, so that the judge is asked for its hypotheses and numbers."""
+        return not no_bound(self.formulas) and self.analysis.invariant_set is not None
+
+    @cached_property
+    def shortfall(self) -> Extremum:
+        """The largest shortfall on the invariant set; on C where that is empty."""
+        found = self.analysis.max_shortfall[0]
+        return Extremum(found, self.proof.shortfall.value) if self._is_judged else Extremum(found)
+
+    @cached_property
+    def suprema(self) -> tuple[Extremum, ...]:
+        """The suprema c_j on the invariant set; where none matters, none is proved."""
+        found = self.analysis.suprema.tolist()
+        if self.formulas.certain or not self._is_judged:
+            return tuple(map(Extremum, found))
+        pairs = zip(found, self.proof.suprema, strict=True)
+        return tuple(Extremum(each, number.value) for each, number in pairs)
 
     @property
     def note(self) -> str | None:
@@ -102,7 +119,7 @@ class ChainGuarantee:
     @property
     def _unbounded(self) -> str:
         """Which supremum is infinite, where one matters, in words; may be empty."""
-        proved = self.formulas.certain or all(math.isfinite(c) for c in self._suprema)
+        proved = self.formulas.certain or all(math.isfinite(c.value) for c in self.suprema)
         return "" if proved else unbounded(self.analysis)
 
     @property
@@ -116,8 +133,15 @@ class ChainGuarantee:
     @property
     def remark(self) -> str:
         """Why the bound is weak: where no action meets the condition; may be empty."""
-        shortfall = self.analysis.max_shortfall[0]
-        return f"no action meets the condition somewhere, {amount(shortfall)}" * bool(shortfall)
+        shortfall = self.shortfall
+        if shortfall.found:
+            return f"no action meets the condition somewhere, {amount(shortfall)}"
+        if not shortfall.is_proved or shortfall.proved <= self.proof.negligible:
+            return ""
+        return (
+            "that an action meets the condition everywhere is not proved, but that the best one"
+            f" misses it by {shortfall.text()}"
+        )
 
     @property
     def word(self) -> Status:
@@ -129,22 +153,14 @@ class ChainGuarantee:
     def stages(self) -> Stages:
         """The stages of all barriers."""
         rates, shortfalls = [], []
-        shortfall = self.proof.shortfall.value
-        if math.isinf(shortfall):
-            shortfall = self.analysis.max_shortfall[0]
+        shortfall = self.shortfall.value
         for condition, stage in zip(self.formulas.conditions, self.formulas.stages, strict=True):
             degree = stage.stop - stage.start
             rates += condition.chain_rates(degree) or (math.nan,) * degree
             shortfalls += [*[0.0] * (degree - 1), shortfall]
         # Where every path is safe, no supremum matters.
-        suprema = (1.0,) * len(rates) if self.formulas.certain else self._suprema
+        suprema = [1.0 if self.formulas.certain else each.value for each in self.suprema]
         return Stages(tuple(rates), tuple(suprema), tuple(shortfalls))
-
-    @property
-    def _suprema(self) -> list[float]:
-        """The suprema that are proved or, where none is, those that the search found."""
-        pairs = zip(self.proof.suprema, self.analysis.suprema.tolist(), strict=True)
-        return [n.value if math.isfinite(n.value) else found for n, found in pairs]
 
     @property
     def _certain_up_to_a_time(self) -> bool:
@@ -182,8 +198,8 @@ class ChainGuarantee:
         """
         if self.note:
             return ""
-        return above_suprema(self.formulas, self.stages.suprema, reached) or above_shortfall(
-            self.formulas, max(self.stages.shortfalls), violated, actions
+        return above_suprema(self.formulas, self.suprema, reached) or above_shortfall(
+            self.formulas, self.shortfall, violated, actions
         )
 
     def applicable_bounds(self, starts: np.ndarray, horizon: float) -> list[Bound]:
@@ -209,7 +225,7 @@ class ChainGuarantee:
         share = f"{100 * (1 - inside.mean()):.1f} %"
         partly = [f"0 at the {share} of the starts that are outside some C_j"] * (not inside.all())
         found = [self._judged(candidate, partly) for candidate in self._candidates(b, horizon)]
-        high = above_suprema(formulas, self.stages.suprema, starts)
+        high = above_suprema(formulas, self.suprema, starts)
         return [bound.without(high) for bound in found]
 
     def _judged(self, candidate: Candidate, partly: list[str]) -> Bound:
@@ -235,11 +251,10 @@ class ChainGuarantee:
     @cached_property
     def _infeasible(self) -> str:
         """Where the conditions cannot be met, in words; may be empty."""
-        formulas, analysis = self.formulas, self.analysis
-        shortfall, infeasible = analysis.max_shortfall[0], analysis.infeasible
-        if not shortfall:
+        formulas, shortfall, infeasible = self.formulas, self.shortfall, self.analysis.infeasible
+        if not shortfall.found:
             return ""
-        share = f"{100 * infeasible:.2g} % of" if infeasible else "a thin part of"
+        share = f"about {100 * infeasible:.2g} % of" if infeasible else "a thin part of"
         where = "C" if formulas.first_order else "the intersection of the C_j"
         conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
         return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
@@ -265,7 +280,8 @@ class ChainGuarantee:
             else of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
         )
         if any(stages.shortfalls):
-            name = f"repaired for the shortfall m = {max(stages.shortfalls):.4g}, up to T"
+            m = self.shortfall.text("=", ">=")
+            name = f"repaired for the shortfall m {m}, up to T"
             values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
             found.append(Candidate(name, values, allows_shortfall=True))
         return found

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from safe_envs.outward_text import number_at_least, number_at_most
 from safe_envs.wrappers.verification import bounds
 
 Status = Literal[
@@ -17,8 +18,45 @@ Status = Literal[
 fails, and the judge left one undecided; episodes contradicted it; one fails; there is none; or an
 assumption is known to be false or was not looked at."""
 
+RELATIVE = 1e-6
+"""Error that a search and rounding may leave, in parts of the number itself."""
+
 HOLDING: tuple[Status, ...] = ("proved", "estimated")
 """Of a bound whose hypotheses are not known to fail."""
+
+
+class Extremum(NamedTuple):
+    """The largest value of a function on a set: what a search met, and what the judge proved.
+
+    Attributes:
+        found: largest value that the search met, below the supremum or equal to it.
+        proved: upper bound that the judge proved; infinite without one.
+    """
+
+    found: float
+    proved: float = math.inf
+
+    @property
+    def is_proved(self) -> bool:
+        """Whether there is a proved upper bound."""
+        return math.isfinite(self.proved)
+
+    @property
+    def value(self) -> float:
+        """The proved bound or, without one, what the search met."""
+        return self.proved if self.is_proved else self.found
+
+    def text(self, below: str = "at most", above: str = "at least", digits: int = 4) -> str:
+        """Return the number and on which side of it the supremum is.
+
+        Args:
+            below: says that the supremum is not above a number that is proved.
+            above: says that it is not below a number that a search met.
+            digits: of the number.
+        """
+        if self.is_proved:
+            return f"{below} {number_at_most(self.proved, digits)}"
+        return f"{above} {number_at_least(self.found * (1.0 + RELATIVE), digits)}, found by search"
 
 
 @dataclass(frozen=True)
