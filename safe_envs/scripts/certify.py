@@ -28,8 +28,9 @@ def certify(
     degree: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="Total degree of psi; by default higher ones are tried as long as"
-            " they are better."
+            metavar="N",
+            help="Total degree of psi; by default higher ones are tried as long as"
+            " they are better.",
         ),
     ] = None,
     policy: Annotated[

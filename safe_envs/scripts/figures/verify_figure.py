@@ -42,8 +42,8 @@ def plot_verification(
 ) -> StyledFigure:
     """Draw where no action meets the conditions, h, and the boundaries of the chain.
 
-    A plane is drawn with the other states as at the worst state found, and next to it with all values of
-    the others at once.
+    A plane is drawn with the other states as at the worst state found, and next to it with all
+    values of the others at once.
 
     Args:
         found: to draw, of `verify`.

@@ -192,7 +192,7 @@ def _missing_lines(found: Certification) -> list[str]:
             " states. That says nothing of other degrees, or of other functions than polynomials."
         )
     lines += [
-        f"Note: nothing of degree {degree} is better than psi of the lower degree, which is its own."
+        f"Note: nothing of degree {degree} is better than psi of the lower degree, which it has."
         for degree in kept
     ]
     lines += [

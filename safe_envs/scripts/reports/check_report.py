@@ -52,8 +52,7 @@ class CheckAnswer:
         return next((word for word in ("refuted", "undecided") if word in words), "checked")
 
     def bounds(self) -> list[float | None]:
-        """Return the bound at each start, 0 outside of G, rounded down; None unless it is checked.
-        """
+        """Return the bound at each start, rounded down; 0 outside of G, None unless checked."""
         if self.word != "checked":
             return [None] * len(self.starts)
         c, bounds = self.certificate, list[float | None]()

@@ -103,8 +103,8 @@ def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
         )
     elif not found.formulas.first_order:
         lines.append(
-            "the intersection of the C_j = {b_j >= 0}, which the condition makes invariant, is about"
-            f" {share_text(found.invariant_set.share)} of {_searched(found)}"
+            "the intersection of the C_j = {b_j >= 0}, which the condition makes invariant, is"
+            f" about {share_text(found.invariant_set.share)} of {_searched(found)}"
         )
         outside = _outside(found, starts)
         if outside:
@@ -133,8 +133,8 @@ def _barrier_lines(found: Verification, i: int) -> list[str]:
         lines = [
             f"control authority: it vanishes at {at}, where the input has no effect, and the"
             " condition holds only if its offset is >= 0",
-            f"  its reach within the input bounds is {size}, below {100 * SMALL:g} % of that on about"
-            f" {share_text(b.small)} of {_searched(found)}{infeasible * bool(b.small)}",
+            f"  its reach within the input bounds is {size}, below {100 * SMALL:g} % of that on"
+            f" about {share_text(b.small)} of {_searched(found)}{infeasible * bool(b.small)}",
         ]
     else:
         lines = [

@@ -135,8 +135,7 @@ class CuttingPlanes:
         self.references, self._cuts = self.references + 1, 0
 
     def _solved(self) -> BarrierCandidate | None:
-        """Solve a linear program, and add what it does not meet; nothing where it has no solution.
-        """
+        """Solve a linear program, and add what it does not meet; nothing without a solution."""
         self._done += 1
         asked, points, bound = self._asked.generator, self._points, self._bound
         high = np.ones(len(asked), dtype=bool)

@@ -105,6 +105,39 @@ def amount(shortfall: Extremum) -> str:
     return shortfall.text("by up to", "by at least")
 
 
+def missed_somewhere(shortfall: Extremum, negligible: float) -> str:
+    """Say that the conditions cannot be met somewhere, or that this is not excluded; may be empty.
+
+    Args:
+        shortfall: of the conditions.
+        negligible: below this a proved one is not worth a word.
+    """
+    if shortfall.found:
+        return f"no action meets the condition somewhere, {amount(shortfall)}"
+    if not shortfall.is_proved or shortfall.proved <= negligible:
+        return ""
+    return (
+        "that an action meets the condition everywhere is not proved, but that the best one misses"
+        f" it by {shortfall.text()}"
+    )
+
+
+def infeasible(analysis: SafeSetAnalysis, shortfall: Extremum) -> str:
+    """Say on which part of the invariant set the conditions cannot be met; "" if on none.
+
+    Args:
+        analysis: of the safe set.
+        shortfall: of the conditions.
+    """
+    formulas, part = analysis.formulas, analysis.infeasible
+    if not shortfall.found:
+        return ""
+    share = f"about {100 * part:.2g} % of" if part else "a thin part of"
+    where = "C" if formulas.first_order else "the intersection of the C_j"
+    conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
+    return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
+
+
 def unbounded(analysis: SafeSetAnalysis) -> str:
     """Say which supremum is infinite, where one matters; "" if none is."""
     if analysis.formulas.certain or not np.isinf(analysis.suprema).any():

@@ -13,9 +13,10 @@ from safe_envs.wrappers.verification.assumptions import (
     JOINT,
     above_shortfall,
     above_suprema,
-    amount,
     failures,
+    infeasible,
     mismatch,
+    missed_somewhere,
     no_bound,
     outside,
     unbounded,
@@ -133,15 +134,7 @@ class ChainGuarantee:
     @property
     def remark(self) -> str:
         """Why the bound is weak: where no action meets the condition; may be empty."""
-        shortfall = self.shortfall
-        if shortfall.found:
-            return f"no action meets the condition somewhere, {amount(shortfall)}"
-        if not shortfall.is_proved or shortfall.proved <= self.proof.negligible:
-            return ""
-        return (
-            "that an action meets the condition everywhere is not proved, but that the best one"
-            f" misses it by {shortfall.text()}"
-        )
+        return missed_somewhere(self.shortfall, self.proof.negligible)
 
     @property
     def word(self) -> Status:
@@ -251,13 +244,7 @@ class ChainGuarantee:
     @cached_property
     def _infeasible(self) -> str:
         """Where the conditions cannot be met, in words; may be empty."""
-        formulas, shortfall, infeasible = self.formulas, self.shortfall, self.analysis.infeasible
-        if not shortfall.found:
-            return ""
-        share = f"about {100 * infeasible:.2g} % of" if infeasible else "a thin part of"
-        where = "C" if formulas.first_order else "the intersection of the C_j"
-        conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
-        return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
+        return infeasible(self.analysis, self.shortfall)
 
     def _candidates(self, b: np.ndarray, horizon: float) -> list[Candidate]:
         """Return the results that suit the conditions; the last one has the weakest hypotheses.

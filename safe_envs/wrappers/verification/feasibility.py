@@ -24,12 +24,12 @@ from safe_envs.wrappers.verification.extrema import (
     without_control,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.results import Extremum
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
     infeasible_part,
 )
-from safe_envs.wrappers.verification.results import Extremum
 from safe_envs.wrappers.verification.search import Region, largest
 
 SMALL = 0.01

@@ -153,10 +153,12 @@ def posterior_guarantee(
     supremum, shortfall = Extremum(highest, proved.supremum), Extremum(missed, proved.shortfall)
     numbers = {"supremum": supremum, "shortfall": shortfall}
     bias = rate_bias(posterior, expression, np.array(problem.box), points)
-    remarks = [f"no action meets the robust condition somewhere, {amount(shortfall)}"] * bool(missed)
+    remarks = [f"no action meets the robust condition somewhere, {amount(shortfall)}"] * bool(
+        missed
+    )
     remarks += [
-        f"steps of {posterior.dt:g} s in the data may shift the rate of h by {bias:.3g} at sampled"
-        " states"
+        f"steps of {posterior.dt:g} s in the data may shift the rate of h by up to {bias:.3g} at"
+        " the sampled states"
     ] * (bias > 0.0)
     unproved = proved.reason or "the length of the steps in the data" * (bias > 0.0)
     remarks += [f"not proved: {unproved}"] * bool(unproved)

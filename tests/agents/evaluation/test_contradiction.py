@@ -46,7 +46,7 @@ FALSE = [
     (
         false_bounds.rotated,
         "cbf:alpha=0.1",
-        "no action meets the condition somewhere, by up to 0.",
+        "no action meets the condition somewhere, by up to",
         "that an action meets the condition everywhere is not proved",
     ),
 ]

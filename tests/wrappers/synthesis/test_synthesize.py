@@ -68,7 +68,9 @@ def test_a_degree_that_finds_nothing_keeps_the_psi_of_the_lower_one(monkeypatch)
         np.testing.assert_allclose(attempt.candidate.psi(x), first.candidate.psi(x))
     automatic = Synthesis(brownian(HORIZON), SynthesisSettings(rates=(0.5,)))
     monkeypatch.setattr(
-        improvement, "solve", lambda claims, *rest: None if len(rest[1]) > 9 else made(claims, *rest)
+        improvement,
+        "solve",
+        lambda claims, *rest: None if len(rest[1]) > 9 else made(claims, *rest),
     )
     assert [(a.degree, a.kept) for a in automatic.attempts()] == [(8, False), (14, True)]
 
