@@ -184,8 +184,8 @@ def _missing_lines(found: Certification) -> list[str]:
     """Return what was not found, in words."""
     lines = []
     none = [str(a.degree) for a in found.attempts if a.candidate is None]
-    kept = [a.degree for a in found.attempts if a.kept]
-    own = [j for j in found.judgements if j.degree not in kept]
+    carried = [a.degree for a in found.attempts if a.carried]
+    own = [j for j in found.judgements if j.degree not in carried]
     if none:
         lines.append(
             f"Note: no barrier of degree {', '.join(none)} has a bound above 0 at the sampled"
@@ -193,7 +193,7 @@ def _missing_lines(found: Certification) -> list[str]:
         )
     lines += [
         f"Note: nothing of degree {degree} is better than psi of the lower degree, which it has."
-        for degree in kept
+        for degree in carried
     ]
     lines += [
         f"Note: degree {j.degree} is undecided: {j.numbers.reason}."

@@ -187,7 +187,7 @@ def nominal_laws(problem: SafetyProblem) -> tuple[sp.Expr, ...]:
 def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[BarrierProof, ...]:
     """Judge the barriers, the best one first, until no other can have a larger bound."""
     order = sorted(
-        (a for a in attempts if a.candidate is not None and not a.kept),
+        (a for a in attempts if a.candidate is not None and not a.carried),
         key=lambda a: -_sampled(a.candidate),
     )
     found: list[BarrierProof] = []
@@ -205,7 +205,7 @@ def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[Barrie
         found.append(judgement)
     by_degree = {each.degree: each for each in found}
     for before, attempt in itertools.pairwise(attempts):
-        if attempt.kept and before.degree in by_degree:
+        if attempt.carried and before.degree in by_degree:
             # The same psi has the same proof.
             own = replace(by_degree[before.degree], degree=attempt.degree, seconds=0.0)
             by_degree[attempt.degree] = own

@@ -57,12 +57,6 @@ class Improvement:
     settings: SynthesisSettings
     extra: np.ndarray | None = None
 
-    def planes(
-        self, basis: ChebyshevBasis, bound: MeanBound, first: Witness | BarrierCandidate
-    ) -> CuttingPlanes:
-        """Return linear programs, of which none is solved yet; see `CuttingPlanes`."""
-        return CuttingPlanes(self, basis, bound, first)
-
 
 class CuttingPlanes:
     """The linear programs of a basis, each with more states.
@@ -98,17 +92,21 @@ class CuttingPlanes:
         self._last: np.ndarray | None = None
         self.best: BarrierCandidate | None = None
         self.references, self._cuts, self._done = 0, 0, 0
+        self._next: tuple[BarrierCandidate, np.ndarray] | None = None
         self._refer(first, x)
 
     def improve(
         self, rounds: int, deadline: float = math.inf, least: float = -math.inf
     ) -> BarrierCandidate | None:
-        """Solve linear programs, and return the best barrier so far.
+        """Solve linear programs.
 
         Args:
             rounds: linear programs at most, those before counted too.
             deadline: time, as of `time.monotonic`, after which few more are begun.
             least: mean bound below which the value of a linear program ends the rounds.
+
+        Returns:
+            The best barrier so far; nothing where no linear program has a solution.
         """
         tolerance = self._all.settings.tolerance
         while self._done < rounds:
@@ -121,7 +119,8 @@ class CuttingPlanes:
                 break
             if time.monotonic() > deadline and self._done >= _FEWEST:
                 break
-            if self.references > 1 and self.best.program - self.best.mean < tolerance:
+            referred = self.references > 1 or self._next is not None
+            if referred and self.best.program - self.best.mean < tolerance:
                 break
         return self.best
 
@@ -132,11 +131,13 @@ class CuttingPlanes:
         near = self._reference.sign_changes(states)
         self._points = self._points.joined(self._all.generator.samples(self._basis, near))
         self._asked = self._reference.asked(self._basis, self._points)
-        self.references, self._cuts = self.references + 1, 0
+        self.references, self._cuts, self._next = self.references + 1, 0, None
 
     def _solved(self) -> BarrierCandidate | None:
         """Solve a linear program, and add what it does not meet; nothing without a solution."""
         self._done += 1
+        if self._next is not None:
+            self._refer(*self._next)
         asked, points, bound = self._asked.generator, self._points, self._bound
         high = np.ones(len(asked), dtype=bool)
         if self._last is not None:
@@ -165,7 +166,7 @@ class CuttingPlanes:
         self._points = points.joined(bad.only(new))
         self._cuts += 1
         if self._cuts == _MOST_CUTS or cost.max(initial=0.0) < 2.0 * tolerance:
-            self._refer(raw, pool.states)
+            self._next = (raw, pool.states)
         else:
             self._asked = self._asked.joined(bad_asked.only(new))
         counts = self._starts @ c * bound.decay > m * bound.spent

@@ -26,7 +26,7 @@ Progress = Callable[[float], None]
 _DEGREES = {1: (8, 14, 20), 2: (6, 10, 14, 16), 3: (4, 6, 8), 4: (2, 4)}
 _LAST_DEGREES = (2,)
 _MOST_STATES = 6
-"""States up to which a proof has been seen to end: its boxes are bisected along all of them."""
+"""With more states neither the search nor the proof, which bisects along all, ends in minutes."""
 
 _MOST_MEMBERS = 800
 """Members of a basis up to which linear programs are fast enough."""
@@ -71,7 +71,7 @@ class Attempt:
         candidate: the barrier; nothing where none was found with a bound above 0.
         inputs: what the first linear program took for the input.
         seconds: of computing.
-        kept: whether the barrier is that of the degree before, than which none is better.
+        carried: whether the barrier is that of the degree before, than which none is better.
     """
 
     degree: int
@@ -79,7 +79,7 @@ class Attempt:
     candidate: BarrierCandidate | None
     inputs: str
     seconds: float
-    kept: bool = False
+    carried: bool = False
 
 
 class Synthesis:
@@ -145,16 +145,16 @@ class Synthesis:
                 first = planes and planes.best
                 own = planes and planes.improve(self._settings.rounds, deadline)
             else:
-                planes = self._improvement.planes(basis, first.bound, first)
+                planes = CuttingPlanes(self._improvement, basis, first.bound, first)
                 own = planes.improve(self._settings.rounds, deadline)
                 first = own if _mean(own) > _NOTHING else first
             last = max(before, own, key=_mean)
-            kept = last is not None and last is before
+            carried = last is not None and last is before
             seconds = time.monotonic() - started
-            found.append(Attempt(degree, len(basis.exponents), last, name, seconds, kept))
+            found.append(Attempt(degree, len(basis.exponents), last, name, seconds, carried))
             if progress is not None:
                 progress((k + 1) / len(self._degrees))
-            gain = 0.0 if kept else 1.0 - _mean(last)
+            gain = 0.0 if carried else 1.0 - _mean(last)
             if last is not None and not self._settings.degrees and gain < self._settings.tolerance:
                 break
         return tuple(found)
@@ -173,7 +173,7 @@ class Synthesis:
             near = np.concatenate([near, -near])
         extra = np.concatenate([worst[None], near[self.domain.inside(near)]])
         improvement = replace(self._improvement, extra=extra)
-        planes = improvement.planes(candidate.basis, candidate.bound, candidate)
+        planes = CuttingPlanes(improvement, candidate.basis, candidate.bound, candidate)
         return planes.improve(self._settings.rounds, time.monotonic())
 
     def _begun(self, basis: ChebyshevBasis) -> tuple[CuttingPlanes | None, str]:
@@ -181,7 +181,7 @@ class Synthesis:
         best, name, most = None, "", _NOTHING
         for bound in self._bounds:
             for law, inputs in self._laws.items():
-                planes = self._improvement.planes(basis, bound, inputs)
+                planes = CuttingPlanes(self._improvement, basis, bound, inputs)
                 mean = _mean(planes.improve(_FIRST_ROUNDS, least=most))
                 if mean > most:
                     best, name, most = planes, law, mean

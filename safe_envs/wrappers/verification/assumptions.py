@@ -111,6 +111,9 @@ def missed_somewhere(shortfall: Extremum, negligible: float) -> str:
     Args:
         shortfall: of the conditions.
         negligible: below this a proved one is not worth a word.
+
+    Returns:
+        A text.
     """
     if shortfall.found:
         return f"no action meets the condition somewhere, {amount(shortfall)}"
@@ -128,6 +131,9 @@ def infeasible(analysis: SafeSetAnalysis, shortfall: Extremum) -> str:
     Args:
         analysis: of the safe set.
         shortfall: of the conditions.
+
+    Returns:
+        A text.
     """
     formulas, part = analysis.formulas, analysis.infeasible
     if not shortfall.found:

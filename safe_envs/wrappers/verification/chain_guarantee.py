@@ -90,8 +90,7 @@ class ChainGuarantee:
         found = self.analysis.suprema.tolist()
         if self.formulas.certain or not self._is_judged:
             return tuple(map(Extremum, found))
-        pairs = zip(found, self.proof.suprema, strict=True)
-        return tuple(Extremum(each, number.value) for each, number in pairs)
+        return tuple(map(Extremum, found, [number.value for number in self.proof.suprema]))
 
     @property
     def note(self) -> str | None:

@@ -63,7 +63,7 @@ def test_a_degree_that_finds_nothing_keeps_the_psi_of_the_lower_one(monkeypatch)
     assert first.candidate.mean > 0.2
     x = np.linspace(0.1, 3.0, 20)[:, None]
     for attempt in others:
-        assert attempt.kept
+        assert attempt.carried
         assert attempt.candidate.mean == first.candidate.mean
         np.testing.assert_allclose(attempt.candidate.psi(x), first.candidate.psi(x))
     automatic = Synthesis(brownian(HORIZON), SynthesisSettings(rates=(0.5,)))
@@ -72,7 +72,7 @@ def test_a_degree_that_finds_nothing_keeps_the_psi_of_the_lower_one(monkeypatch)
         "solve",
         lambda claims, *rest: None if len(rest[1]) > 9 else made(claims, *rest),
     )
-    assert [(a.degree, a.kept) for a in automatic.attempts()] == [(8, False), (14, True)]
+    assert [(a.degree, a.carried) for a in automatic.attempts()] == [(8, False), (14, True)]
 
 
 @pytest.mark.slow
