@@ -202,9 +202,9 @@ def degrees_of(plant: Plant | ControlAffineSDE, settings: SynthesisSettings) -> 
     n = len(plant.states)
     if n > _MOST_STATES:
         raise ConfigurationError(
-            f"the system has {n} states ({', '.join(map(str, plant.states))}); certificates are"
-            f" looked for with up to {_MOST_STATES}, since the coefficients of psi and the boxes of"
-            " its proof multiply with each: give a system of the states that the barriers need"
+            f"the system has {n} states, and certificates are looked for with up to {_MOST_STATES}:"
+            " each state multiplies the coefficients of psi and the boxes of its proof; give a"
+            " system of the states that the barriers need"
         )
     degrees = tuple(sorted(set(settings.degrees))) or _DEGREES.get(n, _LAST_DEGREES)
     members = sp.binomial(n + degrees[-1], n)
