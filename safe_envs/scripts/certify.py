@@ -29,8 +29,7 @@ def certify(
         int | None,
         typer.Option(
             metavar="N",
-            help="Total degree of psi; by default higher ones are tried as long as"
-            " they are better.",
+            help="Highest total degree of psi; by default it rises as long as that is better.",
         ),
     ] = None,
     policy: Annotated[

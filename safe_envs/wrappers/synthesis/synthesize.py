@@ -124,8 +124,8 @@ class Synthesis:
 
         Returns:
             Attempts of increasing degree. Where the settings list none, a degree that is no better
-            than the one before, or nothing to gain, ends them; so does the time, but not before
-            the lowest degree of the settings.
+            than the one before, or nothing to gain, ends them. Where the time is over only the
+            lowest degree of the settings is begun.
         """
         deadline = time.monotonic() + self._settings.seconds
         lowest = min(self._settings.degrees, default=None)
@@ -133,7 +133,7 @@ class Synthesis:
         for k, degree in enumerate(self._degrees):
             started = time.monotonic()
             if found and started > deadline and degree != lowest:
-                break
+                continue
             basis = ChebyshevBasis(
                 self._task.plant.states, *self.domain.frame, degree, self.domain.even
             )
@@ -217,9 +217,9 @@ def degrees_of(plant: Plant | ControlAffineSDE, settings: SynthesisSettings) -> 
 
 
 def _climbed(degrees: tuple[int, ...], n: int) -> tuple[int, ...]:
-    """Return degrees that begin with one at which all rates and first inputs are tried soon."""
-    lowest = _DEGREES.get(n, _LAST_DEGREES)[0]
-    return (lowest, *degrees) if lowest < degrees[0] else degrees
+    """Return degrees after the lower ones of `_DEGREES`, whose first linear programs are fast."""
+    lower = (d for d in _DEGREES.get(n, _LAST_DEGREES) if d < degrees[0])
+    return (*lower, *degrees)
 
 
 def _mean(candidate: BarrierCandidate | None) -> float:

@@ -97,7 +97,7 @@ def test_no_degree_is_proved_worse_than_a_lower_one():
     )
     assert 0.99 < lowest.mean <= chosen.mean
     assert higher.mean >= lowest.mean - 1e-9
-    assert [a.degree for a in higher.attempts] == [6, 8]
+    assert [a.degree for a in higher.attempts] == [6, 8]  # Degree 6 is where it begins.
     sampled = [a.candidate.mean for a in higher.attempts]
     assert sampled == sorted(sampled)
 
