@@ -27,7 +27,10 @@ def certify(
     env: EnvOptions,
     degree: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Total degree of psi; by default several are tried."),
+        typer.Option(
+            metavar="N",
+            help="Highest total degree of psi; by default it rises as long as that is better.",
+        ),
     ] = None,
     policy: Annotated[
         str,
@@ -66,7 +69,8 @@ def certify(
     """Look for a polynomial psi that bounds how safe episodes are, and prove the bound.
 
     Linear programs choose psi for the largest mean bound over the env's starts, at sampled states;
-    branch and bound then proves its numbers at all states. The bound is of continuous control. It
+    branch and bound then proves its numbers at all states. Each degree starts from the psi before,
+    and is never worse. The bound is of continuous control. It
     holds for every policy whose input meets psi's constraint, which a filter ensures; all of it
     counts leaving the workspace in the safe set as safe.
 

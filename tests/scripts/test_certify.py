@@ -66,6 +66,12 @@ def test_what_is_not_found_is_said(safe_envs_command):
     assert "no barrier of degree 6" in out
 
 
+def test_too_many_states_are_refused_before_the_search(safe_envs_command):
+    status, out, err = safe_envs_command("certify", "safe_envs/Quadrotor-v0")
+    assert (status, out) == (2, "")
+    assert "12 states" in " ".join(err.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

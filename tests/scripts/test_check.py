@@ -57,9 +57,11 @@ def test_what_is_refuted_or_undecided_ends_with_1(safe_envs_command, written):
     status, out, err = safe_envs_command("check", written(TRUE["the disk"]), *asked)
     assert (status, err) == (1, "")
     assert json.loads(out)["word"] == "undecided"
+    assert json.loads(out)["bounds"] == [{"state": [0, 0], "bound": None}]
     status, out, _ = safe_envs_command("check", "psi.json", *asked[:4])
     assert status == 1
     assert "not proved" in out
+    assert ">= 9" not in out
 
 
 def test_a_proof_of_another_system_is_none_of_the_env(safe_envs_command, written):

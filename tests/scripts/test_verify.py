@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
 
 from safe_envs.agents.evaluation import bound_check
+from safe_envs.wrappers.verification import proof
+from safe_envs.wrappers.verification.judge import Supremum
 from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
@@ -33,8 +36,9 @@ def test_the_report_names_what_was_found(verify):
         "relative degree 1 with scbf",
         "it vanishes at",
         "the best action violates it by 0.08",
-        "sup h over C = c = 1",
-        "C: 1.6 %, violated by up to 0.08 at (x_1 = 0, x_2 = 0)",
+        "c = sup h over C <= 1.00001, proved",
+        "C: about 1.6 %, violated by at most 0.0800",
+        ", proved; by 0.08 at (x_1 = 0, x_2 = 0), the worst state found",
         "hypothesis fails",
         "repaired for the shortfall m = 0.08",
         "Hypotheses, judged G is where all b_j are positive, in the workspace",
@@ -43,7 +47,7 @@ def test_the_report_names_what_was_found(verify):
         "Held input: no bound, neither a table nor a certificate",
         "policy nominal",
         "The measurement contradicts bound 1, hypothesis fails (Prop. 4.2.8: h/c, for ever)",
-        "are estimates from samples",
+        "Shares are of sampled states",
     ):
         assert text in out
 
@@ -104,11 +108,15 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
     [
         (
             ("safe_envs/ACC-v0",),
-            ("sup h over C = c = 1000", "suprema are of the part inside", "proved, but empty"),
+            (
+                "sup h over C <= 1000.01, proved",
+                "suprema are of the part inside",
+                "proved, but empty",
+            ),
         ),
         (
             ("StochasticDubins-v0",),
-            ("c_0 = 8.9996, c_1 = 11.92", "product of", "conditions on the future"),
+            ("c_0 <= 9.0", "proved; c_1 <= 11.9", "product of", "conditions on the future"),
         ),
         (("StochasticDubins-v0", "--filter", "hocbf"), ("hocbf ignores the noise",)),
         (
@@ -129,7 +137,7 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
         ),
         (
             ("Pendulum-v0", "--start", ".1,.1"),
-            ("nowhere; the smallest margin", "estimated", " 72.6 % ", ">= 72.6 %"),
+            ("; the smallest margin found", "estimated", " 72.6 % ", ">= 72.6 %"),
         ),
     ],
 )
@@ -170,11 +178,10 @@ def test_json_holds_all_of_it(verify, tmp_path):
         "horizon": 1.0,
     }
     (barrier,) = document["barriers"]
-    assert (barrier["supremum"], barrier["unbounded"], barrier["suprema"]) == (
-        1000.0,
-        False,
-        [1000.0],
-    )
+    assert (barrier["supremum_found"], barrier["unbounded"]) == (1000.0, False)
+    assert 1000.0 <= barrier["supremum"] <= 1001.0
+    assert (barrier["suprema"], barrier["suprema_found"]) == ([barrier["supremum"]], [1000.0])
+    assert document["safe_set"]["shortfall"] >= document["safe_set"]["shortfall_found"] > 0.0
     assert [bound["status"] for bound in document["bounds"]] == ["hypothesis fails", "proved"]
     assert len(document["safe_set"]["worst"]) == 3
     measured, _ = document["measurements"]
@@ -208,6 +215,57 @@ def test_a_picture_without_an_infeasible_state_says_so(verify, tmp_path):
     picture = path.read_text()
     assert "no action meets the condition" not in picture
     assert "least to spare" in picture
+
+
+SPIKE = """
+from dataclasses import replace
+
+import sympy as sp
+
+from safe_envs.problem.barrier import Barrier
+from safe_envs.registry import make_problem
+
+
+def problem():
+    p = make_problem("safe_envs/CubicSDEDisk-v0")
+    x, y = p.plant.states
+    away = (x - sp.Rational(31, 100)) ** 2 + (y - sp.Rational(47, 100)) ** 2
+    h = 1 - x**2 - y**2 + 50 * sp.exp(-away * 10**8)
+    return replace(p, barriers=(Barrier(h, "h"),), name="spike")
+"""
+
+
+def test_what_a_search_misses_is_not_printed_as_a_fact(verify, safe_envs_command):
+    Path("own.py").write_text(SPIKE)
+    asked = ("--system", "own.py:problem", "--filter", "scbf")
+    status, out, _ = verify(*asked, "--no-simulate", "--json", "o.js")
+    assert status == 0
+    assert "c = sup h over C <= 50.6831, proved" in out
+    assert "violated by at most 4.00001e+08, proved; by 0.08 at" in out
+    document = strictly("o.js")
+    assert document["barriers"][0]["supremum"] > 50.68 > document["barriers"][0]["supremum_found"]
+    assert document["safe_set"]["shortfall"] > 4e8 > document["safe_set"]["shortfall_found"]
+    arguments = (*asked, "--episodes", 20, "--horizon", 0.1)
+    status, evaluated, _ = safe_envs_command("evaluate", *arguments)
+    assert status == 0
+    assert "no action meets the condition somewhere, by up to 4.001e+08" in evaluated
+    for text in (out, evaluated):
+        assert "by up to 0.08" not in text
+        assert "sup h over C = c = 1" not in text
+
+
+def test_what_only_a_search_knows_says_so(verify, monkeypatch):
+    undecided = Supremum(math.inf, -math.inf, None, 0, "not looked at")
+    monkeypatch.setattr(proof, "supremum", lambda *_: undecided)
+    asked = (CUBIC_DISK, "--horizon", 0.7, "--no-simulate", "--json", "o.js")
+    status, out, _ = verify(*asked)
+    assert status == 0
+    assert "c = sup h over C >= 1, found by search" in out
+    assert "violated by at least 0.08, found by search at" in out
+    assert "repaired for the shortfall m >= 0.08, found" in out
+    document = strictly("o.js")
+    assert document["barriers"][0]["suprema"] == [None]
+    assert document["safe_set"]["shortfall"] is None
 
 
 def test_the_policy_is_looked_for_before_anything_else(verify):

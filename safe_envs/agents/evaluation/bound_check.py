@@ -155,7 +155,7 @@ def measure(
     if best is not None:
         worlds.append(
             (
-                "the start where the printed bound is largest",
+                "the start found where the printed bound is largest",
                 problem.configured(start=best.tolist()),
             )
         )

@@ -111,7 +111,8 @@ class GuaranteeAverager:
         )
         if self._of_posterior:
             of_posterior = isinstance(self._found, PosteriorGuarantee)
-            sizes = {name: getattr(self._found, name) for name in _SIZES} if of_posterior else {}
+            names = (*_SIZES, "searched") if of_posterior else ()
+            sizes = {name: getattr(self._found, name) for name in names}
             found = replace(
                 found,
                 continuous_bound=None,
@@ -229,5 +230,7 @@ def together(summaries: Sequence[BoundSummary]) -> BoundSummary:
     }
     proved = all(c.word == "proved" for c in found)
     word: ContinuousWord = "proved" if proved else "estimated"
-    merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, word=word, **mean))
+    searched = tuple(dict.fromkeys(name for c in found for name in c.searched or ()))
+    summary = PosteriorSummary(note=worst.note, word=word, searched=searched, **mean)
+    merged = replace(first, posterior_bound=summary)
     return without_continuous(merged, reason) if reason else merged

@@ -14,8 +14,9 @@ from safe_envs.wrappers.certificates.certificate import HeldCertificate
 from safe_envs.wrappers.certificates.matching import system_differences
 from safe_envs.wrappers.conditions import Certified, Condition
 from safe_envs.wrappers.conditions.filter_settings import FilterSettings
-from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
+from safe_envs.wrappers.verification.assumptions import reaches
 from safe_envs.wrappers.verification.held_check import stated_bound, why_not_proved
+from safe_envs.wrappers.verification.results import RELATIVE, Extremum
 
 PROVED = "the certificate's statements are proved by branch and bound"
 """Note on such a bound."""
@@ -71,7 +72,7 @@ class HeldCertificateBound:
         inside = (np.abs(x - middle) <= half).all(axis=1) & (visited.depth > 0.0)
         highest = float(psi.values(x[inside]).max(initial=-math.inf))
         c = float(self._certificate.supremum)
-        return reaches("psi", highest, c) if highest > c * (1.0 + RELATIVE) else ""
+        return reaches("psi", highest, Extremum(c, c)) if highest > c * (1.0 + RELATIVE) else ""
 
 
 def held_certificate_bound(of: FilteredPolicy) -> HeldCertificateBound | None:

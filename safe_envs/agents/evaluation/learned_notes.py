@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.rows import EvaluationRow, PosteriorSummary
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
-from safe_envs.outward_text import number_at_most
+from safe_envs.outward_text import number_at_least, number_at_most
 from safe_envs.problem.problem import SafetyProblem
 
 
@@ -47,14 +47,23 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
             notes.append(f"bound of {name} over the posterior: {bound.note}")
         if bound and bound.delta is not None:
             word = "" if bound.probability is None else f" {bound.word} given the posterior,"
-            numbers = (bound.delta, bound.shortfall, bound.bias, bound.supremum)
-            delta, m, e, c = (number_at_most(value or 0.0, 3) for value in numbers)
+            numbers = (bound.delta, bound.bias or 0.0)
+            delta, e = (number_at_most(value, 3) for value in numbers)
+            m, c = (_size(bound, each) for each in ("shortfall", "supremum"))
             notes.append(
                 f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,{word}"
                 f" with probability delta = {delta} that the identification does not contain the"
-                f" system, shortfall m = {m}, bias of the steps e = {e}, c = {c}."
+                f" system, shortfall m {m}, bias of the steps e = {e} at sampled states, c {c}."
             )
     return notes
+
+
+def _size(bound: PosteriorSummary, name: str) -> str:
+    """Return a number of a bound with its relation: a search's is below the true one."""
+    value = getattr(bound, name) or 0.0
+    if name in (bound.searched or ()):
+        return f">= {number_at_least(value, 3)} (found by search)"
+    return f"= {number_at_most(value, 3)}"
 
 
 def _repeats(rows: Sequence[EvaluationRow]) -> int:

@@ -146,6 +146,7 @@ class PosteriorSummary:
         supremum: c.
         shortfall: m, in 1/s.
         bias: e of the steps, in 1/s.
+        searched: which of supremum and shortfall a search found, below their true values.
     """
 
     probability: float | None
@@ -155,9 +156,10 @@ class PosteriorSummary:
     supremum: float | None = None
     shortfall: float | None = None
     bias: float | None = None
+    searched: tuple[str, ...] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON-able data, less the numbers that are not there."""
+        """Return it as JSON-able data, less what is not there."""
         given = asdict(self)
         head = {name: given.pop(name) for name in ("probability", "note", "word")}
         return head | {name: value for name, value in given.items() if value is not None}

@@ -42,8 +42,8 @@ def plot_verification(
 ) -> StyledFigure:
     """Draw where no action meets the conditions, h, and the boundaries of the chain.
 
-    A plane is drawn with the other states as at the worst state, and next to it with all values of
-    the others at once.
+    A plane is drawn with the other states as at the worst state found, and next to it with all
+    values of the others at once.
 
     Args:
         found: to draw, of `verify`.
@@ -115,7 +115,7 @@ def _legend(answer: DrawnVerification, lines: ContourSet | None) -> list[Patch |
         for j in range(1, degree)
     ]
     marker: Any = {"linestyle": "", "color": INFEASIBLE, "marker": "X", "markeredgecolor": "black"}
-    cross = "worst state" if found.part.shortfall else "least to spare"
+    cross = "worst state found" if found.part.shortfall else "least to spare, found"
     handles.append(Line2D([], [], **marker, markersize=6, label=cross))
     starts = "starts, projected" if found.problem.plant.n > 2 else "starts"
     marker = {"linestyle": "", "color": COLORS[0], "marker": "o"}

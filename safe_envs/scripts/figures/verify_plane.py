@@ -73,7 +73,7 @@ def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
     ]
     listing = ", ".join(others) if len(others) < _LISTED else "other states"
     title = "Contours of $h$"
-    axes.set_title(f"{title}, at the worst state's\n{listing}" if others else title)
+    axes.set_title(f"{title}, at the worst state found:\n{listing}" if others else title)
     return lines
 
 

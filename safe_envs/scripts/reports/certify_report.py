@@ -192,19 +192,25 @@ def _missing_lines(found: Certification) -> list[str]:
     """Return what was not found, in words."""
     lines = []
     none = [str(a.degree) for a in found.attempts if a.candidate is None]
+    carried = [a.degree for a in found.attempts if a.carried]
+    own = [j for j in found.judgements if j.degree not in carried]
     if none:
         lines.append(
             f"Note: no barrier of degree {', '.join(none)} has a bound above 0 at the sampled"
             " states. That says nothing of other degrees, or of other functions than polynomials."
         )
     lines += [
+        f"Note: nothing of degree {degree} is better than psi of the lower degree, which it has."
+        for degree in carried
+    ]
+    lines += [
         f"Note: degree {j.degree} is undecided: {j.numbers.reason}."
-        for j in found.judgements
+        for j in own
         if j.numbers.reason
     ]
     lines += [
         f"Note: the numbers of degree {j.degree} may be far from the least ones: {j.numbers.note}."
-        for j in found.judgements
+        for j in own
         if j.numbers.note and not j.numbers.reason
     ]
     return lines

@@ -51,9 +51,11 @@ class CheckAnswer:
         words += ["refuted"] if self.env.word == "differs" else []
         return next((word for word in ("refuted", "undecided") if word in words), "checked")
 
-    def bounds(self) -> list[float]:
-        """Return the bound that is stated at each start, 0 outside of G, rounded down."""
-        c, bounds = self.certificate, []
+    def bounds(self) -> list[float | None]:
+        """Return the bound at each start, rounded down; 0 outside of G, None unless checked."""
+        if self.word != "checked":
+            return [None] * len(self.starts)
+        c, bounds = self.certificate, list[float | None]()
         plant = c.plant
         for start in self.starts:
             known = dict(zip(plant.states, map(sp.Float, start), strict=True))
@@ -137,7 +139,7 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     say(console, f"{shortened(answer.file)}: barrier certificate of {shortened(whose)}")
     say(console, f"psi has degree {c.psi.degree} in {names}; it is for {control}")
     told = ", ".join(f"{name} = {_number_text(name, v)}" for name, v in _numbers(c).items())
-    say(console, f"{told}; {_formula(c)}")
+    say(console, f"It states, with {told}: {_formula(c)}")
     say(console, answer.env.text)
     for name, result in answer.found.items():
         say(console, f"\nBy {_BY[name]}:")
@@ -155,10 +157,10 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
         rows = []
         for start, bound in zip(answer.starts, answer.bounds(), strict=True):
             place = ", ".join(f"{x:g}" for x in start)
-            rows.append((place, f">= {percent_at_least(bound, 2)} %"))
-        titles = (names, "bound" if answer.word == "checked" else "not proved")
+            text = "not proved" if bound is None else f">= {percent_at_least(bound, 2)} %"
+            rows.append((place, text))
         console.print()
-        print_rows(console, "pr", titles, rows)
+        print_rows(console, "pr", (names, "bound"), rows)
         console.print()
     proof = "a proof of its bound" if answer.word == "checked" else "no proof of its bound"
     held = (

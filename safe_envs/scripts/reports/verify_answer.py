@@ -13,7 +13,7 @@ from safe_envs.agents.evaluation.bound_check import MeasuredSafety
 from safe_envs.agents.evaluation.safety_chain import SafetyChain
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.certificate_guarantee import CertificateGuarantee
-from safe_envs.wrappers.verification.feasibility import Verification
+from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
 from safe_envs.wrappers.verification.judge import JudgeResult
 from safe_envs.wrappers.verification.results import Bound
 
@@ -79,12 +79,9 @@ class VerifyAnswer:
                 "notes": found.region.notes,
                 "beyond_workspace": found.beyond,
                 "undefined": found.undefined,
-                "safe_set": vars(found.safe_set),
-                "invariant_set": vars(found.invariant_set) if found.invariant_set else None,
-                "barriers": [
-                    {**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)}
-                    for b in found.barriers
-                ],
+                "safe_set": _set(found, found.safe_set),
+                "invariant_set": found.invariant_set and _set(found, found.invariant_set),
+                "barriers": [_barrier(found, i) for i in range(len(found.barriers))],
                 "statements": [
                     {"statement": text, **verdict._asdict()} for text, verdict in self.statements
                 ],
@@ -93,6 +90,29 @@ class VerifyAnswer:
                 "chain": self.chain.as_dict(),
             }
         )
+
+
+def _set(found: Verification, part: SetFeasibility) -> dict[str, Any]:
+    """Return the feasibility in a set; the number of a search has a name of its own."""
+    shortfall = found.shortfall(part)
+    return {**vars(part), "shortfall": shortfall.proved, "shortfall_found": shortfall.found}
+
+
+def _barrier(found: Verification, i: int) -> dict[str, Any]:
+    """Return what is known of a barrier; the numbers of a search have names of their own."""
+    barrier, supremum, suprema = found.barriers[i], found.supremum(i), found.suprema(i)
+    document = dict(vars(barrier))
+    return {
+        "name": document.pop("name"),
+        "control_authority_found": document.pop("control_authority"),
+        **document,
+        "supremum": supremum.proved,
+        "supremum_found": supremum.found,
+        "suprema": [each.proved for each in suprema],
+        "suprema_found": [each.found for each in suprema],
+        "vanishes": barrier.vanishes,
+        "unbounded": math.isinf(barrier.supremum),
+    }
 
 
 def _measured(found: MeasuredSafety) -> dict[str, Any]:

@@ -17,10 +17,13 @@ from safe_envs.scripts.reports.quantities import number_text, share_text, state_
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.feasibility import (
     SMALL,
-    BarrierFindings,
     SetFeasibility,
     Verification,
 )
+from safe_envs.wrappers.verification.results import Extremum
+
+_DIGITS = 6
+"""Of extrema, as many as the judge's statements have."""
 
 
 def print_report(console: Console, answer: VerifyAnswer) -> None:
@@ -38,13 +41,14 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
     )
     say(console, Text.assemble((answer.title, "bold"), told))
     _section(console, "Safe set", _set_lines(found, answer.starts))
-    for barrier, condition in zip(found.barriers, found.formulas.conditions, strict=True):
+    pairs = zip(found.barriers, found.formulas.conditions, strict=True)
+    for i, (barrier, condition) in enumerate(pairs):
         # A barrier of its own, in the place of h, takes the input in its first derivative.
         order = f"relative degree {barrier.degree} " if condition.differentiates else ""
         _section(
             console,
             f"Barrier {barrier.name}: {order}with {barrier.condition}",
-            _barrier_lines(found, barrier),
+            _barrier_lines(found, i),
         )
     conditions = "conditions" if len(found.barriers) > 1 else "condition"
     _section(
@@ -56,8 +60,8 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
     print_chain(console, answer)
     say(
         console,
-        "\nShares, worst states and what is said of each barrier are estimates from samples and a"
-        " local search; what the judge proved is not. The bounds but for that of held input are of"
+        "\nShares are of sampled states, and what was found is of a local search: worse states may"
+        " be left. What is proved holds at all states. The bounds but for that of held input are of"
         f" a filter that acts at every instant, not every {problem.dt:g} s, and count leaving the"
         " workspace as an end, not as a violation.",
     )
@@ -77,7 +81,7 @@ def _searched(found: Verification) -> str:
 def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     ranges = f" ({'; '.join(found.region.notes)})" if found.region.notes else ""
     lines = [
-        f"{found.analysis.safe.drawn} states were drawn from the workspace{ranges}; C is"
+        f"{found.analysis.safe.drawn} states were drawn from the workspace{ranges}; C is about"
         f" {share_text(found.safe_set.share)} of it, and {found.safe_set.points} of its states are"
         " looked at"
     ]
@@ -90,15 +94,17 @@ def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
         )
     if found.undefined:
         lines.append(
-            f"a condition has no finite value on {share_text(found.undefined)} of"
+            f"a condition has no finite value on about {share_text(found.undefined)} of"
             f" {_searched(found)}; it can be neither met nor violated there"
         )
     if found.invariant_set is None:
-        lines.append("the sets C_j = {b_j >= 0} have no state in common: there is no invariant set")
+        lines.append(
+            "no state was found that the sets C_j = {b_j >= 0} have in common: no invariant set"
+        )
     elif not found.formulas.first_order:
         lines.append(
             "the intersection of the C_j = {b_j >= 0}, which the condition makes invariant, is"
-            f" {share_text(found.invariant_set.share)} of {_searched(found)}"
+            f" about {share_text(found.invariant_set.share)} of {_searched(found)}"
         )
         outside = _outside(found, starts)
         if outside:
@@ -117,37 +123,47 @@ def _outside(found: Verification, starts: np.ndarray) -> float:
     )
 
 
-def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
-    problem = found.problem
+def _barrier_lines(found: Verification, i: int) -> list[str]:
+    problem, b = found.problem, found.barriers[i]
     size = f"{number_text(b.typical)} in the median"
     if b.vanishes:
-        infeasible = f"; no action meets the condition on {share_text(b.small_infeasible)} of it"
+        share = share_text(b.small_infeasible)
+        infeasible = f"; no action meets the condition on about {share} of it"
         at = state_text(problem, b.control_authority_at)
         lines = [
             f"control authority: it vanishes at {at}, where the input has no effect, and the"
             " condition holds only if its offset is >= 0",
             f"  its reach within the input bounds is {size}, below {100 * SMALL:g} % of that on"
-            f" {share_text(b.small)} of {_searched(found)}{infeasible * bool(b.small)}",
+            f" about {share_text(b.small)} of {_searched(found)}{infeasible * bool(b.small)}",
         ]
     else:
         lines = [
-            "control authority: it vanishes nowhere in C; its reach within the input bounds is at"
-            f" least {number_text(b.control_authority)}, {size}"
+            "control authority: no state of C was found where it vanishes; its reach within the"
+            f" input bounds is {number_text(b.control_authority)} at the least one found, {size}"
         ]
     shortfall = f"violates it by {number_text(b.deepest_shortfall)}"
     lines.append(
-        f"deepest state of the workspace: h = {number_text(b.deepest_h)} at"
+        f"deepest state found in the workspace: h = {number_text(b.deepest_h)} at"
         f" {state_text(problem, b.deepest)}; there the best action"
         f" {shortfall if b.deepest_shortfall else 'meets it'}"
     )
-    if math.isinf(b.supremum):
+    supremum = found.supremum(i)
+    if math.isinf(supremum.value):
         lines.append(f"sup h over C {b.growth}")
     elif b.degree == 1:
-        lines.append(f"sup h over C = c = {number_text(b.supremum)}")
+        lines.append(f"c = sup h over C {_relation(supremum)}")
     else:
-        suprema = ", ".join(f"c_{j} = {number_text(c)}" for j, c in enumerate(b.suprema))
-        lines.append(f"sup h over C = {number_text(b.supremum)}; over the intersection: {suprema}")
+        suprema = "; ".join(f"c_{j} {_relation(c)}" for j, c in enumerate(found.suprema(i)))
+        lines.append(f"sup h over C {_relation(supremum)}; over the intersection: {suprema}")
     return lines
+
+
+def _relation(number: Extremum) -> str:
+    if math.isnan(number.found):
+        return "is not known"
+    if math.isinf(number.value):
+        return "seems infinite"
+    return number.text("<=", ">=", _DIGITS) + ", proved" * number.is_proved
 
 
 def _parts(found: Verification) -> list[str]:
@@ -158,12 +174,20 @@ def _parts(found: Verification) -> list[str]:
 
 
 def _describe_part(found: Verification, part: SetFeasibility) -> str:
-    at = state_text(found.problem, part.worst)
+    at, shortfall = state_text(found.problem, part.worst), found.shortfall(part)
     if not part.shortfall:
-        return f"nowhere; the smallest margin is at {at}"
+        margin = f"the smallest margin found is at {at}"
+        if shortfall.proved == 0.0:
+            return f"nowhere, proved; {margin}"
+        amount = f"; violated by {shortfall.text(digits=_DIGITS)}, proved" * shortfall.is_proved
+        return f"no such state was found{amount}; {margin}"
     share = (
-        share_text(part.infeasible)
+        f"about {share_text(part.infeasible)}"
         if part.infeasible
-        else f"less than {share_text(1.0 / part.points)}"
+        else f"less than about {share_text(1.0 / part.points)}"
     )
-    return f"{share}, violated by up to {number_text(part.shortfall)} at {at}"
+    amount = shortfall.text(digits=_DIGITS)
+    if shortfall.is_proved:
+        worst = f"by {number_text(part.shortfall)} at {at}, the worst state found"
+        return f"{share}, violated by {amount}, proved; {worst}"
+    return f"{share}, violated by {amount} at {at}"

@@ -85,6 +85,18 @@ class ChebyshevBasis:
                 hessians[:, i, j] = hessians[:, j, i] = product((unit[i] + unit[j]).tolist())
         return Jets(product([0] * n), gradients, hessians)
 
+    def embedded(self, lower: ChebyshevBasis, coefficients: np.ndarray) -> np.ndarray:
+        """Return the coefficients of a polynomial of another basis, shape (K,).
+
+        Args:
+            lower: the other basis, all members of which this one has.
+            coefficients: of its members.
+        """
+        places = {tuple(key): i for i, key in enumerate(self.exponents.tolist())}
+        found = np.zeros(len(places))
+        found[[places[tuple(key)] for key in lower.exponents.tolist()]] = coefficients
+        return found
+
     def polynomial(self, coefficients: np.ndarray, decimals: int) -> Polynomial:
         """Return the polynomial of rounded coefficients, exactly.
 

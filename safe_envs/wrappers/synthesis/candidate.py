@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,11 @@ class BarrierCandidate:
     mean: float
     program: float
     rounds: int
+
+    def embedded(self, basis: ChebyshevBasis) -> BarrierCandidate:
+        """Return the same barrier in a basis that has all members of its own."""
+        coefficients = basis.embedded(self.basis, self.coefficients)
+        return replace(self, basis=basis, coefficients=coefficients)
 
     def psi(self, x: np.ndarray) -> np.ndarray:
         """Return psi of states (B, n), shape (B,)."""

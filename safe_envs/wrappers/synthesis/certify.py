@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -18,7 +19,13 @@ from safe_envs.wrappers.certificates.statements import plant_of
 from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.finalize import ProofNumbers, exact_decimal, finalize
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
-from safe_envs.wrappers.synthesis.synthesize import Attempt, Progress, Synthesis, Task
+from safe_envs.wrappers.synthesis.synthesize import (
+    Attempt,
+    Progress,
+    Synthesis,
+    Task,
+    degrees_of,
+)
 from safe_envs.wrappers.value.starts import draw_starts, sampling_margin
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 
@@ -109,6 +116,7 @@ def certify(
     """
     begin, problem = time.monotonic(), named.problem
     require_direct(problem, "certificates")
+    degrees_of(problem.plant, settings)  # What is too large is refused before it takes time.
     laws = nominal_laws(problem)
     if policy and not laws:
         raise ConfigurationError(
@@ -179,7 +187,8 @@ def nominal_laws(problem: SafetyProblem) -> tuple[sp.Expr, ...]:
 def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[BarrierProof, ...]:
     """Judge the barriers, the best one first, until no other can have a larger bound."""
     order = sorted(
-        (a for a in attempts if a.candidate is not None), key=lambda a: -_sampled(a.candidate)
+        (a for a in attempts if a.candidate is not None and not a.carried),
+        key=lambda a: -_sampled(a.candidate),
     )
     found: list[BarrierProof] = []
     for attempt in order:
@@ -194,7 +203,13 @@ def _judged(synthesis: Synthesis, attempts: tuple[Attempt, ...]) -> tuple[Barrie
                 second = _judgement(synthesis, attempt.degree, again)
                 judgement = max(judgement, second, key=lambda each: each.mean)
         found.append(judgement)
-    return tuple(found)
+    by_degree = {each.degree: each for each in found}
+    for before, attempt in itertools.pairwise(attempts):
+        if attempt.carried and before.degree in by_degree:
+            # The same psi has the same proof.
+            own = replace(by_degree[before.degree], degree=attempt.degree, seconds=0.0)
+            by_degree[attempt.degree] = own
+    return tuple(by_degree.values())
 
 
 def _judgement(synthesis: Synthesis, degree: int, candidate: BarrierCandidate) -> BarrierProof:

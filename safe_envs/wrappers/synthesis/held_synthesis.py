@@ -102,6 +102,7 @@ def certify_held(
     """
     begin, problem = time.monotonic(), named.problem
     require_direct(problem, "certificates")
+    degrees_of(problem.plant, settings)  # What is too large is refused before it takes time.
     period, plant = held_period(problem), plant_of(problem)
     step = SampledStep(plant, float(period))
     closed = tuple(not np.isfinite([v.low, v.high]).all() for v in problem.states)
@@ -141,6 +142,9 @@ def _attempts(
         if best is not None:
             psi = basis.polynomial(best.coefficients, _DECIMALS)
             attempt = HeldAttempt(degree, members, best.program, best.sampled, psi)
+        if found and found[-1].sampled > attempt.sampled:
+            # What is of a lower degree is of this one too.
+            attempt = replace(found[-1], degree=degree, members=members)
         found.append(replace(attempt, seconds=time.monotonic() - since))
         if progress is not None:
             progress(_SEARCHED * len(found) / len(degrees))
@@ -155,6 +159,10 @@ def _proved(
     tolerance = min(_TOLERANCE, _LOST / task.steps)
     for i in sorted(range(len(found)), key=lambda k: -found[k].sampled):
         attempt, begin = found[i], time.monotonic()
+        before = found[i - 1] if i else None
+        if before is not None and before.psi is attempt.psi:
+            found[i] = replace(attempt, bound=before.bound, proved=before.proved)
+            continue
         if attempt.psi is None or attempt.sampled <= best:
             continue
         bound = prove_held_bound(task.step.plant, attempt.psi, period, tolerance, _BUDGET)

@@ -57,51 +57,18 @@ class Improvement:
     settings: SynthesisSettings
     extra: np.ndarray | None = None
 
-    def best(
-        self,
-        basis: ChebyshevBasis,
-        bound: MeanBound,
-        first: Witness | BarrierCandidate,
-        rounds: int,
-        deadline: float = math.inf,
-    ) -> BarrierCandidate | None:
-        """Return the best barrier of some rounds.
 
-        Args:
-            basis: of the barrier.
-            bound: to maximise.
-            first: inputs for the first linear program, or a barrier that they are to raise most.
-            rounds: linear programs to solve at most.
-            deadline: time, as of `time.monotonic`, after which few more are begun.
-
-        Returns:
-            The best one; nothing where no linear program has a solution.
-        """
-        planes = _CuttingPlanes(self, basis, bound, first)
-        found = None
-        for done in range(1, rounds + 1):
-            candidate = planes.solved(done)
-            if candidate is None:
-                break
-            if found is None or candidate.mean > found.mean:
-                found = candidate
-            if time.monotonic() > deadline and done >= _FEWEST:
-                break
-            if planes.references > 1 and found.program - found.mean < self.settings.tolerance:
-                break
-        return found
-
-
-class _CuttingPlanes:
+class CuttingPlanes:
     """The linear programs of a basis, each with more states.
 
     Args:
         improvement: what is the same for all.
         basis: of the barrier.
         bound: to maximise.
-        first: see `Improvement.best`.
+        first: inputs for the first linear program, or a barrier that they are to raise most.
 
     Attributes:
+        best: the best barrier so far; None where no linear program has a solution.
         references: number of inputs that were given so far.
     """
 
@@ -123,8 +90,39 @@ class _CuttingPlanes:
         self._starts = basis.values(improvement.starts)
         self._weights = self._starts.mean(axis=0)
         self._last: np.ndarray | None = None
-        self.references, self._cuts = 0, 0
+        self.best: BarrierCandidate | None = None
+        self.references, self._cuts, self._done = 0, 0, 0
+        self._next: tuple[BarrierCandidate, np.ndarray] | None = None
         self._refer(first, x)
+
+    def improve(
+        self, rounds: int, deadline: float = math.inf, least: float = -math.inf
+    ) -> BarrierCandidate | None:
+        """Solve linear programs.
+
+        Args:
+            rounds: linear programs at most, those before counted too.
+            deadline: time, as of `time.monotonic`, after which few more are begun.
+            least: mean bound below which the value of a linear program ends the rounds.
+
+        Returns:
+            The best barrier so far; nothing where no linear program has a solution.
+        """
+        tolerance = self._all.settings.tolerance
+        while self._done < rounds:
+            candidate = self._solved()
+            if candidate is None:
+                break
+            if self.best is None or candidate.mean > self.best.mean:
+                self.best = candidate
+            if candidate.program < least:
+                break
+            if time.monotonic() > deadline and self._done >= _FEWEST:
+                break
+            referred = self.references > 1 or self._next is not None
+            if referred and self.best.program - self.best.mean < tolerance:
+                break
+        return self.best
 
     def _refer(self, given: Witness | BarrierCandidate, states: np.ndarray) -> None:
         """Take other inputs as given."""
@@ -133,14 +131,13 @@ class _CuttingPlanes:
         near = self._reference.sign_changes(states)
         self._points = self._points.joined(self._all.generator.samples(self._basis, near))
         self._asked = self._reference.asked(self._basis, self._points)
-        self.references, self._cuts = self.references + 1, 0
+        self.references, self._cuts, self._next = self.references + 1, 0, None
 
-    def solved(self, done: int) -> BarrierCandidate | None:
-        """Solve a linear program, and add what it does not meet; nothing where it has no solution.
-
-        Args:
-            done: linear programs up to this one.
-        """
+    def _solved(self) -> BarrierCandidate | None:
+        """Solve a linear program, and add what it does not meet; nothing without a solution."""
+        self._done += 1
+        if self._next is not None:
+            self._refer(*self._next)
         asked, points, bound = self._asked.generator, self._points, self._bound
         high = np.ones(len(asked), dtype=bool)
         if self._last is not None:
@@ -156,7 +153,7 @@ class _CuttingPlanes:
             return None
         c, m = self._last, _ = solution
         value = bound.mean(self._starts @ c, m, 1.0)
-        raw = BarrierCandidate(self._basis, c, bound, m, 1.0, 0.0, value, done)
+        raw = BarrierCandidate(self._basis, c, bound, m, 1.0, 0.0, value, self._done)
         pool = self._all.generator.samples(self._basis, self._all.domain.draw(_POOL, self._rng))
         rim = self._basis.values(self._all.domain.draw_edge(_RIM, self._rng))
         bad, bad_asked, cost = self._sharpened(pool, c, m)
@@ -169,7 +166,7 @@ class _CuttingPlanes:
         self._points = points.joined(bad.only(new))
         self._cuts += 1
         if self._cuts == _MOST_CUTS or cost.max(initial=0.0) < 2.0 * tolerance:
-            self._refer(raw, pool.states)
+            self._next = (raw, pool.states)
         else:
             self._asked = self._asked.joined(bad_asked.only(new))
         counts = self._starts @ c * bound.decay > m * bound.spent

@@ -15,8 +15,8 @@ class SynthesisSettings:
     """How a polynomial barrier is looked for.
 
     Attributes:
-        degrees: total degrees of psi that are tried, in increasing order; () for those that suit
-            the number of states.
+        degrees: total degrees of psi that are tried, in increasing order, after the lower ones of
+            those that suit the number of states; () for these, as long as each is better.
         rates: a of the bound, each >= 0, in 1/s; () for 0 and some in proportion to 1/T.
         rounds: linear programs of a degree, at most, each with the states added at which the one
             before is violated.

@@ -9,21 +9,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sympy as sp
 
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.certificates.certificate import Plant
 from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
 from safe_envs.wrappers.synthesis.candidate import BarrierCandidate
 from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.generator import Generator
-from safe_envs.wrappers.synthesis.improvement import Improvement
+from safe_envs.wrappers.synthesis.improvement import CuttingPlanes, Improvement
 from safe_envs.wrappers.synthesis.linear_program import MeanBound
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
-from safe_envs.wrappers.synthesis.witnesses import Witness, witnesses_of
+from safe_envs.wrappers.synthesis.witnesses import witnesses_of
 
 Progress = Callable[[float], None]
 
 _DEGREES = {1: (8, 14, 20), 2: (6, 10, 14, 16), 3: (4, 6, 8), 4: (2, 4)}
 _LAST_DEGREES = (2,)
+_MOST_STATES = 6
+"""With more states neither the search nor the proof, which bisects along all, ends in minutes."""
+
 _MOST_MEMBERS = 800
 """Members of a basis up to which linear programs are fast enough."""
 
@@ -67,6 +71,7 @@ class Attempt:
         candidate: the barrier; nothing where none was found with a bound above 0.
         inputs: what the first linear program took for the input.
         seconds: of computing.
+        carried: whether the barrier is that of the degree before, than which none is better.
     """
 
     degree: int
@@ -74,6 +79,7 @@ class Attempt:
     candidate: BarrierCandidate | None
     inputs: str
     seconds: float
+    carried: bool = False
 
 
 class Synthesis:
@@ -98,7 +104,7 @@ class Synthesis:
 
     def __init__(self, task: Task, settings: SynthesisSettings) -> None:
         self._task, self._settings = task, settings
-        self._degrees = degrees_of(task.plant, settings)
+        self._degrees = _climbed(degrees_of(task.plant, settings), len(task.plant.states))
         self.domain = Domain.of(task.plant, task.closed, settings.seed)
         generator = Generator(task.plant)
         starts = self.domain.wrapped(task.starts)
@@ -111,41 +117,46 @@ class Synthesis:
         self._bounds = [MeanBound(rate, task.horizon) for rate in rates]
 
     def attempts(self, progress: Progress | None = None) -> tuple[Attempt, ...]:
-        """Return the best barrier of each degree.
+        """Return the best barrier of each degree, which is never worse than that of a lower one.
 
         Args:
             progress: called with the part of the work that is done.
 
         Returns:
-            Attempts of increasing degree; fewer than the settings list where the time is over.
+            Attempts of increasing degree. Where the settings list none, a degree that is no better
+            than the one before, or nothing to gain, ends them. Where the time is over only the
+            lowest degree of the settings is begun.
         """
-        begin, found = time.monotonic(), list[Attempt]()
-        last, name = None, ""
+        deadline = time.monotonic() + self._settings.seconds
+        lowest = min(self._settings.degrees, default=None)
+        found, last, first, name = list[Attempt](), None, None, ""
         for k, degree in enumerate(self._degrees):
             started = time.monotonic()
-            if found and started - begin > self._settings.seconds:
-                break
+            if found and started > deadline and degree != lowest:
+                continue
             basis = ChebyshevBasis(
                 self._task.plant.states, *self.domain.frame, degree, self.domain.even
             )
-            deadline = begin + self._settings.seconds
-            if last is None:
-                best, name = self._begun(basis)
+            before = None if last is None else last.embedded(basis)
+            if first is None:
+                planes, name = self._begun(basis)
+                # The next degree starts from the first rounds: more of them fix the inputs and
+                # the set where psi > 0, and end lower, as measured for CubicSDE and Pendulum.
+                first = planes and planes.best
+                own = planes and planes.improve(self._settings.rounds, deadline)
             else:
-                best = self._improvement.best(
-                    basis, last.bound, last, self._settings.rounds, deadline
-                )
-            best = best if _mean(best) > _NOTHING else None
-            if k + 1 == len(self._degrees) and last is None and best is not None:
-                more = self._improvement.best(
-                    basis, best.bound, best, self._settings.rounds, deadline
-                )
-                best = max(best, more, key=_mean)
+                planes = CuttingPlanes(self._improvement, basis, first.bound, first)
+                own = planes.improve(self._settings.rounds, deadline)
+                first = own if _mean(own) > _NOTHING else first
+            last = max(before, own, key=_mean)
+            carried = last is not None and last is before
             seconds = time.monotonic() - started
-            found.append(Attempt(degree, len(basis.exponents), best, name, seconds))
-            last = best if best is not None else last
+            found.append(Attempt(degree, len(basis.exponents), last, name, seconds, carried))
             if progress is not None:
                 progress((k + 1) / len(self._degrees))
+            gain = 0.0 if carried else 1.0 - _mean(last)
+            if last is not None and not self._settings.degrees and gain < self._settings.tolerance:
+                break
         return tuple(found)
 
     def repaired(self, candidate: BarrierCandidate, worst: np.ndarray) -> BarrierCandidate | None:
@@ -162,22 +173,22 @@ class Synthesis:
             near = np.concatenate([near, -near])
         extra = np.concatenate([worst[None], near[self.domain.inside(near)]])
         improvement = replace(self._improvement, extra=extra)
-        return improvement.best(
-            candidate.basis, candidate.bound, candidate, self._settings.rounds, time.monotonic()
-        )
+        planes = CuttingPlanes(improvement, candidate.basis, candidate.bound, candidate)
+        return planes.improve(self._settings.rounds, time.monotonic())
 
-    def _begun(self, basis: ChebyshevBasis) -> tuple[BarrierCandidate | None, str]:
-        """Return the best barrier over all rates and first inputs, and the name of the latter."""
-        laws: dict[str, Witness] = self._laws
-        tried = [
-            (self._improvement.best(basis, bound, law, _FIRST_ROUNDS), name)
-            for bound in self._bounds
-            for name, law in laws.items()
-        ]
-        return max(tried, key=lambda each: _mean(each[0]))
+    def _begun(self, basis: ChebyshevBasis) -> tuple[CuttingPlanes | None, str]:
+        """Return the best begun programs over all rates and first inputs, and the latter's name."""
+        best, name, most = None, "", _NOTHING
+        for bound in self._bounds:
+            for law, inputs in self._laws.items():
+                planes = CuttingPlanes(self._improvement, basis, bound, inputs)
+                mean = _mean(planes.improve(_FIRST_ROUNDS, least=most))
+                if mean > most:
+                    best, name, most = planes, law, mean
+        return best, name
 
 
-def degrees_of(plant: Plant, settings: SynthesisSettings) -> tuple[int, ...]:
+def degrees_of(plant: Plant | ControlAffineSDE, settings: SynthesisSettings) -> tuple[int, ...]:
     """Return the degrees that are tried, increasing.
 
     Args:
@@ -185,9 +196,16 @@ def degrees_of(plant: Plant, settings: SynthesisSettings) -> tuple[int, ...]:
         settings: of the search.
 
     Raises:
-        ConfigurationError: A polynomial of a degree has too many coefficients.
+        ConfigurationError: There are too many states, or a polynomial of a degree has too many
+            coefficients.
     """
     n = len(plant.states)
+    if n > _MOST_STATES:
+        raise ConfigurationError(
+            f"the system has {n} states, and certificates are looked for with up to {_MOST_STATES}:"
+            " each state multiplies the coefficients of psi and the boxes of its proof; give a"
+            " system of the states that the barriers need"
+        )
     degrees = tuple(sorted(set(settings.degrees))) or _DEGREES.get(n, _LAST_DEGREES)
     members = sp.binomial(n + degrees[-1], n)
     if members > _MOST_MEMBERS:
@@ -196,6 +214,12 @@ def degrees_of(plant: Plant, settings: SynthesisSettings) -> tuple[int, ...]:
             f" linear programs up to {_MOST_MEMBERS} are solved: give a lower degree"
         )
     return degrees
+
+
+def _climbed(degrees: tuple[int, ...], n: int) -> tuple[int, ...]:
+    """Return degrees after the lower ones of `_DEGREES`, whose first linear programs are fast."""
+    lower = (d for d in _DEGREES.get(n, _LAST_DEGREES) if d < degrees[0])
+    return (*lower, *degrees)
 
 
 def _mean(candidate: BarrierCandidate | None) -> float:

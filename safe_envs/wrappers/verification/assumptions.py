@@ -12,6 +12,7 @@ from safe_envs.dynamics.kinks import edges
 from safe_envs.dynamics.lie import has_kinks
 from safe_envs.wrappers.conditions import Certified
 from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.results import RELATIVE, Extremum
 from safe_envs.wrappers.verification.safe_set import in_workspace, workspace_of
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 from safe_envs.wrappers.verification.smoothness import NOT_ESTABLISHED
@@ -114,9 +115,48 @@ def outside(formulas: Formulas, b: np.ndarray) -> str:
     )
 
 
-def amount(shortfall: float) -> str:
-    """Say by how much a condition is violated."""
-    return f"by up to {shortfall:.4g}"
+def amount(shortfall: Extremum) -> str:
+    """Say by how much a condition is violated at most or, where that is not proved, at least."""
+    return shortfall.text("by up to", "by at least")
+
+
+def missed_somewhere(shortfall: Extremum, negligible: float) -> str:
+    """Say that the conditions cannot be met somewhere, or that this is not excluded; may be empty.
+
+    Args:
+        shortfall: of the conditions.
+        negligible: below this a proved one is not worth a word.
+
+    Returns:
+        A text.
+    """
+    if shortfall.found:
+        return f"no action meets the condition somewhere, {amount(shortfall)}"
+    if not shortfall.is_proved or shortfall.proved <= negligible:
+        return ""
+    return (
+        "that an action meets the condition everywhere is not proved, but that the best one misses"
+        f" it by {shortfall.text()}"
+    )
+
+
+def infeasible(analysis: SafeSetAnalysis, shortfall: Extremum) -> str:
+    """Say on which part of the invariant set the conditions cannot be met; "" if on none.
+
+    Args:
+        analysis: of the safe set.
+        shortfall: of the conditions.
+
+    Returns:
+        A text.
+    """
+    formulas, part = analysis.formulas, analysis.infeasible
+    if not shortfall.found:
+        return ""
+    share = f"about {100 * part:.2g} % of" if part else "a thin part of"
+    where = "C" if formulas.first_order else "the intersection of the C_j"
+    conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
+    return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
 
 
 def unbounded(analysis: SafeSetAnalysis) -> str:
@@ -127,16 +167,12 @@ def unbounded(analysis: SafeSetAnalysis) -> str:
     return f"sup {analysis.formulas.names[j]} {analysis.how_infinite(j)}"
 
 
-RELATIVE = 1e-6
-"""Error that a search and rounding may leave, in parts of the number itself."""
-
-
-def above_suprema(formulas: Formulas, suprema: Sequence[float], x: np.ndarray) -> str:
+def above_suprema(formulas: Formulas, suprema: Sequence[Extremum], x: np.ndarray) -> str:
     """Say which b_j is above its c_j at a state of the invariant set; "" if none is.
 
     Args:
         formulas: of the chains.
-        suprema: c_j of each chain function.
+        suprema: of each chain function.
         x: states (B, n), those outside the set or the workspace among them.
 
     Returns:
@@ -145,17 +181,18 @@ def above_suprema(formulas: Formulas, suprema: Sequence[float], x: np.ndarray) -
     if formulas.certain:
         return ""  # No supremum matters there.
     b = formulas.chain(x[_inside(formulas, x)])
-    for j in np.flatnonzero((b > np.array(suprema) * (1.0 + RELATIVE)).any(axis=0)).tolist():
+    most = np.array([each.value for each in suprema])
+    for j in np.flatnonzero((b > most * (1.0 + RELATIVE)).any(axis=0)).tolist():
         return reaches(formulas.names[j], float(b[:, j].max()), suprema[j])
     return ""
 
 
-def above_shortfall(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.ndarray) -> str:
+def above_shortfall(formulas: Formulas, shortfall: Extremum, x: np.ndarray, u: np.ndarray) -> str:
     """Say by how much actions violate the conditions, if by more than was found; "" if not.
 
     Args:
         formulas: of the conditions.
-        shortfall: the largest one that a search found.
+        shortfall: the largest one.
         x: states (E, n); those outside the invariant set do not count.
         u: actions (E, m).
 
@@ -168,40 +205,44 @@ def above_shortfall(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.n
     a, b = formulas.constraints_at(x[inside])
     moved = np.einsum("eki,ei->ek", a, u[inside])
     # Where a condition has no finite value nothing can be said of by how much it is violated.
-    more = np.nan_to_num(-(moved + b) - shortfall, nan=0.0) > RELATIVE * (
-        shortfall + abs(moved) + abs(b)
-    )
+    most = shortfall.value
+    more = np.nan_to_num(-(moved + b) - most, nan=0.0) > RELATIVE * (most + abs(moved) + abs(b))
     return violated_by(float(np.where(more, -(moved + b), 0.0).max()), shortfall) * bool(more.any())
 
 
-def reaches(name: str, value: float, supremum: float) -> str:
+def reaches(name: str, value: float, supremum: Extremum) -> str:
     """Say that a function is above its supremum.
 
     Args:
         name: of the function.
         value: that it has.
-        supremum: that a search found.
+        supremum: of the function.
 
     Returns:
         A text.
     """
-    return f"{name} reaches {value:.4g}, above the supremum of {supremum:.4g} that the search found"
+    return f"{name} reaches {value:.4g}, above the supremum of {_sourced(supremum)}"
 
 
-def violated_by(most: float, shortfall: float) -> str:
+def violated_by(most: float, shortfall: Extremum) -> str:
     """Say that a filter violated its condition by more than the shortfall.
 
     Args:
         most: by how much, in the units of b_(r-1) per s.
-        shortfall: that a search found.
+        shortfall: of the condition.
 
     Returns:
         A text.
     """
     return (
         f"the filter violated the condition by {most:.4g}, more than the shortfall of"
-        f" {shortfall:.4g} that the search found"
+        f" {_sourced(shortfall)}"
     )
+
+
+def _sourced(number: Extremum) -> str:
+    source = "is proved" if number.is_proved else "the search found"
+    return f"{number.value:.4g} that {source}"
 
 
 def _inside(formulas: Formulas, x: np.ndarray) -> np.ndarray:

@@ -14,11 +14,11 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.certificates.certificate import BarrierCertificate, HeldCertificate
 from safe_envs.wrappers.certificates.matching import system_differences
 from safe_envs.wrappers.conditions import Certified, Condition
-from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches
+from safe_envs.wrappers.verification.assumptions import reaches
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.certificate_statements import judged
 from safe_envs.wrappers.verification.judge import JudgeResult
-from safe_envs.wrappers.verification.results import Bound, Status
+from safe_envs.wrappers.verification.results import RELATIVE, Bound, Extremum, Status
 
 _BUDGET = Budget(boxes=2_000_000, seconds=120.0)
 OF_HELD_INPUT = "its certificate is of held input, and not of continuous control"
@@ -77,7 +77,8 @@ class CertificateGuarantee:
             return ""
         psi = self.certificate.values(reached[_inside(self.certificate, reached)])
         highest, c = float(psi.max(initial=-math.inf)), float(self.certificate.supremum)
-        return reaches("psi", highest, c) if highest > c * (1.0 + RELATIVE) else ""
+        stated = Extremum(c, c)  # The judge does not refute it, or there is no bound.
+        return reaches("psi", highest, stated) if highest > c * (1.0 + RELATIVE) else ""
 
     def applicable_bounds(self, starts: np.ndarray, horizon: float) -> list[Bound]:
         """Return the bound on average over starts; see `ChainGuarantee.applicable_bounds`."""

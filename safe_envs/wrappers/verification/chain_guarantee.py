@@ -13,9 +13,10 @@ from safe_envs.wrappers.verification.assumptions import (
     JOINT,
     above_shortfall,
     above_suprema,
-    amount,
     failures,
+    infeasible,
     mismatch,
+    missed_somewhere,
     nearly_rough,
     no_bound,
     outside,
@@ -27,6 +28,7 @@ from safe_envs.wrappers.verification.proof import ChainProof
 from safe_envs.wrappers.verification.results import (
     Bound,
     Candidate,
+    Extremum,
     Stages,
     Status,
     candidates_for,
@@ -87,11 +89,26 @@ class ChainGuarantee:
     @property
     def statements(self) -> list[tuple[str, JudgeResult]]:
         """The hypotheses with the judge's word; none where no theorem applies."""
-        return (
-            []
-            if no_bound(self.formulas) or self.analysis.invariant_set is None
-            else self.proof.statements
-        )
+        return self.proof.statements if self._is_judged else []
+
+    @cached_property
+    def _is_judged(self) -> bool:
+        """Whether a theorem applies, so that the judge is asked for its hypotheses and numbers."""
+        return not no_bound(self.formulas) and self.analysis.invariant_set is not None
+
+    @cached_property
+    def shortfall(self) -> Extremum:
+        """The largest shortfall on the invariant set; on C where that is empty."""
+        found = self.analysis.max_shortfall[0]
+        return Extremum(found, self.proof.shortfall.value) if self._is_judged else Extremum(found)
+
+    @cached_property
+    def suprema(self) -> tuple[Extremum, ...]:
+        """The suprema c_j on the invariant set; where none matters, none is proved."""
+        found = self.analysis.suprema.tolist()
+        if self.formulas.certain or not self._is_judged:
+            return tuple(map(Extremum, found))
+        return tuple(map(Extremum, found, [number.value for number in self.proof.suprema]))
 
     @property
     def note(self) -> str | None:
@@ -135,13 +152,14 @@ class ChainGuarantee:
             return False
         b = self.formulas.chain(draw_starts(self.formulas.problem, _STARTS))
         stages = stages_of(self.formulas, suprema.tolist(), 0.0)
-        found = candidates_for(self.formulas, b, stages, self.formulas.problem.duration)
+        horizon = self.formulas.problem.duration
+        found = candidates_for(self.formulas, b, stages, horizon, Extremum(0.0))
         return not found[-1].values.any()
 
     @property
     def _unbounded(self) -> str:
         """Which supremum is infinite, where one matters, in words; may be empty."""
-        proved = self.formulas.certain or all(math.isfinite(c) for c in self._suprema)
+        proved = self.formulas.certain or all(math.isfinite(c.value) for c in self.suprema)
         return "" if proved else unbounded(self.analysis)
 
     @property
@@ -156,8 +174,7 @@ class ChainGuarantee:
     @property
     def remark(self) -> str:
         """Why the bound is weak: where no action meets the condition; may be empty."""
-        shortfall = self.analysis.max_shortfall[0]
-        return f"no action meets the condition somewhere, {amount(shortfall)}" * bool(shortfall)
+        return missed_somewhere(self.shortfall, self.proof.negligible)
 
     @property
     def word(self) -> Status:
@@ -168,17 +185,8 @@ class ChainGuarantee:
     @cached_property
     def stages(self) -> Stages:
         """The stages of all barriers."""
-        shortfall = self.proof.shortfall.value
-        if math.isinf(shortfall):
-            shortfall = self.analysis.max_shortfall[0]
-        suprema = None if self.formulas.certain else self._suprema
-        return stages_of(self.formulas, suprema, shortfall)
-
-    @property
-    def _suprema(self) -> list[float]:
-        """The suprema that are proved or, where none is, those that the search found."""
-        pairs = zip(self.proof.suprema, self.analysis.suprema.tolist(), strict=True)
-        return [n.value if math.isfinite(n.value) else found for n, found in pairs]
+        suprema = None if self.formulas.certain else [c.value for c in self.suprema]
+        return stages_of(self.formulas, suprema, self.shortfall.value)
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
         """Return the largest bound on P(safe up to the horizon) whose hypotheses hold.
@@ -193,7 +201,7 @@ class ChainGuarantee:
         b = self.formulas.chain(np.asarray(starts, dtype=np.float64))
         if self.note:
             return np.zeros(len(b))
-        return candidates_for(self.formulas, b, self.stages, horizon)[-1].values
+        return candidates_for(self.formulas, b, self.stages, horizon, self.shortfall)[-1].values
 
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
@@ -212,8 +220,8 @@ class ChainGuarantee:
         """
         if self.note:
             return ""
-        return above_suprema(self.formulas, self.stages.suprema, reached) or above_shortfall(
-            self.formulas, max(self.stages.shortfalls), violated, actions
+        return above_suprema(self.formulas, self.suprema, reached) or above_shortfall(
+            self.formulas, self.shortfall, violated, actions
         )
 
     def applicable_bounds(self, starts: np.ndarray, horizon: float) -> list[Bound]:
@@ -238,9 +246,9 @@ class ChainGuarantee:
             return [Bound("all of them", None, "hypothesis fails", outside(formulas, b))]
         share = f"{100 * (1 - inside.mean()):.1f} %"
         partly = [f"0 at the {share} of the starts that are outside some C_j"] * (not inside.all())
-        candidates = candidates_for(formulas, b, self.stages, horizon)
+        candidates = candidates_for(formulas, b, self.stages, horizon, self.shortfall)
         found = [self._judged(candidate, partly) for candidate in candidates]
-        high = above_suprema(formulas, self.stages.suprema, starts)
+        high = above_suprema(formulas, self.suprema, starts)
         return [bound.without(high) for bound in found]
 
     def _judged(self, candidate: Candidate, partly: list[str]) -> Bound:
@@ -266,14 +274,7 @@ class ChainGuarantee:
     @cached_property
     def _infeasible(self) -> str:
         """Where the conditions cannot be met, in words; may be empty."""
-        formulas, analysis = self.formulas, self.analysis
-        shortfall, infeasible = analysis.max_shortfall[0], analysis.infeasible
-        if not shortfall:
-            return ""
-        share = f"{100 * infeasible:.2g} % of" if infeasible else "a thin part of"
-        where = "C" if formulas.first_order else "the intersection of the C_j"
-        conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
-        return f"no action meets {conditions} on {share} {where}, {amount(shortfall)}"
+        return infeasible(self.analysis, self.shortfall)
 
     def best_start(self, seed: int = 0) -> np.ndarray | None:
         """Return the state (n,) where the printed bound is largest; None without such a bound.

@@ -24,6 +24,7 @@ from safe_envs.wrappers.verification.extrema import (
     without_control,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.results import Extremum
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
@@ -42,11 +43,10 @@ class SetFeasibility:
     Attributes:
         points: number of its points that were drawn.
         share: part of the workspace that it is; of C for the intersection.
-        infeasible: part of it where no action within the input bounds meets all conditions.
-        shortfall: by how much the worst condition is violated where that is most, 0 if all can be
-            met everywhere; in the units of b_(r-1) per s.
-        worst: the state where that is, shape (n,); where the conditions are nearest to it if they
-            can be met.
+        infeasible: part of its points where no action within the input bounds meets all conditions.
+        shortfall: by how much the worst condition is violated at the worst state that a search met,
+            0 if all can be met there; in the units of b_(r-1) per s.
+        worst: that state, shape (n,); where the conditions are nearest to it if they can be met.
     """
 
     points: int
@@ -58,25 +58,25 @@ class SetFeasibility:
 
 @dataclass(frozen=True)
 class BarrierFindings:
-    """The control authority over a barrier, and its suprema.
+    """The control authority over a barrier, and its suprema, as a search found them.
 
     Attributes:
         name: of the barrier.
         condition: its spec.
         degree: r.
-        control_authority: smallest one over C: half of the range of L_g b_(r-1) u over the input
-            bounds.
+        control_authority: smallest one that was met in C: half of the range of L_g b_(r-1) u over
+            the input bounds.
         control_authority_at: the state where that is, shape (n,).
         typical: its median over C.
         small: part of C where it is below `SMALL` of that.
         small_infeasible: part of these points where no action meets all conditions.
-        supremum: of h over C within the workspace, infinite where it grows with the ranges that
-            were chosen for states without any.
+        supremum: largest h that was met in C within the workspace, infinite where it grows with
+            the ranges that were chosen for states without any.
         growth: how sure it is that it is infinite, in words; empty where it is not.
-        deepest: the state where h is largest in C within the workspace, shape (n,).
+        deepest: the state where that is, or nearly, shape (n,).
         deepest_h: h there.
         deepest_shortfall: by how much its condition is violated there at best.
-        suprema: c_j of the b_j over the intersection, shape (r,); NaN if that is empty.
+        suprema: likewise c_j of the b_j over the intersection, shape (r,); NaN if that is empty.
     """
 
     name: str
@@ -147,6 +147,36 @@ class Verification:
         if any(isinstance(c, Certified) for c in self.formulas.conditions):
             return certificate_guarantee(self.formulas.problem, self.formulas.conditions)
         return ChainGuarantee(self.formulas, self.analysis)
+
+    def suprema(self, i: int) -> tuple[Extremum, ...]:
+        """Return the suprema c_j of a barrier's chain over the intersection of the C_j.
+
+        Args:
+            i: index of the barrier.
+        """
+        if isinstance(self.guarantee, ChainGuarantee):
+            return self.guarantee.suprema[self.formulas.stages[i]]
+        return tuple(map(Extremum, self.barriers[i].suprema.tolist()))
+
+    def supremum(self, i: int) -> Extremum:
+        """Return the supremum of a barrier over C within the workspace.
+
+        Args:
+            i: index of the barrier.
+        """
+        first_order = self.formulas.first_order
+        return self.suprema(i)[0] if first_order else Extremum(self.barriers[i].supremum)
+
+    def shortfall(self, part: SetFeasibility) -> Extremum:
+        """Return the largest shortfall in a set.
+
+        Args:
+            part: `safe_set` or `invariant_set`, of which the judge knows the latter.
+        """
+        judged = part is self.invariant_set or self.formulas.first_order
+        if judged and isinstance(self.guarantee, ChainGuarantee):
+            return self.guarantee.shortfall
+        return Extremum(part.shortfall)
 
 
 def verify(

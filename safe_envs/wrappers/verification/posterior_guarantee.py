@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,9 +15,9 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.assumptions import RELATIVE, kinked, reaches, violated_by
-from safe_envs.wrappers.verification.posterior_proof import PosteriorNumbers, proved_numbers_of
-from safe_envs.wrappers.verification.results import Status
+from safe_envs.wrappers.verification.assumptions import amount, kinked, reaches, violated_by
+from safe_envs.wrappers.verification.posterior_proof import proved_numbers_of
+from safe_envs.wrappers.verification.results import RELATIVE, Extremum, Status
 from safe_envs.wrappers.verification.safe_set import (
     draw_starts,
     in_workspace,
@@ -56,9 +55,11 @@ class PosteriorGuarantee:
         shortfall: m, by how much the robust condition is violated where that is most, in the units
             of h per s.
         bias: e, by how much the length of the steps in the data may shift A h, in the units of h
-            per s; see `safe_envs.wrappers.verification.step_bias.rate_bias`.
+            per s, at sampled states; see `safe_envs.wrappers.verification.step_bias.rate_bias`.
         remark: what weakens it, in words; may be empty.
         word: "proved" or "estimated".
+        searched: which of supremum and shortfall a search found, below their true values; the
+            others are proved.
     """
 
     delta: float
@@ -67,6 +68,7 @@ class PosteriorGuarantee:
     bias: float
     remark: str
     word: Status
+    searched: tuple[str, ...]
     _barrier: Any
     _workspace: tuple[np.ndarray, np.ndarray]
     note: None = None
@@ -84,11 +86,15 @@ class PosteriorGuarantee:
         """Say what states contradict in c and m; see `ChainGuarantee.contradiction`."""
         h = self._barrier(reached[in_workspace(reached, self._workspace)])[:, 0]
         if (h > self.supremum * (1.0 + RELATIVE)).any():
-            return reaches("h", h.max(), self.supremum)
+            return reaches("h", h.max(), self._extremum("supremum"))
         inside = in_workspace(violated, self._workspace) & (self._barrier(violated)[:, 0] > 0.0)
         most = float(slack[inside].max(initial=0.0))
         exceeded = most > self.shortfall * (1.0 + RELATIVE)
-        return violated_by(most, self.shortfall) if exceeded else ""
+        return violated_by(most, self._extremum("shortfall")) if exceeded else ""
+
+    def _extremum(self, name: str) -> Extremum:
+        value = getattr(self, name)
+        return Extremum(value) if name in self.searched else Extremum(value, value)
 
 
 def posterior_guarantee(
@@ -141,34 +147,33 @@ def posterior_guarantee(
     points = np.concatenate([points, starts[level(starts) >= 0.0]])
     _require_smooth(problem, expression, level, points, region, np.random.default_rng([seed, 4]))
     highest, _ = largest(level, points, region, np.random.default_rng([seed, 2]))
-    shortfall, _ = largest(shortfall_at, points, region, np.random.default_rng([seed, 3]))
-    highest, shortfall, unproved = _judged(
-        proved_numbers_of(problem, robust, expression, (highest, max(shortfall, 0.0))),
-        (highest, shortfall),
-    )
+    missed, _ = largest(shortfall_at, points, region, np.random.default_rng([seed, 3]))
+    missed = max(missed, 0.0)
+    proved = proved_numbers_of(problem, robust, expression, (highest, missed))
+    supremum, shortfall = Extremum(highest, proved.supremum), Extremum(missed, proved.shortfall)
+    numbers = {"supremum": supremum, "shortfall": shortfall}
     bias = rate_bias(posterior, expression, np.array(problem.box), points)
-    remarks = [f"no action meets the robust condition somewhere, by up to {shortfall:.3g}"] * (
-        shortfall > 0.0
+    remarks = [f"no action meets the robust condition somewhere, {amount(shortfall)}"] * bool(
+        missed
     )
     remarks += [
-        f"steps of {posterior.dt:g} s in the data may shift the rate of h by up to {bias:.3g}"
+        f"steps of {posterior.dt:g} s in the data may shift the rate of h by up to {bias:.3g} at"
+        " the sampled states"
     ] * (bias > 0.0)
-    unproved = unproved or "the length of the steps in the data" * (bias > 0.0)
+    unproved = proved.reason or "the length of the steps in the data" * (bias > 0.0)
     remarks += [f"not proved: {unproved}"] * bool(unproved)
     word: Status = "estimated" if unproved else "proved"
-    delta, ends = credible.miss_probability, workspace_of(problem)
     return PosteriorGuarantee(
-        delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), word, barrier, ends
+        credible.miss_probability,
+        supremum.value,
+        shortfall.value,
+        bias,
+        "; ".join(remarks),
+        word,
+        tuple(name for name, n in numbers.items() if not n.is_proved),
+        barrier,
+        workspace_of(problem),
     )
-
-
-def _judged(proved: PosteriorNumbers, found: tuple[float, float]) -> tuple[float, float, str]:
-    """Return c and m, proved where they are, and why one of them is not."""
-    c, m = (
-        number if math.isfinite(number) else searched
-        for number, searched in zip((proved.supremum, proved.shortfall), found, strict=True)
-    )
-    return c, m, proved.reason
 
 
 def _require_smooth(

@@ -167,7 +167,7 @@ class ChainProof:
         self, name: str, expression: Any, found: float, supremum_hints: bool = False
     ) -> JudgedNumber:
         """Prove an upper bound of an expression on G that is near what a search found."""
-        wanted = max(_RELATIVE * abs(found) if math.isfinite(found) else 0.0, self._negligible)
+        wanted = max(_RELATIVE * abs(found) if math.isfinite(found) else 0.0, self.negligible)
         statement, hints = replace(self._region, name=name), None if supremum_hints else self._hints
         result = self._within(lambda budget: supremum(statement, expression, wanted, budget, hints))
         upper = max(result.upper, 0.0) if not math.isnan(result.upper) else math.inf
@@ -177,7 +177,7 @@ class ChainProof:
         return JudgedNumber(name, math.inf, JudgeResult("undecided", result.boxes, reason=reason))
 
     @property
-    def _negligible(self) -> float:
+    def negligible(self) -> float:
         """A rate that over the horizon costs a bound nothing that matters."""
         size = min((c for c in self._found if math.isfinite(c) and c > 0.0), default=1.0)
         return _SMALL * size / self._formulas.problem.duration

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from safe_envs.outward_text import number_at_most
+from safe_envs.outward_text import number_at_least, number_at_most
 from safe_envs.wrappers.verification import bounds
 from safe_envs.wrappers.verification.formulas import Formulas
 
@@ -20,8 +20,45 @@ Status = Literal[
 fails, and the judge left one undecided; episodes contradicted it; one fails; there is none; or an
 assumption is known to be false or was not looked at."""
 
+RELATIVE = 1e-6
+"""Error that a search and rounding may leave, in parts of the number itself."""
+
 HOLDING: tuple[Status, ...] = ("proved", "estimated")
 """Of a bound whose hypotheses are not known to fail."""
+
+
+class Extremum(NamedTuple):
+    """The largest value of a function on a set: what a search met, and what the judge proved.
+
+    Attributes:
+        found: largest value that the search met, below the supremum or equal to it.
+        proved: upper bound that the judge proved; infinite without one.
+    """
+
+    found: float
+    proved: float = math.inf
+
+    @property
+    def is_proved(self) -> bool:
+        """Whether there is a proved upper bound."""
+        return math.isfinite(self.proved)
+
+    @property
+    def value(self) -> float:
+        """The proved bound or, without one, what the search met."""
+        return self.proved if self.is_proved else self.found
+
+    def text(self, below: str = "at most", above: str = "at least", digits: int = 4) -> str:
+        """Return the number and on which side of it the supremum is.
+
+        Args:
+            below: says that the supremum is not above a number that is proved.
+            above: says that it is not below a number that a search met.
+            digits: of the number.
+        """
+        if self.is_proved:
+            return f"{below} {number_at_most(self.proved, digits)}"
+        return f"{above} {number_at_least(self.found * (1.0 + RELATIVE), digits)}, found by search"
 
 
 @dataclass(frozen=True)
@@ -168,7 +205,7 @@ def holds_up_to_a_time(formulas: Formulas, stages: Stages) -> bool:
 
 
 def candidates_for(
-    formulas: Formulas, b: np.ndarray, stages: Stages, horizon: float
+    formulas: Formulas, b: np.ndarray, stages: Stages, horizon: float, shortfall: Extremum
 ) -> list[Candidate]:
     """Return the results that suit conditions; the last one has the weakest hypotheses.
 
@@ -177,6 +214,7 @@ def candidates_for(
         b: values of all chain functions at the starts, shape (B, sum of the r).
         stages: of all barriers.
         horizon: T in s.
+        shortfall: m, for the name of a result.
     """
     if formulas.certain:
         name = "no noise: no path leaves"
@@ -191,9 +229,8 @@ def candidates_for(
     else:
         found = of_stages(b, stages, horizon, stages.barriers > 1)
     if any(stages.shortfalls):
-        most = number_at_most(max(stages.shortfalls))
         values = bounds.union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
-        name = f"repaired for the shortfall m = {most}, up to T"
+        name = f"repaired for the shortfall m {shortfall.text('=', '>=')}, up to T"
         found.append(Candidate(name, values, allows_shortfall=True))
     return found
 

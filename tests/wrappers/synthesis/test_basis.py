@@ -49,6 +49,16 @@ def test_derivatives_are_those_of_the_exact_polynomial():
             )
 
 
+@pytest.mark.parametrize("even", [False, True])
+def test_a_polynomial_of_a_lower_degree_is_one_of_a_higher_degree(even):
+    low, high = (
+        ChebyshevBasis(BASIS.states, BASIS.center, BASIS.scale, degree, even) for degree in (2, 4)
+    )
+    coefficients = RNG.uniform(-1, 1, len(low.exponents))
+    embedded = high.embedded(low, coefficients)
+    np.testing.assert_allclose(high.values(STATES) @ embedded, low.values(STATES) @ coefficients)
+
+
 def test_coefficients_are_rounded_to_short_decimals():
     one = ChebyshevBasis((X,), (Fraction(0),), (Fraction(1),), degree=2)
     psi = one.polynomial(np.array([1 / 3, 0.0, 0.25]), decimals=3)

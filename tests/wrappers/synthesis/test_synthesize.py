@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+import time
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import sympy as sp
 
+from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.wrappers.certificates.checker import check
 from safe_envs.wrappers.certificates.statements import plant_of
+from safe_envs.wrappers.synthesis import improvement
 from safe_envs.wrappers.synthesis.certify import Named, certify, nominal_laws
 from safe_envs.wrappers.synthesis.domain import Domain
 from safe_envs.wrappers.synthesis.finalize import finalize
+from safe_envs.wrappers.synthesis.held_synthesis import certify_held
 from safe_envs.wrappers.synthesis.settings import SynthesisSettings
 from safe_envs.wrappers.synthesis.synthesize import Synthesis, Task, degrees_of
 from tests.wrappers.synthesis.systems import brownian, survival
@@ -47,6 +51,55 @@ def test_the_bound_of_brownian_motion_approaches_that_of_the_eigenfunction():
         float(numbers.supremum),
     )
     assert BEST - 0.01 < bound <= BEST
+
+
+def test_a_degree_that_finds_nothing_keeps_the_psi_of_the_lower_one(monkeypatch):
+    # Behind the first linear programs none has a solution.
+    synthesis = Synthesis(brownian(HORIZON), SynthesisSettings(degrees=(2, 4, 6), rates=(0.5,)))
+    made = improvement.solve
+    fails = lambda claims, *rest: None if len(rest[1]) > 3 else made(claims, *rest)  # noqa: E731
+    monkeypatch.setattr(improvement, "solve", fails)
+    first, *others = synthesis.attempts()
+    assert first.candidate.mean > 0.2
+    x = np.linspace(0.1, 3.0, 20)[:, None]
+    for attempt in others:
+        assert attempt.carried
+        assert attempt.candidate.mean == first.candidate.mean
+        np.testing.assert_allclose(attempt.candidate.psi(x), first.candidate.psi(x))
+    automatic = Synthesis(brownian(HORIZON), SynthesisSettings(rates=(0.5,)))
+    monkeypatch.setattr(
+        improvement,
+        "solve",
+        lambda claims, *rest: None if len(rest[1]) > 9 else made(claims, *rest),
+    )
+    assert [(a.degree, a.carried) for a in automatic.attempts()] == [(8, False), (14, True)]
+
+
+@pytest.mark.slow
+def test_no_degree_is_proved_worse_than_a_lower_one():
+    """Noise that vanishes at the origin: linear programs of higher degrees fail here."""
+    s, t, u = sp.symbols("s t u", real=True)
+    system = ControlAffineSDE.from_rate(
+        (s, t), (u,), [-1.5 * s + t, -s - 1.5 * t + u], diffusion=[[0.2 * s, 0], [0, 0.2 * t]]
+    )
+    problem = state_problem(
+        system,
+        s + 80,
+        box=(-1.0, 1.0),
+        start=[(45.0, 55.0), (-55.0, -45.0)],
+        dt=0.01,
+        horizon=1.0,
+        workspace={s: (-100.0, 100.0), t: (-100.0, 100.0)},
+    )
+    chosen, lowest, higher = (
+        certify(Named(problem), SynthesisSettings(degrees=degrees), policy=True)
+        for degrees in ((), (6,), (8,))
+    )
+    assert 0.99 < lowest.mean <= chosen.mean
+    assert higher.mean >= lowest.mean - 1e-9
+    assert [a.degree for a in higher.attempts] == [6, 8]  # Degree 6 is where it begins.
+    sampled = [a.candidate.mean for a in higher.attempts]
+    assert sampled == sorted(sampled)
 
 
 def test_no_proved_bound_is_above_the_exact_probability():
@@ -121,10 +174,16 @@ def test_settings_out_of_range_are_refused(wrong, told):
         SynthesisSettings(**wrong)
 
 
-def test_a_polynomial_with_too_many_coefficients_is_refused():
-    plant = make_problem("safe_envs/Quadrotor-v0").plant
-    with pytest.raises(ConfigurationError, match="coefficients"):
-        degrees_of(plant, SynthesisSettings(degrees=(5,)))
+def test_what_is_too_large_is_refused():
+    five = make_problem("safe_envs/DubinsReach-v0").plant
+    with pytest.raises(ConfigurationError, match="give a lower degree"):
+        degrees_of(five, SynthesisSettings(degrees=(8,)))
+    twelve = make_problem("safe_envs/Quadrotor-v0")
+    for find in (certify, certify_held):
+        begin = time.process_time()
+        with pytest.raises(ConfigurationError, match="12 states"):
+            find(Named(twelve), SynthesisSettings())
+        assert time.process_time() - begin < 1.0
 
 
 def test_starts_are_taken_within_the_period_of_an_angle():
