@@ -8,9 +8,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.agents.policies.base import BLOCK, Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.observations import each, rows_of
 from safe_envs.errors import InvalidInputError
+
+_BLOCK = 512
+"""Observations in a block: a call takes long, and longer with more rows."""
 
 Map = Callable[[Any], Any]
 """From a batch of observations, or of actions, to another one."""
@@ -44,7 +47,7 @@ class TrainedPolicy(Policy):
 
     def begin(self, episodes: range, seed: int) -> None:
         """Remember in which row of its block the first episode belongs; see `Policy.begin`."""
-        self._offset = episodes.start % BLOCK
+        self._offset = episodes.start % _BLOCK
 
     def predict(
         self,
@@ -62,9 +65,9 @@ class TrainedPolicy(Policy):
         for change in self._observe:
             rows = change(rows)
         end = self._offset + size
-        blocks = -(-end // BLOCK)
+        blocks = -(-end // _BLOCK)
         # Any observation would do in the other rows; zeros may be none.
-        places = np.clip(np.arange(blocks * BLOCK) - self._offset, 0, size - 1)
+        places = np.clip(np.arange(blocks * _BLOCK) - self._offset, 0, size - 1)
         starts = np.zeros(size, dtype=bool) if episode_start is None else np.asarray(episode_start)
         memories = state if isinstance(state, _Memories) else [None] * blocks
         if len(memories) != blocks:
@@ -74,7 +77,7 @@ class TrainedPolicy(Policy):
             )
         found, kept = [], _Memories()
         for k, memory in enumerate(memories):
-            part = places[k * BLOCK : (k + 1) * BLOCK]
+            part = places[k * _BLOCK : (k + 1) * _BLOCK]
             block = each(lambda array, part=part: array[part], rows)
             actions, memory = self._model.predict(block, memory, starts[part], deterministic=True)
             found.append(actions)
