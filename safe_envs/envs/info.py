@@ -156,6 +156,22 @@ def specification_info(robustness: Any, satisfied: Any, verdict: Any, automaton_
     }
 
 
+def step_cost(cost: Any, violation: Any, episode_cost: Any, before: Any) -> Any:
+    """Return what a step cost: by how much the cost of the episode has risen since the last one.
+
+    Where actions are repeated a step is several control periods, and `cost` that of the last one. A
+    cost that somebody else wrote into the info stays as it is.
+
+    Args:
+        cost: of the info, float64 (...).
+        violation: likewise.
+        episode_cost: likewise.
+        before: `episode_cost` after the last step; NaN where that is not known.
+    """
+    own = (cost == violation) & (episode_cost >= before)
+    return np.where(own, episode_cost - before, cost)
+
+
 def with_masks(info: Info, present: np.ndarray) -> Info:
     """Add Gymnasium's `_key` masks, which say for which envs of a batch a key was reported.
 

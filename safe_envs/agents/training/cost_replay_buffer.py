@@ -43,6 +43,16 @@ class CostReplayBuffer(ReplayBuffer):
         super().__init__(*args, **kwargs)
         self.costs = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self._sampled: CostSamples | None = None
+        self._expected: tuple[Any, Any] = (None, None)
+
+    def expect(self, infos: list[dict[str, Any]], costs: np.ndarray) -> None:
+        """Take the costs of a step that somebody has found out, in place of `info["cost"]`.
+
+        Args:
+            infos: that the step will be added with.
+            costs: shape (n_envs,).
+        """
+        self._expected = infos, costs
 
     def last_sample(self) -> CostSamples:
         """Return the steps that `sample` returned last, with their costs.
@@ -76,7 +86,8 @@ class CostReplayBuffer(ReplayBuffer):
         Raises:
             ConfigurationError: an info has no cost.
         """
-        self.costs[self.pos] = costs_of(infos)
+        known, costs = self._expected
+        self.costs[self.pos] = costs if known is infos else costs_of(infos)
         super().add(obs, next_obs, action, reward, done, infos)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
