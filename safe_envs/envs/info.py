@@ -25,6 +25,7 @@ and with a filter
 | `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
+| `input_bounds` | float64 (m, 2) | inputs at the two ends of the action space; not of a joint QP |
 
 and with the promise filter
 

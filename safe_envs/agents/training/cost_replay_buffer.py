@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from safe_envs.agents.training.constraint import costs_of
+from safe_envs.agents.training.lazy_info import of_envs
 from safe_envs.agents.training.replay_buffer import FilteredReplayBuffer
 from safe_envs.errors import ConfigurationError
 
@@ -86,9 +87,10 @@ class CostReplayBuffer(ReplayBuffer):
         Raises:
             ConfigurationError: an info has no cost.
         """
+        each: Any = of_envs(infos, self.n_envs)
         known, costs = self._expected
-        self.costs[self.pos] = costs if known is infos else costs_of(infos)
-        super().add(obs, next_obs, action, reward, done, infos)
+        self.costs[self.pos] = costs if known is each else costs_of(each)
+        super().add(obs, next_obs, action, reward, done, each)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         # Stable-Baselines3 draws the env of each row where nobody sees it: draw the same envs here,
