@@ -79,10 +79,10 @@ def new_model(
     # Stable-Baselines3 writes into what it is given.
     left = scheduled(copy.deepcopy(dict(settings)))
     _require_known(name, left)
-    for key in _IN_PYTHON:
-        if isinstance(left.get(key), str):
-            left[key] = python_value(key, left[key])
     try:
+        for key in _IN_PYTHON:
+            if isinstance(left.get(key), str):
+                left[key] = python_value(key, left[key])
         envs = _normalized(envs, left.pop("normalize", False), left.get("gamma", 0.99))
         left |= _action_noise(
             left.pop("noise_type", None), left.pop("noise_std", None), problem.plant.m

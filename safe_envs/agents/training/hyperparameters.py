@@ -126,6 +126,8 @@ def checked(settings: Mapping[str, Any]) -> dict[str, Any]:
         value = found.get(name)
         if value is None or isinstance(value, list | tuple):  # such as [1, episode] of train_freq
             continue
+        if isinstance(value, str):
+            raise ConfigurationError(f"{name} = {shown(value)}; give a number")
         if isinstance(value, float) and value.is_integer():
             value = found[name] = int(value)
         require_whole(name, value, least)
@@ -148,7 +150,7 @@ def python_value(name: str, text: str) -> Any:
         text: literals, dict(NAME=VALUE, ...), and classes of torch.nn such as nn.ReLU.
 
     Raises:
-        ConfigurationError: it holds anything else.
+        ValueError: it holds anything else.
     """
     try:
         return _value_of(ast.parse(text.strip(), mode="eval").body)
@@ -160,7 +162,7 @@ def python_value(name: str, text: str) -> Any:
         TypeError,
         ValueError,
     ) as error:
-        raise ConfigurationError(
+        raise ValueError(
             f"{name} = {shown(text)} is none of the values in Python that are read; give YAML such"
             " as {net_arch: [64, 64]}, or dict(net_arch=[64, 64], activation_fn=nn.ReLU)"
         ) from error

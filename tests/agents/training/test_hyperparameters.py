@@ -104,7 +104,7 @@ def test_the_zoo_writes_python():
     ],
 )
 def test_python_is_not_run(text):
-    with pytest.raises(ConfigurationError, match=r"policy_kwargs = .* is none of the values"):
+    with pytest.raises(ValueError, match=r"policy_kwargs = .* is none of the values"):
         python_value("policy_kwargs", text)
 
 
@@ -122,7 +122,13 @@ def test_texts_of_the_zoo_make_a_model(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["buffer_size=1e15", "replay_buffer_class=x", "policy_kwargs=dict(n_critics=0)"]
+    "text",
+    [
+        "buffer_size=1e15",
+        "replay_buffer_class=x",
+        "policy_kwargs=dict(n_critics=0)",
+        "policy_kwargs=dict(f=open('x'))",
+    ],
 )
 def test_what_stable_baselines3_refuses_is_an_error_of_this_project(tmp_path, text):
     torch.set_num_threads(1)
