@@ -39,7 +39,12 @@ def rows_of(observation: Any, space: gym.Space[Any]) -> tuple[Any, int, bool]:
 
 
 def each(function: Callable[[np.ndarray], Any], observation: Any) -> Any:
-    """Return a function of each array of an observation, in the structure of the observation."""
+    """Return a function of each array of an observation, in the structure of the observation.
+
+    Args:
+        function: of an array.
+        observation: an array, or a mapping or a tuple of them.
+    """
     if isinstance(observation, Mapping):
         return {key: each(function, part) for key, part in observation.items()}
     if isinstance(observation, tuple):

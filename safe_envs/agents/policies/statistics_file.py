@@ -15,7 +15,7 @@ _OF_CHECKPOINT = re.compile(r"(.+)_vecnormalize_(\d+)_steps")
 
 
 def statistics_files(path: Path) -> list[Path]:
-    """Return the files beside a .zip that may hold its statistics; nothing is opened.
+    """Return the files next to a .zip that may hold its statistics; nothing is opened.
 
     They are the pickles with "norm" in their names, and VecNormalize's in a subfolder without a
     model, where the RL Zoo puts it. One that is named after this .zip excludes the others, and one

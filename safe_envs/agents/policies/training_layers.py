@@ -23,6 +23,9 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import StateEstimatorVectorWrapper, StateEstimatorWrapper
 from safe_envs.wrappers.env_wrappers.layers_below import CHANGING, passes_on
 
+_OF_OWN = ("problem", "physical_action", "episode")
+"""Attributes by which an env of this project is known where it is out of reach."""
+
 
 class Normalizer:
     """What a VecNormalize does to observations, with its statistics at one time.
@@ -220,9 +223,11 @@ def _look_at_batch(env: gym.vector.VectorEnv, found: TrainingLayers) -> None:
 def _ask(envs: Any, env_id: str, found: TrainingLayers) -> None:
     """Ask envs out of reach, mostly of other processes, as far as they answer."""
     try:
-        found.problem = _problem_of(envs, "get_attr")
+        # A process ends if it is asked for what it has not, or cannot send.
+        if all(map(envs.has_attr, _OF_OWN)):
+            found.problem = envs.get_attr("problem", [0])[0]
         seen = [kind for kind in CHANGING if any(envs.env_is_wrapped(kind, [0]))]
-    except (AttributeError, EOFError, NotImplementedError, OSError):  # such as processes that ended
+    except Exception:  # such as of processes that have ended, and of envs of other libraries
         return
     own = _wrappers_of_id(env_id) if seen else []
     seen = [kind for kind in seen if not any(issubclass(each, kind) for each in own)]
@@ -233,8 +238,8 @@ def _ask(envs: Any, env_id: str, found: TrainingLayers) -> None:
         )
 
 
-def _problem_of(env: Any, by: str = "") -> SafetyProblem | None:
-    found = env.get_attr("problem", [0])[0] if by else getattr(env, "problem", None)
+def _problem_of(env: Any) -> SafetyProblem | None:
+    found = getattr(env, "problem", None)
     return found if isinstance(found, SafetyProblem) else None
 
 

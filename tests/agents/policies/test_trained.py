@@ -15,7 +15,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.callbacks import CheckpointCallback
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.save_util import save_to_zip_file
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionWarning
 from safe_envs.agents import evaluate, make_policy, make_problem, make_sb3_env
@@ -302,6 +302,51 @@ def test_a_file_holds_no_wrappers_and_an_unknown_one_is_named(tmp_path):
         acted(str(tmp_path / "model.zip"))
     with pytest.warns(SystemDefinitionWarning, match="trained behind Slow, which is not there"):
         acted(ppo(Slow(single())))
+
+
+class Remote(VecEnv):
+    """An env that answers to questions as SubprocVecEnv does, and is out of reach."""
+
+    closed = False
+
+    def __init__(self, make):
+        self._inner = DummyVecEnv([make])
+        super().__init__(1, self._inner.observation_space, self._inner.action_space)
+        for name in ("reset", "step_async", "step_wait", "env_method", "set_attr"):
+            setattr(self, name, getattr(self._inner, name))
+
+    reset = step_async = step_wait = env_method = set_attr = None
+
+    def close(self):
+        self.closed = True
+
+    def get_attr(self, name, indices=None):
+        return self._asked(self._inner.get_attr, name)
+
+    def has_attr(self, name):
+        return self._asked(self._inner.has_attr, name)
+
+    def env_is_wrapped(self, kind, indices=None):
+        return self._asked(self._inner.env_is_wrapped, kind)
+
+    def _asked(self, question, what):
+        if self.closed:
+            raise EOFError
+        return question(what)
+
+
+def test_envs_in_other_processes_are_asked(third_party):
+    spec, _ = third_party
+    envs = Remote(lambda: gym.make(ENV_ID, horizon=0.5, box=(-2.0, 4.0)))
+    model = ppo(envs)
+    wanted, _ = model.predict(OBSERVATIONS, deterministic=True)
+    # The same inputs, in the bounds -10 and 10.
+    assert_same(model, (1.0 + 3.0 * wanted) / 10.0)
+    envs.close()
+    assert_same(model, wanted)
+    model = ppo(Remote(lambda: Turned(gym.make("Pendulum-v1"))))
+    with pytest.raises(ConfigurationError, match="ObservationWrapper in another process"):
+        evaluate("Pendulum-v1", model, filter_spec=spec, episodes=1)
 
 
 def test_an_action_stands_for_an_input(tmp_path):
