@@ -121,12 +121,13 @@ def _made(given: Any, problem: SafetyProblem) -> Any:
         parameters = [inspect.Parameter("problem", inspect.Parameter.POSITIONAL_ONLY)]
     if inspect.isfunction(given) and [p.name for p in parameters] not in ([], ["problem"]):
         return given
+    make: Any = given
     by_name = any(p.name == "problem" and p.kind is not p.POSITIONAL_ONLY for p in parameters)
     takes_problem = by_name or any(map(_is_needed, parameters))
     try:
         if by_name:
-            return given(problem=problem)
-        return given(problem) if takes_problem else given()
+            return make(problem=problem)
+        return make(problem) if takes_problem else make()
     except SafeEnvsError:
         raise
     except Exception as error:

@@ -82,9 +82,9 @@ def _typed(observation: Any, space: gym.Space[Any]) -> Any:
 def _arrays(typed: Any, space: gym.Space[Any]) -> Iterator[tuple[np.ndarray, gym.Space[Any]]]:
     """Yield each array of an observation and its space."""
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        parts = space.spaces.keys() if isinstance(space, gym.spaces.Dict) else range(len(typed))
-        for key in parts:
-            yield from _arrays(typed[key], space.spaces[key])
+        parts: Any = space.spaces
+        for key in parts if isinstance(space, gym.spaces.Dict) else range(len(parts)):
+            yield from _arrays(typed[key], parts[key])
     else:
         yield typed, space
 

@@ -63,8 +63,8 @@ def policy_of_model(model: Any, problem: SafetyProblem, spaces: Spaces) -> Train
     require_same_env(type(model).__name__, layers, problem, spaces)
     act, trained = list(layers.act), layers.problem
     if trained is not None and trained.box != problem.box:
-        boxes = (np.array(each.box, dtype=float) for each in (trained, problem))
-        act.append(partial(in_another_box, boxes=tuple(boxes)))
+        boxes = np.array(trained.box, dtype=float), np.array(problem.box, dtype=float)
+        act.append(partial(in_another_box, boxes=boxes))
     return TrainedPolicy(model, spaces[0], layers.observe, act)
 
 
@@ -83,10 +83,9 @@ def require_same_env(
     if layers.problem is not None:
         difference = Signature.of(layers.problem).difference(problem)
     else:
-        known = gym.registry.get(problem.name)
-        unknown = known is None or layers.spec is None
-        same = unknown or known.entry_point == layers.spec.entry_point
-        difference = "" if same else f"{layers.spec.id}, and not {problem.name}"
+        wanted, spec, difference = gym.registry.get(problem.name), layers.spec, ""
+        if wanted is not None and spec is not None and wanted.entry_point != spec.entry_point:
+            difference = f"{spec.id}, and not {problem.name}"
     if difference:
         raise ConfigurationError(
             f"the policy of {name} was trained on another env: {difference}. Train it on this one;"

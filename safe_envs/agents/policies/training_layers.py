@@ -139,7 +139,8 @@ def _look_through(envs: Any, env_id: str, found: TrainingLayers) -> None:
     from stable_baselines3.common import vec_env as sb3
 
     plain = (sb3.VecMonitor, sb3.VecCheckNan, sb3.VecVideoRecorder, sb3.VecTransposeImage)
-    observe, layer = [], envs
+    observe: list[Map] = []
+    layer: Any = envs
     while isinstance(layer, sb3.VecEnvWrapper):
         if isinstance(layer, sb3.VecNormalize):
             observe += [Normalizer(layer)] if layer.norm_obs else []
@@ -204,8 +205,10 @@ def _wrappers_of_id(env_id: str) -> list[type[Any]]:
     """Return the classes of the wrappers that an id of a third-party env stands for."""
     if env_id not in gym.registry:
         return []
-    with gym.make(env_id) as env:
-        return [type(each) for each in _changing_wrappers(env)]
+    env = gym.make(env_id)
+    found = [type(each) for each in _changing_wrappers(env)]
+    env.close()
+    return found
 
 
 def _look_at_batch(env: gym.vector.VectorEnv, found: TrainingLayers) -> None:

@@ -134,7 +134,7 @@ def checked(settings: Mapping[str, Any]) -> dict[str, Any]:
     ends = {**dict.fromkeys(_SHARES, (0.0, 1.0)), **dict.fromkeys(_FROM_ZERO, (0.0, math.inf))}
     ends |= dict.fromkeys(_ABOVE_ZERO, (math.ulp(0.0), math.inf))
     for name, (low, high) in ends.items():
-        value = found.get(name)
+        value: Any = found.get(name)
         number = isinstance(value, int | float)
         if number and (isinstance(value, bool) or not low <= value <= min(high, 1e300)):
             allowed = "from 0 to 1" if high == 1.0 else "from 0" if low == 0.0 else "above 0"
@@ -171,10 +171,10 @@ def python_value(name: str, text: str) -> Any:
 def _value_of(node: ast.expr) -> Any:
     match node:
         case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs):
-            return {str(pair.arg): _value_of(pair.value) for pair in pairs if pair.arg or _refuse()}
+            return {pair.arg or _refuse(): _value_of(pair.value) for pair in pairs}
         case ast.Dict(keys=keys, values=values):
             entries = zip(keys, values, strict=True)
-            return {_value_of(key): _value_of(value) for key, value in entries if key or _refuse()}
+            return {_value_of(key or _refuse()): _value_of(value) for key, value in entries}
         case ast.List(elts=parts):
             return [_value_of(part) for part in parts]
         case ast.Tuple(elts=parts):

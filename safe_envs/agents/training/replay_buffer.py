@@ -93,7 +93,8 @@ class FilteredReplayBuffer(ReplayBuffer):
                 " buffer for them from FilteredDictReplayBuffer, or flatten them by"
                 " gymnasium.wrappers.FlattenObservation"
             )
-        return super().__new__(FilteredDictReplayBuffer)
+        kind: Any = FilteredDictReplayBuffer
+        return super().__new__(kind)
 
     def __init__(
         self,
