@@ -40,8 +40,15 @@ _WHOLE = {
 _SHARES = ("gamma", "gae_lambda", "tau", "cost_gamma", "cost_gae_lambda")
 """Those from 0 to 1."""
 
-_FROM_ZERO = ("learning_rate", "ent_coef", "vf_coef", "noise_std", "target_policy_noise")
-_ABOVE_ZERO = ("clip_range", "clip_range_vf", "max_grad_norm", "target_kl", "target_noise_clip")
+_FROM_ZERO = (
+    "learning_rate",
+    "ent_coef",
+    "vf_coef",
+    "noise_std",
+    "target_policy_noise",
+    "target_noise_clip",
+)
+_ABOVE_ZERO = ("clip_range", "clip_range_vf", "max_grad_norm", "target_kl")
 
 _POLICY = "MlpPolicy"
 

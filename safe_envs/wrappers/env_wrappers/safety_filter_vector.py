@@ -121,10 +121,11 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
         if self._stepper is not None:
-            *found, info = self._inner.step_filtered(self._stepper, actions)
+            found = self._inner.step_filtered(self._stepper, actions)
+            info = self._with_bounds(found[-1])
             if "final_info" in info:
                 self._with_bounds(info["final_info"])
-            return *found, self._with_bounds(info)
+            return found
         proposed = self._inner.physical_action(actions)
         self.follow()
         decision = self._filter.decide_arrays(tuple(self.known(proposed)), proposed)
@@ -181,7 +182,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
     def _with_bounds(self, info: Info) -> Info:
         """Add what is always the same to an info of the compiled function."""
-        info.update(with_masks(self.bounds_info(), info["_cost"]))
+        if self._bounds is not None:
+            info["input_bounds"], info["_input_bounds"] = self._bounds.copy(), info["_cost"]
         return info
 
     def _observe_last(self, info: Info, ended: np.ndarray) -> None:
