@@ -181,8 +181,8 @@ def _load(path: Path) -> tuple[Any, Mapping[str, Any]]:
         network.load_state_dict(parameters["policy"])
     except ModuleNotFoundError as error:
         raise ConfigurationError(
-            f"{path} needs the package {error.name}, which is not installed; install it, or save"
-            " the policy by safe_envs.agents.policies.network.save_policy"
+            f"{path} needs the module {error.name}, which is not there; install it, or work where"
+            " it can be imported"
         ) from error
     except Exception as error:  # What a pickle may raise has no limits.
         raise ConfigurationError(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import sys
+import types
 
 import gymnasium as gym
 import numpy as np
@@ -21,11 +23,13 @@ from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionWar
 from safe_envs.agents import evaluate, make_policy, make_problem, make_sb3_env
 from safe_envs.agents.policies.network import load_policy, save_policy
 from safe_envs.agents.policies.statistics_file import statistics_file
+from safe_envs.envs.spaces import action_box, observation_box
 from safe_envs.object_import import load_object
 from safe_envs.wrappers import SafetyFilterWrapper
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 PROBLEM = make_problem(ENV_ID)
+PROBLEM_SPACES = observation_box(PROBLEM), action_box(PROBLEM)
 OBSERVATIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (150, 4)).astype(np.float32)
 SHORT = {"episodes": 3, "options": {"horizon": 0.2}, "bounds": False, "best": False}
 
@@ -487,12 +491,27 @@ class Linear(BasePolicy):
         return self.layer(observation)
 
 
+def saved_alone(policy, path):
+    data = {"observation_space": policy.observation_space, "action_space": policy.action_space}
+    data |= {"policy_class": type(policy), "policy_kwargs": {}}
+    save_to_zip_file(path, data, {"policy": policy.state_dict()})
+    return str(path)
+
+
 def test_a_policy_without_a_learning_rate_is_loaded(tmp_path):
-    policy = Linear(*(getattr(single(), f"{kind}_space") for kind in ("observation", "action")))
-    saved = {"observation_space": policy.observation_space, "action_space": policy.action_space}
-    saved |= {"policy_class": Linear, "policy_kwargs": {}}
-    save_to_zip_file(tmp_path / "model.zip", saved, {"policy": policy.state_dict()})
-    assert_same(str(tmp_path / "model.zip"), policy.predict(OBSERVATIONS)[0])
+    policy = Linear(*PROBLEM_SPACES)
+    path = saved_alone(policy, tmp_path / "model.zip")
+    assert_same(path, policy.predict(OBSERVATIONS)[0])
+
+
+def test_a_module_that_is_missing_is_named(tmp_path, monkeypatch):
+    module = types.ModuleType("gone")
+    kind = module.Gone = type("Gone", (Linear,), {"__module__": "gone"})
+    monkeypatch.setitem(sys.modules, "gone", module)
+    path = saved_alone(kind(*PROBLEM_SPACES), tmp_path / "model.zip")
+    monkeypatch.delitem(sys.modules, "gone")
+    with pytest.raises(ConfigurationError, match="needs the module gone, which is not there"):
+        acted(path)
 
 
 def test_policies_of_sb3_contrib(tmp_path):
