@@ -66,8 +66,8 @@ def _fitting(
             "the env is filtered, and a wrapper around the filter changes the actions, or the"
             " map of the actions is no straight line, so that the executed ones are unknown in"
             " units of the action space; put the filter around that wrapper, or give"
-            " replay_buffer_kwargs={'box': [(low, high), ...]}: the inputs at its ends. In a loop of"
-            " your own, add actions in [-1, 1], and not in the units of another action space"
+            " replay_buffer_kwargs={'box': [(low, high), ...]}: the inputs at its ends. A loop of"
+            " your own adds actions in [-1, 1], and not in the units of another action space"
         )
     return known[0]
 
