@@ -25,6 +25,7 @@ and with a filter
 | `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
+| `input_bounds` | float64 (m, 2) | inputs at the two ends of the action space; not of a joint QP |
 
 and with the promise filter
 
@@ -154,6 +155,22 @@ def specification_info(robustness: Any, satisfied: Any, verdict: Any, automaton_
         "verdict": verdict,
         "automaton_state": automaton_state,
     }
+
+
+def step_cost(cost: Any, violation: Any, episode_cost: Any, before: Any) -> Any:
+    """Return what a step cost: by how much the cost of the episode has risen since the last one.
+
+    Where actions are repeated a step is several control periods, and `cost` that of the last one. A
+    cost that somebody else wrote into the info stays as it is.
+
+    Args:
+        cost: of the info, float64 (...).
+        violation: likewise.
+        episode_cost: likewise.
+        before: `episode_cost` after the last step; NaN where that is not known.
+    """
+    own = (cost == violation) & (episode_cost >= before)
+    return np.where(own, episode_cost - before, cost)
 
 
 def with_masks(info: Info, present: np.ndarray) -> Info:

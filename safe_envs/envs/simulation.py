@@ -81,12 +81,12 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
 
     Args:
         problem: whose horizon is the limit.
-        max_episode_steps: a lower limit, if any.
+        max_episode_steps: a lower limit, if any; -1 is none, as for Gymnasium.
 
     Raises:
         ConfigurationError: the limit is no whole number from 1.
     """
-    if max_episode_steps is None:
+    if max_episode_steps is None or max_episode_steps == -1:
         return problem.steps
     require_whole("max_episode_steps", max_episode_steps, 1)
     return min(problem.steps, max_episode_steps)

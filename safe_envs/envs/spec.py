@@ -64,7 +64,7 @@ class SystemSpec(EnvSpec):
         if sys._getframe(1).f_code in _MAKERS:
             return self.given_steps
         own = self._default_steps() if self.own_steps is None else self.own_steps
-        return min(filter(None, (self.given_steps, own)), default=None)
+        return _least(self.given_steps, own)
 
     @max_episode_steps.setter
     def max_episode_steps(self, steps: int | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -84,7 +84,7 @@ class SystemSpec(EnvSpec):
             steps = creator.make_problem(**given).steps
         except ConfigurationError:  # The id for any system has none of its own.
             return None
-        return min(steps, self.kwargs.get("max_episode_steps") or steps)
+        return _least(steps, self.kwargs.get("max_episode_steps"))
 
 
 class OwnSpec:
@@ -129,6 +129,11 @@ def register_system(
         env_id, entry_point, vector_entry_point=vector_entry_point, kwargs=arguments or None
     )
     gym.registry[env_id] = SystemSpec.of(gym.registry[env_id])
+
+
+def _least(*limits: int | None) -> int | None:
+    """Return the least of some limits; Gymnasium's -1 is none, as None is."""
+    return min((n for n in limits if n not in (None, -1)), default=None)  # pyright: ignore[reportReturnType, reportArgumentType]
 
 
 def _given(spec: EnvSpec) -> dict[str, Any]:

@@ -8,8 +8,16 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem.factory import build_problem, remembering
 from safe_envs.problem.problem import SafetyProblem
+
+_OF_BATCHES = {
+    "autoreset_mode": "for vectorization_mode = 'sync' or 'async' of gym.make_vec give"
+    " vector_kwargs={'autoreset_mode': 'SameStep'}",
+    "engine": "leave it out, or leave out the vectorization_mode of gym.make_vec",
+}
+"""Arguments of `SystemVectorEnv` that one env does not have, and what to give in their place."""
 
 
 class SystemEnv(SafeEnv):
@@ -42,6 +50,11 @@ class SystemEnv(SafeEnv):
         terminate_on_violation: bool = False,
         **options: Any,
     ) -> None:
+        for name in _OF_BATCHES.keys() & options.keys():
+            raise ConfigurationError(
+                f"{name} is an argument of batches of envs that are stepped together, and this is"
+                f" one env; {_OF_BATCHES[name]}"
+            )
         problem = type(self).make_problem(**options)
         super().__init__(problem, max_episode_steps, render_mode, terminate_on_violation)
 

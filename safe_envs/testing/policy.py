@@ -35,8 +35,8 @@ def check_policy(
     observations get equal actions, unless the policy says that it is not deterministic.
 
     Args:
-        policy: as for `evaluate`: a name or FILE.py:NAME, an object with `predict`, a class that
-            takes the problem, or a function of a batch of observations.
+        policy: as for `evaluate`: a name or FILE.py:NAME, an object with `predict`, a class of such
+            objects, or a function of a batch of observations.
         problem: problem, or the id of its env.
         episodes: number of episodes side by side.
         steps: control periods of each, at most.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import pickle
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -134,3 +135,27 @@ def test_an_env_without_a_spec_has_none():
     assert env.spec is None
     assert OrderEnforcing(env).spec is None
     assert safe_envs.SafeVectorEnv(walk(), 2).spec is None
+
+
+@pytest.mark.parametrize("mode", [None, "sync"])
+def test_no_limit_of_gymnasium_is_the_horizon(mode):
+    """-1, as for `gym.make`."""
+    envs = gym.make_vec("safe_envs/Scalar-v0", 2, mode, max_episode_steps=-1, horizon=0.1)
+    steps = gym.make("safe_envs/Scalar-v0", max_episode_steps=-1, horizon=0.1).spec
+    assert envs.spec.max_episode_steps == steps.max_episode_steps == 10
+    envs.reset(seed=0)
+    ends = [envs.step(np.zeros((2, 1)))[3].all() for _ in range(10)]
+    assert ends == [*[False] * 9, True]
+
+
+@pytest.mark.parametrize(
+    ("argument", "says"),
+    [
+        ({"autoreset_mode": "SameStep"}, "vector_kwargs={'autoreset_mode': 'SameStep'}"),
+        ({"engine": "compiled"}, "leave out the vectorization_mode"),
+    ],
+)
+def test_arguments_of_native_vector_envs_are_no_arguments_of_one_env(argument, says):
+    for make in (gym.make, lambda *given, **named: gym.make_vec(*given, 2, "sync", **named)):
+        with pytest.raises(ConfigurationError, match=re.escape(says)):
+            make("safe_envs/Scalar-v0", **argument)

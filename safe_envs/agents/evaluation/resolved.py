@@ -21,7 +21,7 @@ from safe_envs.agents.evaluation.targets import Env, make_target
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.names import policy_file
+from safe_envs.agents.policies.names import policy_files
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, shown
@@ -280,5 +280,7 @@ def _describe(problem: SafetyProblem) -> dict[str, Any]:
 def _describe_policy(policy: Any) -> dict[str, Any]:
     if not isinstance(policy, str):
         return {"name": policy_name(policy)}
-    file = policy_file(policy)
-    return {"name": policy} | ({} if file is None else {"sha256": file_checksum(file)})
+    found = {"name": policy}
+    for key, file in zip(("sha256", "statistics_sha256"), policy_files(policy), strict=False):
+        found[key] = file_checksum(file)
+    return found

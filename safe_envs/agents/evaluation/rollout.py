@@ -17,6 +17,7 @@ from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.processes import compute_in_order
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
+from safe_envs.agents.policies.observations import shapes_of
 from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.philox import episode_seeds
 from safe_envs.envs.info import Info
@@ -203,12 +204,12 @@ def _play(
     return batch
 
 
-def acted(policy: Any, observation: np.ndarray, state: Any, start: np.ndarray) -> tuple[Any, Any]:
+def acted(policy: Any, observation: Any, state: Any, start: np.ndarray) -> tuple[Any, Any]:
     """Return the actions and the state of a policy, whose failure is that of what was given.
 
     Args:
         policy: anything with Stable-Baselines3's `predict`.
-        observation: of each env, shape (B, k).
+        observation: of each env, shape (B, k) mostly.
         state: of the policy, as it returned it last; None at first.
         start: which envs begin an episode, bool (B,).
 
@@ -224,7 +225,7 @@ def acted(policy: Any, observation: np.ndarray, state: Any, start: np.ndarray) -
         raise
     except (Exception, SystemExit) as error:
         raise InvalidInputError(
-            f"the policy {policy_name(policy)} failed on observations of shape {observation.shape}"
+            f"the policy {policy_name(policy)} failed on observations {shapes_of(observation)}"
             f" ({type(error).__name__}: {shortened(error)}); predict(observation, state,"
             " episode_start, deterministic) returns the actions and the next state"
         ) from error

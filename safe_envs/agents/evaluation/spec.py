@@ -47,7 +47,7 @@ class EvaluationSpec:
         problem: what to simulate, or the id of a registered env; with a `filter_spec` the id of any
             env that Gymnasium knows.
         policy: a name, a place or a path for `make_policy`; or what `as_policy` takes: an object
-            with Stable-Baselines3's `predict`, a class that takes the problem, or a function of a
+            with Stable-Baselines3's `predict`, a class of such objects, or a function of a
             batch of observations.
         filters: texts for `parse_conditions`, conditions, or tuples of one condition for each
             barrier, and "none" for the unfiltered env; None for that and the problem's own.

@@ -179,25 +179,20 @@ def checked_observation(observation: Any, width: int) -> np.ndarray:
     return given
 
 
-def require_spaces(
-    what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
-) -> None:
-    """Raise ConfigurationError unless a network takes an env's observations and gives its actions.
+def require_spaces(what: str, trained: Spaces, wanted: Spaces) -> None:
+    """Raise ConfigurationError unless a policy takes an env's observations and gives its actions.
 
     Args:
-        what: the network is, to begin the message with.
-        network: a policy of Stable-Baselines3.
-        observation_space: of the env that it is to act in.
-        action_space: of that env.
+        what: the policy is, to begin the message with.
+        trained: spaces of the policy.
+        wanted: spaces of the env that it is to act in.
     """
-    spaces = (
-        ("observation", network.observation_space, observation_space),
-        ("action", network.action_space, action_space),
-    )
-    for kind, trained, wanted in spaces:
-        if trained != wanted:
+    for kind, its, of_env in zip(("observation", "action"), trained, wanted, strict=True):
+        if its != of_env:
             raise ConfigurationError(
-                f"{what} was trained for another {kind} space, {_difference(trained, wanted)}"
+                f"{what} was trained for another {kind} space, {_difference(its, of_env)}. Where it"
+                " was trained behind wrappers that change spaces, give the model itself, with an"
+                " env that has these wrappers: PPO.load(file, env=env)"
             )
 
 

@@ -6,6 +6,7 @@ import os
 import re
 from pathlib import Path
 
+from safe_envs.agents.policies.statistics_file import statistics_files
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.object_import import resolved
 from safe_envs.plugins import POLICIES as POLICY_PLUGINS
@@ -84,6 +85,14 @@ def policy_file(name: str) -> Path | None:
         source = name.rpartition(":")[0]
         return Path(source) if source.endswith(".py") else None
     return saved_policy_file(Path(name)) or Path(name)
+
+
+def policy_files(name: str) -> list[Path]:
+    """Return the files that decide what the policy of a name is: its own, and its statistics."""
+    file = policy_file(name)
+    if file is None:
+        return []
+    return [file, *(statistics_files(file) if file.suffix == ".zip" else [])]
 
 
 def policy_module(name: str) -> str | None:

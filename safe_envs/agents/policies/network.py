@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.base import require_spaces
 from safe_envs.agents.policies.names import POLICY_FILE, saved_policy_file
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
+from safe_envs.agents.policies.sb3 import require_same_env
+from safe_envs.agents.policies.training_layers import Normalizer, training_layers
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.envs.spaces import observation_names
 from safe_envs.errors import ConfigurationError, shortened
@@ -44,12 +45,7 @@ def save_policy(
     """
     from safe_envs.agents.policies.sb3_actor import actor_of
 
-    require_spaces(
-        f"the policy of {type(model).__name__}",
-        model.policy,
-        observation_box(problem),
-        action_box(problem),
-    )
+    scaling = _normalization_of(model, problem, normalization)
     weights, biases, activation = actor_of(model.policy)
     if not all(np.isfinite(a).all() for a in (*weights, *biases)):
         raise ConfigurationError(
@@ -57,9 +53,6 @@ def save_policy(
             " smaller learning rate"
         )
     network = Network.unscaled(weights, biases, activation)
-    scaling = Normalization.of(
-        model.get_vec_normalize_env() if normalization is None else normalization
-    )
     details = {
         "algorithm": type(model).__name__,
         "activation": activation,
@@ -78,6 +71,25 @@ def save_policy(
     files.save(
         folder / POLICY_FILE, KIND, Signature.of(problem), details, network.to_arrays("actor")
     )
+
+
+def _normalization_of(model: Any, problem: SafetyProblem, given: Any) -> Normalization | None:
+    """Return the normalisation of a model's observations, and check what it was trained on."""
+    name = type(model).__name__
+    layers = training_layers(model, problem.name, given)
+    require_same_env(name, layers, problem, (observation_box(problem), action_box(problem)))
+    if layers.problem is not None and layers.problem.box != problem.box:
+        raise ConfigurationError(
+            f"the policy of {name} was trained with the input bounds {layers.problem.box}, and"
+            f" those of the problem are {problem.box}; give the problem of its training"
+        )
+    scales = [each for each in layers.observe if isinstance(each, Normalizer)]
+    if layers.act or len(layers.observe) > len(scales) or len(scales) > 1:
+        raise ConfigurationError(
+            f"the policy of {name} was trained behind wrappers that change observations or actions,"
+            " which a file of a policy does not hold; evaluate the model itself"
+        )
+    return Normalization.of(scales[0]) if scales else None
 
 
 def load_policy(path: str | Path, problem: SafetyProblem) -> NetworkPolicy:

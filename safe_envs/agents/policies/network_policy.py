@@ -129,7 +129,7 @@ class NetworkPolicy(BlockPolicy):
             x = self._normalization(x)
         actions = _OUTPUTS[self._output](self._network.outputs(x))
         if self._boxes is not None:
-            actions = _in_another_box(actions, *self._boxes)
+            actions = in_another_box(actions, self._boxes)
         return actions.astype(np.float32)
 
     def source(self, data: Data) -> Source:
@@ -151,9 +151,14 @@ class NetworkPolicy(BlockPolicy):
         )
 
 
-def _in_another_box(actions: np.ndarray, trained: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """Return actions (B, m) that stand for the same or the nearest inputs in other input bounds."""
-    (center, half), (new_center, new_half) = map(_middles, (trained, given))
+def in_another_box(actions: np.ndarray, boxes: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return actions that stand for the same or the nearest inputs in other input bounds.
+
+    Args:
+        actions: in [-1, 1], shape (B, m).
+        boxes: input bounds of the training and of the env, each (m, 2).
+    """
+    (center, half), (new_center, new_half) = map(_middles, boxes)
     return np.clip((center + half * actions - new_center) / new_half, -1.0, 1.0)
 
 

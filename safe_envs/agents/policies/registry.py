@@ -17,6 +17,7 @@ from safe_envs.agents.policies.names import (
     saved_policy_file,
 )
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
+from safe_envs.agents.policies.sb3 import policy_of_archive, require_archive
 from safe_envs.agents.policies.third_party import ModelPolicy
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError
@@ -70,7 +71,7 @@ def make_policy(
     if filter_spec is not None and spaces is not None:
         _require_third_party(name, problem.name, filter_spec)
         if name in _NAMED:
-            return ModelPolicy(_NAMED[name](problem), filter_spec, problem, spaces[1])
+            return ModelPolicy(_NAMED[name](problem), filter_spec, problem, spaces)
     if name in _NAMED:
         return _NAMED[name](problem)
     if name in plugin_names(POLICY_PLUGINS):
@@ -107,8 +108,6 @@ def _require_third_party(name: str, env_id: str, filter_spec: FilterSpec) -> Non
 
 
 def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
-    from safe_envs.agents.policies.sb3 import SB3Policy, require_archive
-
     require_archive(path)
     if not trust:
         raise ConfigurationError(
@@ -116,4 +115,4 @@ def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
             f" Python: trust=True), or give a folder of `safe-envs train`, whose {POLICY_FILE}"
             " holds no code"
         )
-    return SB3Policy(path, *spaces)
+    return policy_of_archive(path, spaces)

@@ -1,55 +1,119 @@
-"""Policies that Stable-Baselines3 saved."""
+"""Models of Stable-Baselines3 as policies: objects, and the archives that they are saved in."""
 
 from __future__ import annotations
 
+import inspect
 import io
+import pickle
+import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.agents.policies.base import BlockPolicy, require_spaces
-from safe_envs.bounded_reading import open_archive, open_regular
+from safe_envs.agents.policies.base import Spaces, require_spaces
+from safe_envs.agents.policies.network_policy import in_another_box
+from safe_envs.agents.policies.observations import arrays_of
+from safe_envs.agents.policies.statistics_file import statistics_file
+from safe_envs.agents.policies.trained import TrainedPolicy
+from safe_envs.agents.policies.training_layers import (
+    Normalizer,
+    TrainingLayers,
+    missing_statistics,
+    saw_normalized,
+    training_layers,
+)
+from safe_envs.bounded_reading import open_archive, open_regular, read_bytes
 from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.learning.data.signature import Signature
 
 _MOST_BYTES = 100_000_000
-_STATISTICS = ("normalization.pkl", "vecnormalize.pkl", "*/vecnormalize.pkl")
-"""Where the VecNormalize of a .zip lies: that of `safe-envs train`, one of RL Zoo, and the place
-where RL Zoo itself puts it."""
 
 
-class SB3Policy(BlockPolicy):
-    """The policy in a .zip of PPO, A2C, SAC, TD3 or DDPG, asked for its deterministic action.
+def is_model(given: Any) -> bool:
+    """Return whether an object is an algorithm or a policy of Stable-Baselines3."""
+    # Where nobody has imported it there is none.
+    places = (("base_class", "BaseAlgorithm"), ("policies", "BasePolicy"))
+    known = [(sys.modules.get(f"stable_baselines3.common.{file}"), name) for file, name in places]
+    return any(module and isinstance(given, getattr(module, name)) for module, name in known)
+
+
+def policy_of_model(model: Any, problem: SafetyProblem, spaces: Spaces) -> TrainedPolicy:
+    """Return a model as a policy that sees and acts through what lay around it in training.
+
+    In an env of this project an action stands for an input in physical units: where the bounds of
+    the inputs differ from those of the training, the policy gives the nearest input.
+
+    Args:
+        model: an algorithm, or the policy of one.
+        problem: which it is to act in.
+        spaces: of observations and actions there.
+
+    Raises:
+        ConfigurationError: It was trained on another env, or behind something that cannot be taken
+            up; see `training_layers`.
+    """
+    layers = training_layers(model, problem.name)
+    require_same_env(type(model).__name__, layers, problem, spaces)
+    act, trained = list(layers.act), layers.problem
+    if trained is not None and trained.box != problem.box:
+        boxes = np.array(trained.box, dtype=float), np.array(problem.box, dtype=float)
+        act.append(partial(in_another_box, boxes=boxes))
+    return TrainedPolicy(model, spaces[0], layers.observe, act)
+
+
+def require_same_env(
+    name: str, layers: TrainingLayers, problem: SafetyProblem, spaces: Spaces
+) -> None:
+    """Raise ConfigurationError where it is known that a model was trained on another env.
+
+    Args:
+        name: of the model's class.
+        layers: of its training.
+        problem: which it is to act in, or the model of a third-party env, whose id it has as name.
+        spaces: of observations and actions there.
+    """
+    require_spaces(f"the policy of {name}", layers.spaces, spaces)
+    if layers.problem is not None:
+        difference = Signature.of(layers.problem).difference(problem)
+    else:
+        wanted, spec, difference = gym.registry.get(problem.name), layers.spec, ""
+        if wanted is not None and spec is not None and wanted.entry_point != spec.entry_point:
+            difference = f"{spec.id}, and not {problem.name}"
+    if difference:
+        raise ConfigurationError(
+            f"the policy of {name} was trained on another env: {difference}. Train it on this one;"
+            " to play its network here all the same give model.policy"
+        )
+
+
+def policy_of_archive(path: Path, spaces: Spaces) -> TrainedPolicy:
+    """Return the policy in a .zip of Stable-Baselines3, with the statistics of its training.
 
     Only the policy is built, not the algorithm around it, so that there is no need to know which
     one saved it. The file does not say for which inputs its actions stand: that is left to the
-    problem's input bounds.
+    input bounds of the env. The statistics of VecNormalize are those of a file next to it, see
+    `statistics_file`.
 
     Args:
-        path: of the file. Loading it runs code that it contains: trust its source.
-        observation_space: of the env that the policy is to act in.
-        action_space: of that env.
+        path: of the file. Loading it runs code that it contains, and so does loading its
+            statistics: trust their source.
+        spaces: of observations and actions of the env that it is to act in.
 
     Raises:
-        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those
-            of the env; or the VecNormalize of its training lies next to it, whose observations are
-            not the env's.
+        ConfigurationError: The file is no archive of Stable-Baselines3, or its spaces are not those
+            of the env; or its statistics are missing, several or damaged.
     """
-
-    def __init__(
-        self, path: str | Path, observation_space: gym.Space[Any], action_space: gym.Space[Any]
-    ) -> None:
-        super().__init__(gym.spaces.flatdim(observation_space))
-        self._network = _load(Path(path))
-        require_spaces(f"the policy {path}", self._network, observation_space, action_space)
-
-    def act(self, block: np.ndarray) -> np.ndarray:
-        """Call the network; see `BlockPolicy.act`."""
-        return self._network.predict(block, deterministic=True)[0]
+    network, saved = _load(path)
+    require_spaces(f"the policy {path}", (network.observation_space, network.action_space), spaces)
+    normalizer = _normalizer(path, saved, network.observation_space)
+    return TrainedPolicy(network, spaces[0], [] if normalizer is None else [normalizer])
 
 
 def require_archive(path: Path) -> None:
@@ -62,17 +126,6 @@ def require_archive(path: Path) -> None:
             f"{path} is not a policy that Stable-Baselines3 saved, or damaged, or larger than"
             f" {_MOST_BYTES / 1e6:g} MB; give a .zip of `model.save(...)`, or a folder of"
             " `safe-envs train`"
-        )
-    statistics = next(
-        (found for name in _STATISTICS for found in sorted(path.parent.glob(name))), None
-    )
-    if statistics is not None:
-        raise ConfigurationError(
-            f"{path} is not the whole policy: it was trained on normalised observations, and how"
-            f" these are normalised stands in {statistics}, not in the .zip. Give the folder of"
-            " `safe-envs train`, or write the policy with its normalisation by"
-            " safe_envs.agents.policies.network.save_policy(model, folder, problem, normalization)"
-            " and give that folder"
         )
 
 
@@ -106,7 +159,8 @@ def _is_archive(path: Path) -> bool:
         return False
 
 
-def _load(path: Path) -> Any:
+def _load(path: Path) -> tuple[Any, Mapping[str, Any]]:
+    """Return the network of an archive, and the attributes of its model."""
     require_archive(path)
     import torch
     from stable_baselines3.common.save_util import load_from_zip_file
@@ -116,13 +170,20 @@ def _load(path: Path) -> Any:
     try:
         data, parameters, _ = load_from_zip_file(path, device="cpu")
         saved: Mapping[str, Any] = data or {}
+        kind = saved["policy_class"]
         options = dict(saved.get("policy_kwargs") or {})
         if saved.get("use_sde"):
             options["use_sde"] = True
-        network = saved["policy_class"](
-            saved["observation_space"], saved["action_space"], _no_learning, **options
-        )
+        # Those without a gradient, such as ARS, have no learning rate.
+        if "lr_schedule" in inspect.signature(kind).parameters:
+            options["lr_schedule"] = _no_learning
+        network = kind(saved["observation_space"], saved["action_space"], **options)
         network.load_state_dict(parameters["policy"])
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            f"{path} needs the module {error.name}, which is not there; install it, or work where"
+            " it can be imported"
+        ) from error
     except Exception as error:  # What a pickle may raise has no limits.
         raise ConfigurationError(
             f"{path} cannot be read as a policy ({type(error).__name__}:"
@@ -130,8 +191,36 @@ def _load(path: Path) -> Any:
             " Stable-Baselines3 saved it"
         ) from error
     network.set_training_mode(False)
-    return network.to("cpu")
+    return network.to("cpu"), saved
 
 
 def _no_learning(_: float) -> float:
     return 0.0
+
+
+def _normalizer(path: Path, saved: Mapping[str, Any], space: gym.Space[Any]) -> Normalizer | None:
+    """Return the normalisation of the observations of an archive; None without one."""
+    normalized = saw_normalized(saved)
+    if normalized is False:  # What lies next to it is of another training.
+        return None
+    file = statistics_file(path)
+    if file is None:
+        if normalized:
+            raise missing_statistics(str(path))
+        return None
+    try:
+        wrapper = pickle.loads(read_bytes(file, _MOST_BYTES))
+        if not wrapper.norm_obs:
+            return None
+        if wrapper.observation_space != space:
+            raise ValueError(f"it is of observations of {wrapper.observation_space}")
+        found = Normalizer(wrapper)
+        if not all(np.isfinite(array).all() for array in arrays_of(found(space.sample()))):
+            raise ValueError("its numbers are not finite")
+    except Exception as error:  # What a pickle may raise has no limits.
+        raise ConfigurationError(
+            f"{file} does not hold the statistics of the observations of {path}"
+            f" ({type(error).__name__}: {shortened(error)}); save those of its training there, by"
+            " model.get_vec_normalize_env().save(...)"
+        ) from error
+    return found

@@ -90,6 +90,6 @@ def _activation(module: Any) -> str:
 def _refused(reason: str) -> ConfigurationError:
     return ConfigurationError(
         f"this policy cannot be saved as data: {reason}. Train the MlpPolicy of PPO, A2C, SAC, TD3"
-        " or DDPG, without gSDE for SAC, or keep the .zip of `model.save(...)`, which needs"
-        " --trust"
+        " or DDPG, without gSDE for SAC, or keep the .zip of `model.save(...)`, with"
+        " vecnormalize.pkl next to it if it has one; that needs --trust"
     )

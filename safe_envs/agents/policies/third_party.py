@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.policies.base import Policy, Spaces
+from safe_envs.agents.policies.observations import rows_of
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
@@ -19,13 +20,14 @@ class ModelPolicy(Policy):
         policy: for the model's problem.
         filter_spec: how a filter sees the env.
         problem: the model as a problem.
-        space: of the env's actions.
+        spaces: of the env's observations and actions.
     """
 
     def __init__(
-        self, policy: Policy, filter_spec: FilterSpec, problem: SafetyProblem, space: Any
+        self, policy: Policy, filter_spec: FilterSpec, problem: SafetyProblem, spaces: Spaces
     ) -> None:
-        self._policy, self._filter_spec, self._space = policy, filter_spec, space
+        self._policy, self._filter_spec = policy, filter_spec
+        self._observations, self._actions = spaces
         self.deterministic = policy.deterministic
         self._center, self._half = (np.array(part) for part in center_and_half_width(problem))
 
@@ -35,20 +37,16 @@ class ModelPolicy(Policy):
 
     def predict(
         self,
-        observation: np.ndarray,
+        observation: Any,
         state: Any = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Choose actions of the env; see `Policy.predict`."""
-        x = self._filter_spec.state(observation, np.shape(observation)[:-1])
+        rows, size, is_batch = rows_of(observation, self._observations)
+        x = self._filter_spec.state(rows, (size,))
         actions, state = self._policy.predict(x, state, episode_start, deterministic)
-        space = self._space
-        return (
-            np.clip(
-                self._filter_spec.actions(self._center + self._half * actions),
-                space.low,
-                space.high,
-            ).astype(space.dtype),
-            state,
-        )
+        space: Any = self._actions
+        inputs = self._filter_spec.actions(self._center + self._half * actions)
+        found = np.clip(inputs, space.low, space.high).astype(space.dtype)
+        return (found if is_batch else found[0]), state

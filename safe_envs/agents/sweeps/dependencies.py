@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.names import absolute_policy, policy_file, policy_module
+from safe_envs.agents.policies.names import absolute_policy, policy_files, policy_module
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.wrappers.conditions.names import AT_STATE
 from safe_envs.wrappers.conditions.text_parts import files_of, modules_of, with_absolute_paths
@@ -36,9 +36,7 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
     yield from files_of(settings["filter"].removesuffix(AT_STATE))
-    policy = policy_file(settings["policy"])
-    if policy is not None and os.path.exists(policy):
-        yield policy
+    yield from filter(os.path.exists, policy_files(settings["policy"]))
 
 
 def installed(settings: Mapping[str, Any]) -> Iterator[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import inspect
 from collections.abc import Mapping
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safe_envs.agents.policies.sb3_actor import actor_of
-from safe_envs.agents.training.hyperparameters import OFF_POLICY, scheduled
+from safe_envs.agents.training.hyperparameters import OFF_POLICY, python_value, scheduled
 from safe_envs.agents.training.replay_buffer import replay_options
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
@@ -24,6 +23,9 @@ MOST_SHOWN = 1000
 """Characters of hyperparameters, or of errors about them, at most, that a message repeats."""
 
 _GIVEN = ("self", "env", "seed", "device", "_init_setup_model")
+_IN_PYTHON = ("normalize", "policy_kwargs", "replay_buffer_kwargs")
+"""Hyperparameters that the RL Zoo writes as texts in Python."""
+
 _OF_THE_LIMIT = ("cost_limit", "cost_unit")
 _OF_THE_ENV = ("normalize",)
 _OF_THE_NOISE = ("noise_type", "noise_std")
@@ -78,6 +80,9 @@ def new_model(
     left = scheduled(copy.deepcopy(dict(settings)))
     _require_known(name, left)
     try:
+        for key in _IN_PYTHON:
+            if isinstance(left.get(key), str):
+                left[key] = python_value(key, left[key])
         envs = _normalized(envs, left.pop("normalize", False), left.get("gamma", 0.99))
         left |= _action_noise(
             left.pop("noise_type", None), left.pop("noise_std", None), problem.plant.m
@@ -90,15 +95,7 @@ def new_model(
         model: Any = algorithm_class(name)(env=envs, seed=seed, device="cpu", **left)
     except SafeEnvsError:
         raise
-    except (
-        ArithmeticError,
-        AssertionError,
-        LookupError,
-        RecursionError,
-        SyntaxError,
-        TypeError,
-        ValueError,
-    ) as error:
+    except Exception as error:  # What a hyperparameter may raise has no limits.
         raise ConfigurationError(
             f"{name} does not take these hyperparameters: {str(error)[:MOST_SHOWN]}; they are"
             f" {str(settings)[:MOST_SHOWN]}"
@@ -141,8 +138,6 @@ def _parameters(kind: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
 
 def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
     """Return the envs, in a VecNormalize if the Zoo's `normalize` asks for it."""
-    if isinstance(normalize, str):
-        normalize = ast.literal_eval(normalize)
     if normalize is False or normalize is None:
         return envs
     if normalize is not True and not isinstance(normalize, Mapping):

@@ -12,6 +12,7 @@ from safe_envs.agents.training.hyperparameters import (
     ACTIONS,
     CONSTRAINED,
     OFF_POLICY,
+    checked,
     hyperparameters,
     whole_batches,
 )
@@ -207,14 +208,13 @@ class Training:
             ConfigurationError: a value is not allowed.
         """
         known, given = full_id(env_id), dict(settings or {})
-        found = {**hyperparameters(algorithm, known), **given}
+        found = checked({**hyperparameters(algorithm, known), **given})
         steps, copies = found.pop("n_timesteps"), found.pop("n_envs")
         steps = steps if n_timesteps is None else n_timesteps
         copies = copies if num_envs is None else num_envs
         require_whole("n_timesteps", steps, 1)
         require_whole("num_envs", copies, 1)
         if algorithm in ("ppo", "ppo-lag"):
-            require_whole("n_steps", found["n_steps"], 1)
             found["batch_size"] = whole_batches(
                 found["batch_size"], found["n_steps"] * copies, "batch_size" in given
             )

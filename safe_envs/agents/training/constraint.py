@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from safe_envs.agents.training.lazy_info import of_each
 from safe_envs.agents.training.multiplier import PIDMultiplier, require_at_least_zero
+from safe_envs.envs.info import step_cost
 from safe_envs.errors import ConfigurationError, shown
 
 _COUNTS = ("running", "ended", "cost", "squares", "violated")
@@ -66,6 +67,7 @@ class EpisodeConstraint:
         self.episode_cost: float | None = None
         self.violation_rate: float | None = None
         self.recent: list[list[float]] = []
+        self._steps = StepCosts(num_envs)
         # Of the episodes that go on, and of those that ended since the last measurement.
         self._running, self._ended, self._cost, self._squares, self._violated = (
             np.zeros(num_envs) for _ in _COUNTS
@@ -75,6 +77,17 @@ class EpisodeConstraint:
     def value(self) -> float:
         """The multiplier, from 0."""
         return self.multiplier.value
+
+    def measure(self, infos: Sequence[Any], dones: np.ndarray) -> np.ndarray:
+        """Count a step of every env by its infos, and return its costs; see `StepCosts`.
+
+        Args:
+            infos: of the step just taken.
+            dones: whether the episode ended with it, shape (num_envs,).
+        """
+        costs = self._steps.of(infos, dones)
+        self.observe(costs, dones)
+        return costs
 
     def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
         """Count a step of every env.
@@ -115,6 +128,7 @@ class EpisodeConstraint:
     def begin_episodes(self) -> None:
         """Forget the episodes that go on: the envs were reset."""
         self._running[:] = 0.0
+        self._steps.begin()
 
     def figures(self) -> dict[str, float]:
         """Return what is logged, by name; the measured costs once there are some."""
@@ -156,8 +170,47 @@ class EpisodeConstraint:
         self.multiplier.restore(state["multiplier"])
         self.episode_cost, self.violation_rate = measured
         self.recent = [list(each) for each in state["recent"]]
+        self._steps.begin(math.nan)
         for name in _COUNTS:
             getattr(self, f"_{name}")[:] = state[name]
+
+
+class StepCosts:
+    """The costs of steps, which may be of several control periods: see `step_cost`.
+
+    Args:
+        num_envs: copies of the env.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self._before = np.zeros(num_envs)
+
+    def begin(self, before: float = 0.0) -> None:
+        """Begin episodes in all envs, or go on in their midst.
+
+        Args:
+            before: costs of the episodes so far; NaN if they are not known.
+        """
+        self._before[:] = before
+
+    def of(self, infos: Sequence[Any], dones: np.ndarray) -> np.ndarray:
+        """Return the cost of each env's last step, float64 of shape (num_envs,).
+
+        Args:
+            infos: see `costs_of`.
+            dones: whether the episode ended with it, shape (num_envs,).
+
+        Raises:
+            ConfigurationError: see `costs_of`.
+        """
+        costs = costs_of(infos)
+        violation, total = (of_each(infos, key) for key in ("violation", "episode_cost"))
+        if any(each is None for each in (*violation, *total)):
+            return costs
+        total = np.array(total, dtype=np.float64)
+        costs = step_cost(costs, np.array(violation), total, self._before)
+        self._before = np.where(dones, 0.0, total)
+        return costs
 
 
 def costs_of(infos: Sequence[Any]) -> np.ndarray:

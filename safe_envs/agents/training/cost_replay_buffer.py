@@ -9,6 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from safe_envs.agents.training.constraint import costs_of
+from safe_envs.agents.training.lazy_info import of_envs
 from safe_envs.agents.training.replay_buffer import FilteredReplayBuffer
 from safe_envs.errors import ConfigurationError
 
@@ -43,6 +44,16 @@ class CostReplayBuffer(ReplayBuffer):
         super().__init__(*args, **kwargs)
         self.costs = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
         self._sampled: CostSamples | None = None
+        self._expected: tuple[Any, Any] = (None, None)
+
+    def expect(self, infos: list[dict[str, Any]], costs: np.ndarray) -> None:
+        """Take the costs of a step that somebody has found out, in place of `info["cost"]`.
+
+        Args:
+            infos: that the step will be added with.
+            costs: shape (n_envs,).
+        """
+        self._expected = infos, costs
 
     def last_sample(self) -> CostSamples:
         """Return the steps that `sample` returned last, with their costs.
@@ -76,8 +87,10 @@ class CostReplayBuffer(ReplayBuffer):
         Raises:
             ConfigurationError: an info has no cost.
         """
-        self.costs[self.pos] = costs_of(infos)
-        super().add(obs, next_obs, action, reward, done, infos)
+        each: Any = of_envs(infos, self.n_envs)
+        known, costs = self._expected
+        self.costs[self.pos] = costs if known is each else costs_of(each)
+        super().add(obs, next_obs, action, reward, done, each)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> Any:
         # Stable-Baselines3 draws the env of each row where nobody sees it: draw the same envs here,

@@ -111,6 +111,27 @@ def of_each(infos: Sequence[Any], key: str) -> np.ndarray | list[Any]:
     return batch[key][[info.index for info in infos]]
 
 
+def of_envs(infos: Any, num_envs: int) -> Sequence[Any]:
+    """Return the infos of a step of every env, also those of a vector env of Gymnasium.
+
+    Args:
+        infos: a sequence, which is returned; or a mapping of arrays over the envs with their masks.
+            There the info of an env whose episode ended is in `final_info`.
+        num_envs: number of the envs.
+    """
+    if not isinstance(infos, Mapping):
+        return infos
+    rows: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+    # Of an ended episode the last step counts, and not the reset after it.
+    for part in (infos, infos.get("final_info") or {}):
+        for key, values in part.items():
+            if not isinstance(values, np.ndarray) or len(values) != num_envs or key[0] == "_":
+                continue
+            for i in np.flatnonzero(part.get(f"_{key}", np.ones(num_envs, dtype=bool))).tolist():
+                rows[i][key] = values[i]
+    return rows
+
+
 def _same(a: Any, b: Any) -> bool:
     return (
         np.array_equal(a, b)

@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 
-from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of, require_one_part
+from safe_envs.agents.training.constraint import EpisodeConstraint, require_one_part
 from safe_envs.agents.training.cost_critic import CostCritic
 from safe_envs.agents.training.multiplier import require_share
 
@@ -33,7 +33,8 @@ class PPOLagrangian(PPO):
     deviations of the advantages A_r of rewards and A_c of costs in the rollout: so the same gains
     serve rewards and costs of any unit. With l = 0 it is PPO, bit for bit.
 
-    The costs are `info["cost"]`, of any env; a `SafeVecEnv` gives those of a step at once. Like the
+    The costs are `info["cost"]`, of any env; a `SafeVecEnv` gives those of a step at once. Behind a
+    wrapper that repeats actions they are those of all repetitions, see `StepCosts`. Like the
     rewards, the costs of an episode that only time ended are continued by the critic's value. The
     constraint is on the undiscounted cost of whole episodes, see `EpisodeConstraint`; its discount
     is for the advantages alone.
@@ -129,8 +130,7 @@ class PPOLagrangian(PPO):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         """Take the costs of a step, for whose place Stable-Baselines3 has no other method."""
         super()._update_info_buffer(infos, dones)
-        costs = costs_of(infos)
-        self.constraint.observe(costs, dones)
+        costs = self.constraint.measure(infos, dones)
         cut = [
             i
             for i in np.flatnonzero(dones)

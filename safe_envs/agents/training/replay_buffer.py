@@ -40,17 +40,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
+from safe_envs.agents.training.executed_actions import bounds_of, executed_actions
 from safe_envs.agents.training.hyperparameters import ACTIONS
-from safe_envs.agents.training.lazy_info import of_each
+from safe_envs.agents.training.lazy_info import of_each, of_envs
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.env_wrappers.filtered_box import ends_of
-
-_ROUNDING = 1e-6
-"""How far beyond [-1, 1] rounding may move an action on the input bounds."""
 
 
 class FilteredReplayBuffer(ReplayBuffer):
@@ -60,17 +58,20 @@ class FilteredReplayBuffer(ReplayBuffer):
     the outermost wrapper that changes actions. Without this class SAC, TD3 and DDPG store what they
     proposed.
 
-    It takes `info["safe_action"]`, which is physical, to [-1, 1] in double precision. An env that
-    reports none has no filter: its proposal is stored, as Stable-Baselines3 does. With "both" each
-    step fills two rows, so that the buffer holds half as many steps; also where the two actions are
-    equal, as one row holds a step of all envs: so each step has the same weight for any number of
-    envs. A row of the executed action has the env's own reward, to which
-    `info["intervention_penalty"]`, if there is one, is added back.
+    It takes `info["safe_action"]`, which is physical, to [-1, 1] in double precision, between the
+    inputs that `info["input_bounds"]` has at the ends of the action space: so the env of a learner
+    may be exchanged. An env that reports no safe action has no filter: its proposal is stored, as
+    Stable-Baselines3 does. With "both" each step fills two rows, so that the buffer holds half as
+    many steps; also where the two actions are equal, as one row holds a step of all envs: so each
+    step has the same weight for any number of envs. A row of the executed action has the env's own
+    reward, to which `info["intervention_penalty"]`, if there is one, is added back.
+
+    For observations with keys, as of `MultiInputPolicy`, it makes a `FilteredDictReplayBuffer`.
 
     Args:
         args: those of `ReplayBuffer`.
-        box: physical (low, high) of each input; None for that of the action space, which that of a
-            filtered env has.
+        box: physical (low, high) of each input at the ends of the action space, where the infos and
+            the action space do not know them, as behind a wrapper that halves the actions.
         action: "executed", "proposed" or "both".
         kwargs: those of `ReplayBuffer`.
 
@@ -78,6 +79,22 @@ class FilteredReplayBuffer(ReplayBuffer):
         ConfigurationError: an argument is not allowed, or "both" is combined with
             `optimize_memory_usage`.
     """
+
+    _bounds: np.ndarray | None = None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        """Make a buffer for the kind of the observations."""
+        space = args[1] if len(args) > 1 else kwargs.get("observation_space")
+        if not isinstance(space, gym.spaces.Dict) or issubclass(cls, DictReplayBuffer):
+            return super().__new__(cls)
+        if cls is not FilteredReplayBuffer:
+            raise ConfigurationError(
+                f"{cls.__name__} stores observations of one array, and these have keys; derive a"
+                " buffer for them from FilteredDictReplayBuffer, or flatten them by"
+                " gymnasium.wrappers.FlattenObservation"
+            )
+        kind: Any = FilteredDictReplayBuffer
+        return super().__new__(kind)
 
     def __init__(
         self,
@@ -98,77 +115,46 @@ class FilteredReplayBuffer(ReplayBuffer):
         self.action = action
         ends = ends_of(self.action_space)
         if box is not None:
-            self._center, self._half = _center_and_half_width(box, self.action_dim)
-        elif ends is not None:
-            at_low, at_high = ends
-            self._center, self._half = 0.5 * (at_low + at_high), 0.5 * (at_high - at_low)
-        else:  # there may be no filter, and nothing to scale
-            self._center = self._half = None
+            self._bounds = bounds_of(box, self.action_dim)
+        elif ends is not None:  # else there may be no filter, and nothing to scale
+            self._bounds = np.stack(ends, axis=-1)
 
     def add(
         self,
-        obs: np.ndarray,
-        next_obs: np.ndarray,
+        obs: Any,
+        next_obs: Any,
         action: np.ndarray,
         reward: np.ndarray,
         done: np.ndarray,
-        infos: list[dict[str, Any]],
+        infos: Any,
     ) -> None:
         """Store one step of every env.
 
         Args:
-            obs: shape (n_envs, features).
-            next_obs: shape (n_envs, features), the terminal one where an episode ended.
+            obs: shape (n_envs, features), or a mapping of such arrays.
+            next_obs: likewise, the terminal one where an episode ended.
             action: proposals in [-1, 1], shape (n_envs, m).
             reward: less the penalty on interventions, if there is one, shape (n_envs,).
-            done: whether the episode ended, shape (n_envs,).
-            infos: of the step just taken, not of the reset after it.
+            done: whether the episode ended, shape (n_envs,). With the infos of a vector env, which
+                do not say where only time ended it, whether it was terminated.
+            infos: of the step just taken, not of the reset after it: one for each env, or those of
+                a vector env of Gymnasium.
 
         Raises:
             ConfigurationError: an executed action is out of the input bounds, or these are unknown.
         """
+        each: Any = of_envs(infos, self.n_envs)
         if self.action != "proposed":
-            super().add(
-                obs,
-                next_obs,
-                self._executed(action, infos),
-                _own_reward(reward, infos),
-                done,
-                infos,
-            )
+            proposed = action.reshape(self.n_envs, self.action_dim)
+            executed = executed_actions(proposed, each, self._bounds)
+            own = _own_reward(reward, each)
+            super().add(obs, next_obs, executed, own, done, each)
         if self.action != "executed":
-            super().add(obs, next_obs, action, reward, done, infos)
+            super().add(obs, next_obs, action, reward, done, each)
 
-    def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
-        """Return executed actions in [-1, 1], or proposals without a filter, shape (n_envs, m)."""
-        each = of_each(infos, "safe_action")
-        if isinstance(each, np.ndarray):
-            return self._normalized(each)
-        filtered = [i for i, u in enumerate(each) if u is not None]
-        if not filtered:
-            return proposed
-        actions = proposed.reshape(self.n_envs, self.action_dim).astype(np.float64)
-        actions[filtered] = self._normalized(np.array([each[i] for i in filtered]))
-        return actions
 
-    def _normalized(self, physical: np.ndarray) -> np.ndarray:
-        if self._center is None or self._half is None:
-            raise ConfigurationError(
-                "the env is filtered, and a wrapper around the filter changes the actions, or the"
-                " map of the actions is no straight line, so that the executed ones are unknown in"
-                " units of the action space; put the filter around that wrapper, or give"
-                " replay_buffer_kwargs={'box': [(low, high), ...]}: the inputs at its ends"
-            )
-        actions = (physical - self._center) / self._half
-        clipped = np.clip(actions, -1.0, 1.0)
-        if not (np.abs(actions - clipped) <= _ROUNDING).all():
-            low, high = np.sort([self._center - self._half, self._center + self._half], axis=0)
-            raise ConfigurationError(
-                f"the executed actions {physical.tolist()} are not between {low.tolist()} and"
-                f" {high.tolist()}; give the input bounds of the env's problem, as"
-                " replay_options(env) does"
-            )
-        return clipped
+class FilteredDictReplayBuffer(FilteredReplayBuffer, DictReplayBuffer):
+    """A `FilteredReplayBuffer` for observations with keys."""
 
 
 class FilteredNStepReplayBuffer(FilteredReplayBuffer, NStepReplayBuffer):
@@ -230,26 +216,6 @@ def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
     if isinstance(penalties, list):
         penalties = np.array([penalty or 0.0 for penalty in penalties])
     return reward + penalties
-
-
-def _center_and_half_width(
-    box: Sequence[Sequence[float]], inputs: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Physical input = center + half width * action; both of shape (m,)."""
-    try:
-        pairs = np.array(box, dtype=np.float64)
-    except (TypeError, ValueError):
-        pairs = np.empty(0)
-    if (
-        pairs.shape != (inputs, 2)
-        or not np.all(np.isfinite(pairs))
-        or np.any(pairs[:, 0] >= pairs[:, 1])
-    ):
-        raise ConfigurationError(
-            f"box = {box!r}; give a finite (low, high) with low < high for each of the {inputs}"
-            " inputs"
-        )
-    return 0.5 * (pairs[:, 0] + pairs[:, 1]), 0.5 * (pairs[:, 1] - pairs[:, 0])
 
 
 def _box_of(source: Any) -> tuple[tuple[float, float], ...]:

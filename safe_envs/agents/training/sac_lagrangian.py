@@ -37,7 +37,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.utils import polyak_update
 from torch.nn import functional
 
-from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of, require_one_part
+from safe_envs.agents.training.constraint import EpisodeConstraint, require_one_part
 from safe_envs.agents.training.cost_replay_buffer import with_costs
 from safe_envs.agents.training.multiplier import require_at_least_zero, require_share
 from safe_envs.errors import ConfigurationError
@@ -169,7 +169,8 @@ class SACLagrangian(SAC):
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
         """Take the costs of a step, for whose place Stable-Baselines3 has no other method."""
         super()._update_info_buffer(infos, dones)
-        self.constraint.observe(costs_of(infos), dones)
+        buffer: Any = self.replay_buffer
+        buffer.expect(infos, self.constraint.measure(infos, dones))
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Update the multiplier, and then everything else at each gradient step.

@@ -13,7 +13,7 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum, json_checksum
 from safe_envs.agents.jobs.store import ResultStore
-from safe_envs.agents.policies.names import policy_file
+from safe_envs.agents.policies.names import policy_files
 from safe_envs.agents.training.config import Training
 from safe_envs.errors import NumericalError, SafeEnvsError
 from safe_envs.wrappers.conditions.text_parts import files_of
@@ -264,6 +264,5 @@ def _told(training: Training) -> dict[str, Any]:
 
 def _checksums(text: str, policy: str | None = None) -> dict[str, dict[str, str]]:
     """Return the checksums of the files of a filter and a policy, as "files"; {} without files."""
-    of_policy = None if policy is None else policy_file(policy)
-    files = [*files_of(text), *([] if of_policy is None else [of_policy])]
+    files = [*files_of(text), *([] if policy is None else policy_files(policy))]
     return {"files": {str(each): file_checksum(each) for each in files}} if files else {}

@@ -236,16 +236,9 @@ class TrainingSession:
                 log_interval=4 if training.algorithm in OFF_POLICY else 1,
                 reset_num_timesteps=False,
             )
-        except (
-            ArithmeticError,
-            AssertionError,
-            LookupError,
-            RuntimeError,
-            TypeError,
-            ValueError,
-        ) as error:
-            if isinstance(error, SafeEnvsError):
-                raise
+        except SafeEnvsError:
+            raise
+        except Exception as error:  # What a hyperparameter may raise has no limits.
             raise ConfigurationError(
                 f"the training failed after {model.num_timesteps} steps ({type(error).__name__}:"
                 f" {str(error)[:MOST_SHOWN]}): it diverged, or a hyperparameter is not allowed;"

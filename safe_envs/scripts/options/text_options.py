@@ -129,15 +129,14 @@ def inputs_of(
     Returns:
         Pairs of option and file.
     """
-    from safe_envs.agents.policies.names import policy_file
+    from safe_envs.agents.policies.names import policy_files
 
     for option, place in (("--system", system), ("--filter-spec", filter_spec)):
         source = (place or "").rpartition(":")[0]
         # Anything else is the name of a module.
         if source.endswith(".py"):
             yield option, Path(source)
-    file = policy_file(policy)
-    if file is not None:
+    for file in policy_files(policy):
         yield "--policy", file
     for path in learned:
         yield "--learned", path

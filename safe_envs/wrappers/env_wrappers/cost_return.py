@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.envs.registration import VectorizeMode
 from gymnasium.vector import AutoresetMode
 
+from safe_envs.envs.info import step_cost
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.registry import env_class, full_id
@@ -44,6 +45,7 @@ class CostReturnWrapper(IndependentCopies):
         self.env = env
         self._mode = autoreset_mode(env) if isinstance(env, gym.vector.VectorEnv) else None
         self._ended = np.zeros(getattr(env, "num_envs", ()), dtype=bool)
+        self._before = np.zeros(self._ended.shape)
 
     def __getattr__(self, name: str) -> Any:
         # What is private is not forwarded; and a copy that is being made has no env to ask yet.
@@ -55,16 +57,19 @@ class CostReturnWrapper(IndependentCopies):
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode; see `gymnasium.Env.reset`."""
-        restarted = (options or {}).get("reset_mask", True)
-        self._ended = self._ended & ~np.asarray(restarted, dtype=bool)
-        return self.env.reset(seed=seed, options=options)
+        restarted = np.asarray((options or {}).get("reset_mask", True), dtype=bool)
+        self._ended = self._ended & ~restarted
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._before = np.where(restarted, info.get("episode_cost", 0.0), self._before)
+        return observation, info
 
     def step(self, action: Any) -> SixTuple:
         """Hold an action for one control period.
 
         Returns:
-            The observation, the reward, the cost of the state that was reached, whether the episode
-            was terminated or truncated, and the env's info with that cost once more as `cost_sum`.
+            The observation, the reward, the cost of the state that was reached, or of all states
+            where a wrapper repeats actions, whether the episode was terminated or truncated, and
+            the env's info with that cost once more as `cost_sum`.
             Over a vector env the first five are arrays (num_envs, ...): a step that ends an episode
             in same-step autoreset has the cost of its last state, and one that only starts an
             episode, in next-step autoreset, costs nothing.
@@ -78,20 +83,29 @@ class CostReturnWrapper(IndependentCopies):
                 f"info of {self.env} has no 'cost', but {', '.join(info) or 'nothing'}; use an env"
                 " of this project"
             )
-        cost, masks = info["cost"], {}
-        if self._mode is not None:
-            cost, masks = self._costs(info), {"_cost_sum": info["_cost"]}
-            self._ended = terminated | truncated
+        cost, masks = self._costs(info), {}
+        self._before = np.array(info.get("episode_cost", 0.0), dtype=np.float64)
+        if self._mode is None:
+            cost = float(cost)
+        else:
+            self._ended, masks = terminated | truncated, {"_cost_sum": info["_cost"]}
         info = {**info, "cost_sum": cost, **masks}
         return observation, reward, cost, terminated, truncated, info
 
     def _costs(self, info: dict[str, Any]) -> np.ndarray:
-        """Return the cost of each env, shape (num_envs,), where the info may be that of a reset."""
-        cost = info["cost"]
+        """Return the cost of each env, where the info may be that of a reset."""
+        cost = self._since(info)
         if self._mode == AutoresetMode.SAME_STEP and "final_info" in info:
             last = info["final_info"]
-            return np.where(last["_cost"], last["cost"], cost)
+            return np.where(last["_cost"], self._since(last), cost)
         return np.where(self._ended, 0.0, cost) if self._mode == AutoresetMode.NEXT_STEP else cost
+
+    def _since(self, info: dict[str, Any]) -> Any:
+        """Return the cost since the last step."""
+        cost = info["cost"]
+        if "violation" not in info or "episode_cost" not in info:
+            return np.asarray(cost)
+        return step_cost(cost, info["violation"], info["episode_cost"], self._before)
 
 
 def make_with_cost(

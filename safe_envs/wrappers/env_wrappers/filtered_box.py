@@ -36,13 +36,30 @@ def filtered_box(space: Any, inner: Any) -> Any:
             " Box; put wrappers that change actions around the filter"
         )
     if not isinstance(inner, MonitorLayer):
-        return _with_ends(space, *np.array(inner.problem.box).T)
-    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    part = np.linspace(0.0, 1.0, _POINTS)[:, None]
-    inputs = inner.inputs_of((1.0 - part) * low + part * high)
+        return _with_ends(space, *input_bounds(space, inner).T)
+    part, inputs = _line(space, inner, _POINTS)
     off = np.abs(inputs - ((1.0 - part) * inputs[0] + part * inputs[-1]))
     straight = (off <= 1e-9 * np.abs(inputs[-1] - inputs[0])).all()
     return _with_ends(space, inputs[0], inputs[-1]) if straight else space
+
+
+def input_bounds(space: Any, inner: Any) -> np.ndarray:
+    """Return the physical inputs at the ends of an action space, shape (m, 2).
+
+    Args:
+        space: see `filtered_box`.
+        inner: see `filtered_box`.
+    """
+    if isinstance(inner, MonitorLayer):
+        return _line(space, inner, 2)[1].T.copy()
+    return np.array(inner.problem.box, dtype=np.float64)
+
+
+def _line(space: Any, inner: MonitorLayer, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return parts (points, 1) of the way between the ends of a space, and the inputs there."""
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    part = np.linspace(0.0, 1.0, points)[:, None]
+    return part, inner.inputs_of((1.0 - part) * low + part * high)
 
 
 def ends_of(space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray] | None:

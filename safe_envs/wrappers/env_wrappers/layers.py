@@ -20,6 +20,7 @@ from safe_envs.wrappers.env_wrappers.belief_values import belief_values_of
 from safe_envs.wrappers.env_wrappers.episode_filter import FilterChoice, episode_filter
 from safe_envs.wrappers.env_wrappers.estimator_layer import EstimatorLayer, require_truth_below
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
+from safe_envs.wrappers.env_wrappers.filtered_box import input_bounds
 from safe_envs.wrappers.value.promise_memory import PromiseMemory
 
 
@@ -78,6 +79,23 @@ class FilterLayer(IndependentCopies):
         # Inputs that pass through an env's numbers are rounded, by float32 at worst.
         self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
         return text
+
+    def know_bounds(
+        self, space: gym.Space[Any], objective: str, batch: tuple[int, ...] = ()
+    ) -> None:
+        """Have the inputs at the ends of the action space in each info.
+
+        Args:
+            space: action space of one env.
+            objective: of the filter; one with a goal of its own does not see what is proposed.
+            batch: number of envs (B,), for a batch.
+        """
+        ends = input_bounds(space, self._inner)
+        self._bounds = np.tile(ends, (*batch, 1, 1)) if objective == "nearest" else None
+
+    def bounds_info(self) -> Info:
+        """Return a new entry for an info: the inputs at the ends of the action space."""
+        return {} if self._bounds is None else {"input_bounds": self._bounds.copy()}
 
     def observation_box(self, space: gym.Space[Any]) -> gym.Space[Any]:
         """Return the space of one env's observations, given that of the env below.

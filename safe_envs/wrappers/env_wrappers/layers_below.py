@@ -26,6 +26,9 @@ _REPEAT = tuple(
     for name in ("MaxAndSkipObservation", "RepeatAction", "AtariPreprocessing")
     if hasattr(wrappers, name)
 )
+CHANGING = (*_SEE, *_ACT, *_REPEAT)
+"""Wrappers that change what is seen of an env, or done in it."""
+
 _PASS_ON = frozenset(
     f"{layer.step.__module__}.{layer.step.__qualname__}"
     for layer in (
@@ -40,6 +43,12 @@ _PASS_ON = frozenset(
     )
 ) | {"stable_baselines3.common.monitor.Monitor.step"}
 """Steps that pass on actions and observations as they are."""
+
+
+def passes_on(layer: Any) -> bool:
+    """Return whether a wrapper is known to pass on actions and observations as they are."""
+    step = type(layer).step
+    return f"{step.__module__}.{step.__qualname__}" in _PASS_ON
 
 
 def doubt_layers(env: Any) -> None:
@@ -96,7 +105,6 @@ def _doubt(layer: Any) -> str | None:
             unless.append(condition)
     if does:
         return f"{' and '.join(does)}: unless {' and '.join(unless)}"
-    step = type(layer).step
-    if f"{step.__module__}.{step.__qualname__}" in _PASS_ON:
+    if passes_on(layer):
         return None
     return "has a step of its own: if that repeats or changes actions, or changes observations"

@@ -97,6 +97,7 @@ class SafetyFilterWrapper(
         )
         gym.Wrapper.__init__(self, env)
         self.action_space = filtered_box(env.action_space, inner)
+        self.know_bounds(env.action_space, objective)
         if observe_promise:
             self.observation_space = self.observation_box(env.observation_space)
         self._directly = only_checks_between(env, inner)
@@ -156,6 +157,7 @@ class SafetyFilterWrapper(
 
     def _reported(self) -> Info:
         found: Info = {key: value.item() for key, value in self._filter.report().items()}
+        found |= self.bounds_info()
         if self._beliefs is not None:
             tracker = self._inner.tracker
             found["belief_barrier"] = self._beliefs.barriers(tracker.mean, tracker.covariance)[0]

@@ -71,6 +71,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         self.watch_states(inner.episodes)
         gym.vector.VectorWrapper.__init__(self, env)
         self.single_action_space = filtered_box(env.single_action_space, inner)
+        self.know_bounds(env.single_action_space, objective, (self.num_envs,))
         if observe_promise:
             self.single_observation_space = self.observation_box(env.single_observation_space)
             self.observation_space = batch_space(self.single_observation_space, env.num_envs)
@@ -87,7 +88,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         See `SafeVectorEnv.reset` and `SafetyFilterWrapper.reset`.
         """
         if self._stepper is not None:
-            return self._inner.reset_filtered(self._stepper, seed, options)
+            observation, info = self._inner.reset_filtered(self._stepper, seed, options)
+            return observation, self._with_bounds(info)
         self.require_whole_episodes(options)
         self.follow()
         observation, info = self.env.reset(seed=seed, options=options)
@@ -119,7 +121,11 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
         if self._stepper is not None:
-            return self._inner.step_filtered(self._stepper, actions)
+            found = self._inner.step_filtered(self._stepper, actions)
+            info = self._with_bounds(found[-1])
+            if "final_info" in info:
+                self._with_bounds(info["final_info"])
+            return found
         proposed = self._inner.physical_action(actions)
         self.follow()
         decision = self._filter.decide_arrays(tuple(self.known(proposed)), proposed)
@@ -165,7 +171,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
     def _reported(self, reached: bool = False) -> Info:
         """Return what the filter reports, of ended episodes too if they were just reached."""
-        found = self._filter.report()
+        found = {**self._filter.report(), **self.bounds_info()}
         if self._beliefs is not None:
             inner = self._inner
             x, p = inner.components, inner.tracker.covariance
@@ -173,6 +179,12 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
                 x, p = self._reached(), self._with_last(p, inner.last_covariance)
             found = {**found, "belief_barrier": self._beliefs.barriers(x, p)}
         return found
+
+    def _with_bounds(self, info: Info) -> Info:
+        """Add what is always the same to an info of the compiled function."""
+        if self._bounds is not None:
+            info["input_bounds"], info["_input_bounds"] = self._bounds.copy(), info["_cost"]
+        return info
 
     def _observe_last(self, info: Info, ended: np.ndarray) -> None:
         """Append p_k to the last observations of episodes, which their envs have not seen."""

@@ -25,11 +25,30 @@ class Gain:
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         return np.tanh(-observation[:, :self.m].astype(np.float64)), state
 
+class Plain:
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.tanh(-observation[:, :1].astype(np.float64)), state
+
+class Weighted(Plain):
+    def __init__(self, gain=1.0, **settings):
+        self.gain = float(gain)
+
+class Named(Plain):
+    def __init__(self, gain=1.0, *, problem):
+        assert problem.name == "Scalar" and gain == 1.0
+
+class Called:
+    def __call__(self, observation):
+        return np.tanh(-observation[:, :1])
+
 def function(observation):
     return np.tanh(-observation[:, :1])
 
 def factory(problem):
     return Gain(problem)
+
+def maker():
+    return Plain()
 
 number = 3
 
@@ -66,7 +85,8 @@ def rows(policy, **changes):
 def test_a_policy_may_be_a_function_a_class_or_an_object(file):
     wanted = rows(function)
     assert wanted != rows("zero")
-    places = [f"mine.py:{name}" for name in ("Gain", "function", "factory")]
+    names = ("Gain", "Plain", "Weighted", "Named", "Called", "function", "factory", "maker")
+    places = [f"mine.py:{name}" for name in names]
     for policy in (lambda x: np.tanh(-x[:, 0]), *places, make_policy(places[0], problem())):
         assert rows(policy) == wanted
     assert rows(ZeroController) == rows("zero")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -150,7 +149,7 @@ def test_evaluation_is_the_same_for_every_num_envs(trained, name):
 def test_an_episode_keeps_its_row_of_a_network_call(trained):
     # Rounding may depend on the size of a batch and on the row: here both do so coarsely.
     class Coarse:
-        def predict(self, rows, deterministic):
+        def predict(self, rows, state, start, deterministic):
             sizes.add(len(rows))
             return (
                 np.linspace(-1.0, 1.0, len(rows), dtype=np.float32)[:, None] + 0.0 * rows[:, :1],
@@ -159,7 +158,7 @@ def test_an_episode_keeps_its_row_of_a_network_call(trained):
 
     sizes = set()
     policy = make_policy(trained["ppo"][1], make_problem(ENV_ID), trust=True)
-    policy._network = Coarse()
+    policy._model = Coarse()
     rows = [
         evaluate(
             ENV_ID,
@@ -293,31 +292,3 @@ def test_policies_for_other_actions_are_errors(tmp_path, space):
     _, path = saved(tmp_path, PPO, env)
     with pytest.raises(ConfigurationError, match="another action space"):
         make_policy(path, make_problem(ENV_ID), trust=True)
-
-
-@pytest.mark.parametrize(
-    "name", ["normalization.pkl", "vecnormalize.pkl", "StochasticDubins-v0/vecnormalize.pkl"]
-)
-def test_policies_of_normalised_observations_are_refused(trained, tmp_path, name):
-    path = tmp_path / "best_model.zip"
-    shutil.copyfile(trained["ppo"][1], path)
-    beside = tmp_path / name
-    beside.parent.mkdir(exist_ok=True)
-    beside.write_bytes(b"not to be read")
-    for trust in (False, True):
-        with pytest.raises(
-            ConfigurationError,
-            match=r"trained on normalised observations.*save_policy\(model, folder, problem, norm",
-        ) as error:
-            make_policy(str(path), make_problem(ENV_ID), trust=trust)
-        assert str(beside) in str(error.value)
-    beside.unlink()
-    make_policy(str(path), make_problem(ENV_ID), trust=True)
-
-
-def test_the_normalisation_of_another_training_is_no_matter(trained, tmp_path):
-    shutil.copyfile(trained["ppo"][1], tmp_path / "model.zip")
-    for name in ("run1/normalization.pkl", "logs/ppo/vecnormalize.pkl"):
-        (tmp_path / name).parent.mkdir(parents=True)
-        (tmp_path / name).touch()
-    make_policy(str(tmp_path / "model.zip"), make_problem(ENV_ID), trust=True)

@@ -130,6 +130,31 @@ def test_costs_are_those_of_any_infos():
         np.testing.assert_array_equal(costs_of(infos), [0.0, 1.0, 1.0])
 
 
+def test_the_costs_of_a_step_are_those_of_all_its_control_periods():
+    """As where actions are repeated: the info is that of the last period."""
+
+    def info(cost, total):
+        return {"cost": cost, "violation": cost == 1.0, "episode_cost": total}
+
+    one, costs = constraint(num_envs=2), []
+    for infos, dones in (
+        ([info(0.0, 2.0), info(0.0, 0.0)], [False, False]),
+        ([info(1.0, 5.0), info(1.0, 1.0)], [True, False]),
+        ([info(0.0, 3.0), {**info(0.0, 4.0), "cost": 0.5}], [False, False]),
+        ([info(0.0, 3.0), info(1.0, 7.0)], [False, False]),
+    ):
+        costs.append(one.measure(infos, np.array(dones)).tolist())
+    # Another one's cost counts as it is.
+    assert costs == [[2.0, 0.0], [3.0, 1.0], [3.0, 0.5], [0.0, 3.0]]
+    again = constraint(num_envs=2)
+    again.restore(one.state())
+    infos = [info(1.0, 9.0), info(0.0, 8.0)]
+    # In the midst of episodes, whose costs so far are not known.
+    assert again.measure(infos, np.array([False, False])).tolist() == [1.0, 0.0]
+    one.begin_episodes()
+    assert one.measure(infos, np.array([False, False])).tolist() == [9.0, 8.0]
+
+
 @pytest.mark.parametrize(
     ("infos", "message"),
     [

@@ -70,7 +70,7 @@ def test_every_way_to_read_an_info_gives_all_of_it(reading):
         "terminal_observation": dict.get(info, "terminal_observation"),
     }
     read = reading(info)
-    assert len(read) == len(wanted) == 17
+    assert len(read) == len(wanted) == 18
     for key, value in wanted.items():
         # The text of an array has eight digits.
         np.testing.assert_allclose(read[key], value, rtol=1e-7, err_msg=key)

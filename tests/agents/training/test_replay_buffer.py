@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode
 from stable_baselines3 import DDPG, PPO, SAC, TD3
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
@@ -18,7 +19,9 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.training.cost_replay_buffer import FilteredCostReplayBuffer
 from safe_envs.agents.training.replay_buffer import (
+    FilteredDictReplayBuffer,
     FilteredNStepReplayBuffer,
     FilteredReplayBuffer,
     replay_options,
@@ -438,17 +441,145 @@ def test_the_class_alone_learns_as_with_the_options():
     assert_same_learning(free, plain)
 
 
-def test_a_wrapper_that_hides_the_box_is_told():
-    def hidden():
+class Halved(gym.ActionWrapper):
+    def action(self, action):
+        return action / 2
+
+
+def test_wrappers_around_the_filter_that_change_actions():
+    def hidden(around):
         env = SafetyFilterWrapper(gym.make(ENV_ID, horizon=0.5, box=BOX), "scbf")
+        return Monitor(around(env))
+
+    def rescaled(env):
         return gym.wrappers.RescaleAction(env, np.float32(-2.0), np.float32(2.0))
 
-    with pytest.raises(ConfigurationError, match="wrapper around the filter"):
-        learned(SAC, hidden(), replay_buffer_class=FilteredReplayBuffer)
-    model, _ = learned(
-        SAC,
-        hidden(),
-        replay_buffer_class=FilteredReplayBuffer,
-        replay_buffer_kwargs={"box": [BOX]},
+    one = {"replay_buffer_class": FilteredReplayBuffer}
+    # From end to end it is the same action in [-1, 1].
+    model, witness = learned(SAC, hidden(rescaled), **one)
+    np.testing.assert_allclose(stored(model), witness.actions()[1], rtol=0, atol=1e-6)
+    for around in (Halved, lambda env: Halved(rescaled(env))):
+        with pytest.raises(ConfigurationError, match="wrapper around the filter"):
+            learned(SAC, hidden(around), **one)
+    wide = {"replay_buffer_kwargs": {"box": [(1.0 - 2.0, 1.0 + 2.0)]}}
+    model = SAC("MlpPolicy", hidden(Halved), **one, **wide, buffer_size=9, device="cpu")
+    model.env.envs[0].unwrapped.reset(seed=0)
+    executed = {"safe_action": np.array([0.0]), "nominal_action": np.array([2.0])}
+    executed["input_bounds"] = np.array([BOX])
+    row = (
+        np.zeros((1, 4)),
+        np.zeros((1, 4)),
+        np.array([[0.5]]),
+        np.zeros(1),
+        np.zeros(1),
+        [executed],
     )
-    assert model.replay_buffer.size() == 120
+    model.replay_buffer.add(*row)
+    assert stored(model).tolist() == [[[-0.5]]]
+
+
+def other_bounds(filtered=True):
+    return make(filtered=filtered, box=(-2.0, 2.0))
+
+
+def in_units(witness, center=0.0, half=2.0):
+    """Executed inputs in [-1, 1] of `other_bounds`, as the infos have them."""
+    return (np.array(witness.inputs) - center) / half
+
+
+class Inputs(BaseCallback):
+    """Keeps the inputs that infos report."""
+
+    def __init__(self):
+        super().__init__()
+        self.inputs = []
+
+    def _on_step(self):
+        self.inputs.append([info["safe_action"] for info in self.locals["infos"]])
+        return True
+
+
+@pytest.mark.parametrize("options", [True, False], ids=["options", "class alone"])
+@pytest.mark.parametrize("saved_filtered", [True, False])
+def test_the_env_of_a_learner_may_be_exchanged(tmp_path, options, saved_filtered):
+    env = make(filtered=saved_filtered)
+    arguments = replay_options(env) if options else {"replay_buffer_class": FilteredReplayBuffer}
+    model, _ = learned(SAC, env, **arguments)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+
+    def goes_on(learner):
+        before = learner.replay_buffer.size()
+        learner.learn(40, callback=(inputs := Inputs()), reset_num_timesteps=False)
+        rows, wanted = stored(learner)[before:], in_units(inputs)
+        assert np.abs(wanted).max() > 0.2
+        np.testing.assert_allclose(rows, wanted, rtol=0, atol=1e-6)
+
+    goes_on(SAC.load(tmp_path / "model.zip", env=other_bounds(), device="cpu"))
+    again = SAC.load(tmp_path / "model.zip", env=other_bounds(), device="cpu")
+    again.load_replay_buffer(tmp_path / "buffer.pkl")
+    goes_on(again)
+    model.set_env(other_bounds())
+    goes_on(model)
+
+
+class Keyed(gym.ObservationWrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = gym.spaces.Dict({"all": env.observation_space})
+
+    def observation(self, observation):
+        return {"all": observation}
+
+
+@pytest.mark.parametrize("action", ["executed", "both"])
+def test_observations_with_keys(tmp_path, action):
+    env = Keyed(make())
+    arguments = replay_options(env.unwrapped, action)
+    plain, _ = learned(SAC, make(), **arguments)
+    model = SAC("MultiInputPolicy", env, **SETTINGS, policy_kwargs={"net_arch": [8]}, **arguments)
+    model.learn(120)
+    assert type(model.replay_buffer) is FilteredDictReplayBuffer
+    assert stored(model).tobytes() == stored(plain).tobytes()
+    rows = model.replay_buffer.observations["all"]
+    assert rows.tobytes() == plain.replay_buffer.observations.tobytes()
+    again = pickle.loads(pickle.dumps(model.replay_buffer))
+    assert again.actions.tobytes() == model.replay_buffer.actions.tobytes()
+    with pytest.raises(ConfigurationError, match="derive a buffer for them from FilteredDict"):
+        SAC("MultiInputPolicy", env, **SETTINGS, **replay_options(env.unwrapped, n_steps=3))
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("kind", ["vector_entry_point", "sync"])
+def test_infos_of_vector_envs_of_gymnasium(kind, mode):
+    """As loops of one's own add them, without Stable-Baselines3's envs."""
+    settings = {"horizon": 0.25, "box": BOX}
+    if kind == "sync":
+        settings |= {
+            "wrappers": [lambda env: SafetyFilterWrapper(env, "scbf")],
+            "vector_kwargs": {"autoreset_mode": AutoresetMode(mode)},
+        }
+        envs = gym.make_vec(ENV_ID, 3, "sync", **settings)
+    else:
+        envs = gym.make_vec(ENV_ID, 3, kind, autoreset_mode=mode, **settings)
+        envs = SafetyFilterVectorWrapper(envs, "scbf")
+    spaces = envs.single_observation_space, envs.single_action_space
+    buffer = FilteredCostReplayBuffer(90, *spaces, device="cpu", n_envs=3)
+    observation, _ = envs.reset(seed=0)
+    envs.action_space.seed(0)
+    ends, intervened = 0, False
+    for k in range(20):
+        proposed = envs.action_space.sample()
+        after, reward, terminated, truncated, infos = envs.step(proposed)
+        done = terminated | truncated
+        buffer.add(observation, after, proposed, reward, terminated, infos)
+        last = infos["final_info"] if mode == "SameStep" and done.any() else infos
+        for i in range(3):
+            info = last if done[i] else infos
+            wanted = (info["safe_action"][i] - 1.0) / 4.0
+            np.testing.assert_allclose(buffer.actions[k, i], wanted, rtol=0, atol=1e-6)
+            assert buffer.costs[k, i] == info["cost"][i]
+            intervened |= np.abs(wanted - proposed[i]).max() > 0.1
+        ends, observation = ends + done.sum(), after
+    assert ends >= 3
+    assert intervened

@@ -24,6 +24,7 @@ KEYS = (
     "active_barrier",
     "episode_interventions",
     "episode_infeasible",
+    "input_bounds",
 )
 
 

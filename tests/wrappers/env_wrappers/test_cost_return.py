@@ -63,6 +63,60 @@ def test_scalar_step_has_six_values():
     assert costs == six[5]["episode_cost"] > 0.0
 
 
+class Repeated(gym.Wrapper):
+    """Holds each action for three control periods."""
+
+    def step(self, action):
+        for _ in range(3):
+            found = self.env.step(action)
+            if found[2] or found[3]:
+                break
+        return found
+
+
+@pytest.mark.parametrize("mode", [None, "NextStep", "SameStep"])
+def test_the_costs_of_repeated_actions_add_up(mode):
+    settings = {"max_episode_steps": 20, "barrier": {"radius": 0.5}}
+    inner = (
+        Repeated(gym.make(ENV_ID, **settings))
+        if mode is None
+        else gym.make_vec(
+            ENV_ID,
+            3,
+            "sync",
+            vector_kwargs={"autoreset_mode": AutoresetMode(mode)},
+            wrappers=[Repeated],
+            **settings,
+        )
+    )
+    env = CostReturnWrapper(inner)
+    env.reset(seed=0)
+    total, seen = np.zeros(1 if mode is None else 3), 0
+    for _ in range(20):
+        _, _, cost, terminated, truncated, info = env.step(np.zeros(inner.action_space.shape))
+        total += cost
+        done = np.atleast_1d(terminated | truncated)
+        last = info["final_info"] if mode == "SameStep" and done.any() else info
+        for i in np.flatnonzero(done):
+            assert total[i] == np.atleast_1d(last["episode_cost"])[i]
+            seen += total[i] > 4.0
+        total[done] = 0.0
+        if mode is None and done:
+            env.reset()
+    assert seen > 0
+
+
+def test_a_cost_that_somebody_else_wrote_is_returned():
+    class Priced(gym.Wrapper):
+        def step(self, action):
+            *found, info = self.env.step(action)
+            return *found, {**info, "cost": 0.25}
+
+    env = CostReturnWrapper(Priced(gym.make(ENV_ID, barrier={"radius": 1.0})))
+    env.reset(seed=0)
+    assert {env.step(np.zeros(1))[2] for _ in range(60)} == {0.25}
+
+
 def test_attributes_are_those_of_the_env():
     inner = SafetyFilterWrapper(gym.make(ENV_ID), "scbf")
     env = CostReturnWrapper(inner)

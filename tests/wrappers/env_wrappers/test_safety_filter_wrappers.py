@@ -33,6 +33,7 @@ FILTER = {
     "active_barrier": int,
     "episode_interventions": int,
     "episode_infeasible": int,
+    "input_bounds": np.ndarray,
 }
 DTYPES = {float: np.float64, bool: np.bool_, int: np.int64, np.ndarray: np.float64}
 
@@ -57,6 +58,7 @@ def test_info_has_every_key_with_one_type_at_reset_and_at_each_step(env_id, filt
     count = len(env.unwrapped.problem.barriers)
     shapes = dict.fromkeys(("barrier", "slacks"), (3, count))
     shapes |= dict.fromkeys(("nominal_action", "safe_action"), vector.action_space.shape)
+    shapes["input_bounds"] = (*vector.action_space.shape, 2)
     for info in infos:
         assert set(info) == set(contract) | {f"_{key}" for key in contract}
         for key, kind in contract.items():
