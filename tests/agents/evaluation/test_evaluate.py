@@ -27,6 +27,7 @@ MEASURES = (
 RATES = ("intervention_rate", "infeasible_rate")
 KEYS = {
     "filter",
+    "kind",
     "policy",
     *COUNTS,
     "touching",

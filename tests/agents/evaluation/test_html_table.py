@@ -50,8 +50,9 @@ class Reader(HTMLParser):
 def read():
     answer = nasty_evaluation()
     rows = [*answer.rows[:2], replace(answer.rows[2], filter=ATTACK)]
+    pairs = [replace(c, second=ATTACK) for c in answer.comparisons]
     reader = Reader()
-    reader.feed(replace(answer, rows=rows)._repr_html_())
+    reader.feed(replace(answer, rows=rows, comparisons=pairs)._repr_html_())
     assert not reader.open
     return reader, rows
 

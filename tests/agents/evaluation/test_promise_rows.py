@@ -196,8 +196,8 @@ def test_a_bound_is_withheld_where_the_table_lets_p_k_fall(tmp_path):
 
 def test_a_bound_that_the_rate_contradicts_is_withheld():
     row = BoundSummary(held_bound=0.9, held_word="computed", held_note=COMPUTED)
-    assert judged(row, 0.9) == row
-    found = judged(row, 0.85)
+    assert judged(row, 0.9, 0.9) == row
+    found = judged(row, 0.85, 0.85)
     assert (found.held_bound, found.held_word) == (None, "withheld")
     assert "ends at 85.0 %, below 90.0 %" in (found.withheld or "")
     assert "continuous time" not in (found.withheld or "")
