@@ -92,7 +92,7 @@ def certify(
     if held and (policy or rates or best):
         raise ConfigurationError(
             "--held is for every policy under psi's constraint, has no a, and counts leaving in"
-            " another way than --best: leave --policy, --rate and --best out, or --held"
+            " another way than --best: leave --policy, --best and --rate out, or --held"
         )
     require_whole("seed", seed, 0)
     require_result(json)

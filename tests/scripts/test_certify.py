@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from decimal import Decimal
 
 import pytest
 
@@ -10,6 +12,17 @@ from safe_envs.wrappers.certificates.files import load_certificate
 from tests.scripts.conftest import strictly
 
 SCALAR = ("safe_envs/Scalar-v0", "--degree", 6, "--rate", 0, "--horizon", 0.5)
+
+
+def assert_says_no_more_than(found, out):
+    """What is printed as proved is what JSON says, less the margin of the draw, rounded down."""
+    (text,) = re.findall(r">= ([\d.]+) %", out)
+    least = Decimal(repr(found["proved"])) - Decimal(repr(found["proved_margin"]))
+    assert 100 * least - Decimal("0.1") < Decimal(text) <= 100 * least
+    (degree,) = found["degrees"]
+    rows = (line.split() for line in out.splitlines())
+    (row,) = (row for row in rows if row[:1] == [str(degree["degree"])])
+    assert Decimal(row[6]) <= 100 * Decimal(repr(degree["proved"]))
 
 
 def test_it_prints_the_bound_and_writes_what_check_accepts(safe_envs_command):
@@ -25,7 +38,12 @@ def test_it_prints_the_bound_and_writes_what_check_accepts(safe_envs_command):
         assert text in out
     found = strictly("all.json")
     assert 0.7 < found["proved"] < 0.99
+    assert_says_no_more_than(found, out)
+    m, c = re.search(r"m = (\S+) 1/s, c = ([\d.e+-]+);", out).groups()
+    assert float(m) >= found["shortfall"]
+    assert float(c) >= found["supremum"]
     assert found["degrees"][0]["degree"] == 6
+    assert found["degrees"][0]["coefficients"] > 1
     assert abs(found["degrees"][0]["proved"] - found["degrees"][0]["sampled"]) < 0.02
     certificate = load_certificate("psi.json")
     assert (certificate.env_id, certificate.options) == ("safe_envs/Scalar-v0", {"horizon": 0.5})
@@ -41,6 +59,7 @@ def test_held_input(safe_envs_command):
     assert status == 0
     assert "in the workspace for 20 steps of 0.01 s" in out
     certificate, found = load_certificate("held.json"), strictly("all.json")
+    assert_says_no_more_than(found, out)
     assert float(certificate.sag) == found["sag"]
     assert found["degrees"][0]["proved"] > 0.7
     status, out, _ = safe_envs_command("certify", *held, "--start", 1, "--json", "-")

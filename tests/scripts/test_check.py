@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import replace
 
@@ -38,6 +39,8 @@ def test_a_proof_ends_with_0_and_says_what_it_proves(safe_envs_command, written)
     bounds = [b["bound"] for b in document["bounds"]]
     assert bounds == pytest.approx([0.92, 0.42, 0.0], abs=1e-6)
     assert bounds[1] < 0.42
+    shown = [float(text) for text in re.findall(r">= ([\d.]+) %", out)]
+    assert all(text <= 100.0 * bound for text, bound in zip(shown, bounds, strict=True))
     statements = document["checks"]["intervals"]["statements"]
     assert {part["word"] for part in statements} == {"checked"}
     assert (document["degree"], document["control"], document["c"]) == (

@@ -25,6 +25,7 @@ QUICK = ("--episodes", "8", "--horizon", "0.3")
 ROW_KEYS = [
     "filter",
     "policy",
+    "kind",
     "episodes",
     "safe",
     "safety_rate",
@@ -396,7 +397,7 @@ def test_bounds_are_shown_where_there_are_any():
     assert line_of(chain, "scbf").split()[1:4] == [">=", "49.2", "%"]
     assert "Note: held input, scbf: proved, of a certificate\n" in chain
     assert chain.count("bound, held input <= safe <= attainable") == 1
-    refuted = judged(replace(answer.rows[2], **{**given, "continuous_bound": 0.999}), 0.98)
+    refuted = judged(replace(answer.rows[2], **{**given, "continuous_bound": 0.999}), 0.98, 0.98)
     below = printed({}, nothing, vars(refuted))
     assert (
         "Note: no bound, continuous control, for scbf: withheld: the interval of the measured rate"

@@ -78,14 +78,15 @@ class Refinement:
 
     Attributes:
         given: the evaluation as it was asked for.
-        evaluations: with the control period dt as given, dt/2 and dt/4, and the integration step of
-            the last one, all on the same noise.
+        evaluations: with the control period dt as given, dt/2 and dt/4.
+        coupled: whether all three have the integration step of the last one, and the same noise.
         order: power of the period with which the rates go to their limit.
         rows: for each filter its rates with these periods, their limit, and a verdict.
     """
 
     given: Evaluation
     evaluations: tuple[Evaluation, ...]
+    coupled: bool
     order: float
     rows: list[RefinementRow]
 
@@ -97,8 +98,8 @@ class Refinement:
     def document(self) -> dict[str, Any]:
         """Return the evaluation with the given dt and its refinement as JSON-able data."""
         rows = [asdict(row) for row in self.rows]
-        refinement = {"dt": self.periods, "order": self.order, "tolerance": TOLERANCE, "rows": rows}
-        return {**self.given.document(), "refinement": refinement}
+        how = {"coupled": self.coupled, "order": self.order, "tolerance": TOLERANCE}
+        return {**self.given.document(), "refinement": {"dt": self.periods, **how, "rows": rows}}
 
 
 def refine(
@@ -116,7 +117,9 @@ def refine(
 
     Control and the check of safety go with the period. All three are integrated with the step of
     dt/4, which makes them sample the same path of the noise, so that their rates differ by little
-    more than the period makes them differ. The horizon is the number of whole periods dt.
+    more than the period makes them differ. What takes one integration step in a period alone, as
+    filters with tables do, is evaluated with that, on noise of its own. The horizon is the number
+    of whole periods dt.
 
     Where noise reaches a barrier directly and h is looked at at control instants, the rate goes to
     its limit as sqrt(dt), since a path is seen less often than it crosses; elsewhere as dt. The
@@ -170,15 +173,25 @@ def refine(
         "closed_loop": False,
         "learned": given.learned,
     }
-    evaluations = tuple(
-        evaluate(_divided(given.problem, d), policy, progress=share, **arguments)
-        for d, share in zip(DIVISORS, shares[1:], strict=True)
-    )
+
+    def finer(coupled: bool) -> tuple[Evaluation, ...]:
+        parts = list(zip(DIVISORS, shares[1:], strict=True))[not coupled :]
+        return tuple(
+            evaluate(_divided(given.problem, d, coupled), policy, progress=share, **arguments)
+            for d, share in parts
+        )
+
+    coupled = True
+    try:
+        evaluations = finer(coupled)
+    except ConfigurationError:
+        coupled = False
+        evaluations = (given, *finer(coupled))
     # The finer ones are nearer to continuous time, of which the bounds are.
     given = replace(given, rows=[_judged(row, evaluations) for row in given.rows])
     order = _order(given)
     rows = [_row(row, given, evaluations, order) for row in given.rows]
-    return Refinement(given, evaluations, order, rows)
+    return Refinement(given, evaluations, coupled, order, rows)
 
 
 def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
@@ -205,9 +218,9 @@ def _share(progress: Progress, before: float, size: float) -> Progress:
     return lambda done: progress(before + size * done)
 
 
-def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
+def _divided(problem: SafetyProblem, divisor: int, coupled: bool) -> SafetyProblem:
     # Noise is drawn for one integration step after the other: of equal steps it is the same.
-    steps = problem.substeps * (DIVISORS[-1] // divisor)
+    steps = problem.substeps * (DIVISORS[-1] // divisor if coupled else 1)
     # With the whole number of periods as the horizon all end at the same time.
     return replace(problem, dt=problem.dt / divisor, substeps=steps, horizon=problem.duration)
 

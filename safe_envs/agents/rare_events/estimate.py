@@ -10,13 +10,19 @@ from typing import Any
 
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, listed
-from safe_envs.agents.evaluation.statistics import exact_interval
 from safe_envs.agents.evaluation.work_parts import WorkParts
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, optimal_tilt
 from safe_envs.agents.rare_events.path_players import ChosenPlayer, player_of
-from safe_envs.agents.rare_events.rows import PlainEpisodes, RareEstimate, RareRow, doubt_of
-from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Pilot, Repetitions, Splitting
+from safe_envs.agents.rare_events.rows import (
+    RareEstimate,
+    RareRow,
+    doubt_of,
+    plain_episodes,
+    skewness,
+    why_none,
+)
+from safe_envs.agents.rare_events.splitting import POWERS, Pilot, Splitting
 from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.actuators import require_direct
@@ -213,15 +219,16 @@ class _Estimator:
             size, splitting = particles, Splitting(chosen.player, spec.seed)
             seen = splitting.estimate(pilot.power, size, self.repetitions, self.work.part())
             levels, steps = seen.levels, steps + seen.paths.steps
-        plain, mean = _plain(seen, spec.confidence), float(levels.mean())
+        plain, mean = plain_episodes(seen, spec.confidence), float(levels.mean())
         nothing = replace(nothing, levels=mean, steps=steps, plain=plain, particles=size)
         by = f"splitting on h{'/sqrt(T - t)' * (pilot.power != POWERS[0])}"
         if best is not None:
             check = RareEstimate.of(by, pilot.estimates, spec.confidence)
         elif seen.stuck or seen.endless:
-            return replace(nothing, reason=_why_none(seen, particles, self.resolved.problem, plain))
+            return replace(nothing, reason=why_none(seen, particles, self.resolved.problem, plain))
         else:
-            best = RareEstimate.of(by, seen.estimates, spec.confidence)
+            skew = skewness(pilot.estimates)
+            best = RareEstimate.of(by, seen.estimates, spec.confidence, skew)
             if not levels.any():
                 ends = {"ci_low": plain.ci_low, "ci_high": plain.ci_high}
                 best = replace(best, method="plain episodes", **ends)
@@ -265,34 +272,3 @@ class _Estimator:
             done(1.0)
         method = f"drift of {length:.3g}/sqrt(s)"
         return RareEstimate.of(method, estimates, self.resolved.spec.confidence), steps
-
-
-def _plain(found: Repetitions, confidence: float) -> PlainEpisodes:
-    """Return the episodes with which repetitions begin."""
-    paths, count = found.paths, found.paths.lowest.size
-    low, high = exact_interval(found.first, count, confidence)
-    return PlainEpisodes(count, found.first, low, high, paths.outside, paths.kept_length)
-
-
-def _why_none(
-    found: Repetitions, particles: int, problem: SafetyProblem, plain: PlainEpisodes
-) -> str:
-    repetitions = len(found.estimates)
-    h = "h" if len(problem.barriers) == 1 else "h/h(start)"
-    if found.stuck:
-        reason = (
-            f"in {len(found.stuck)} of {repetitions} repetitions all {particles} particles stood at"
-            f" one level and none came below {h} = {min(found.stuck):.3g}. There h may be flat,"
-            " jump or never fall, or those that come lower are too few: more particles or a"
-            " smaller dt may help"
-        )
-    else:
-        reason = (
-            f"in {len(found.endless)} of {repetitions} repetitions the probability to come below"
-            f" {h} = {min(found.endless):.3g} is less than {LEAST:g} already; h = 0 may never be"
-            " reached"
-        )
-    if not plain.violations:
-        return reason
-    seen = f"{plain.violations} of the {plain.episodes} plain episodes at its beginning violated"
-    return f"{reason}. But {seen}, which says [{plain.ci_low:.3g}, {plain.ci_high:.3g}]"

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.statistics import log_normal_interval
+from safe_envs.agents.evaluation.statistics import exact_interval, log_normal_interval
+from safe_envs.agents.rare_events.splitting import LEAST, Repetitions
+from safe_envs.problem.problem import SafetyProblem
 
 _ROUGH = 0.4
 """Standard deviation of the logarithms of repetitions above which their interval is doubted."""
@@ -35,15 +37,18 @@ class RareEstimate:
     estimates: list[float]
 
     @classmethod
-    def of(cls, method: str, estimates: np.ndarray, confidence: float) -> RareEstimate:
+    def of(
+        cls, method: str, estimates: np.ndarray, confidence: float, skew: float = 0.0
+    ) -> RareEstimate:
         """Make an estimate from those of the repetitions, shape (R,), all above 0.
 
         Args:
             method: by which they were estimated.
             estimates: of the repetitions.
             confidence: of the interval.
+            skew: see `skewed_interval`.
         """
-        low, high = skewed_interval(estimates, confidence)
+        low, high = skewed_interval(estimates, confidence, skew)
         p = math.fsum(estimates) / len(estimates)
         error = float(np.std(estimates, ddof=1)) / math.sqrt(len(estimates)) / p
         return cls(method, p, low, min(high, 1.0), error, estimates.tolist())
@@ -122,7 +127,17 @@ class RareRow:
         return asdict(self) | {"estimates": list(self.estimates)}
 
 
-def skewed_interval(estimates: np.ndarray, confidence: float) -> tuple[float, float]:
+def skewness(estimates: np.ndarray) -> float:
+    """Return the third moment about the mean of estimates, in units of their deviation."""
+    deviation = float(np.std(estimates))
+    return (
+        float(np.mean((estimates - np.mean(estimates)) ** 3)) / deviation**3 if deviation else 0.0
+    )
+
+
+def skewed_interval(
+    estimates: np.ndarray, confidence: float, skew: float = 0.0
+) -> tuple[float, float]:
     """Return an interval for the mean of positive estimates, of which the largest are the rarest.
 
     It is that for nearly normal logarithms, see
@@ -133,6 +148,8 @@ def skewed_interval(estimates: np.ndarray, confidence: float) -> tuple[float, fl
     Args:
         estimates: of the repetitions, shape (R,).
         confidence: of the two-sided interval.
+        skew: of other estimates of the same. It counts where it is larger: a few estimates seldom
+            hold the large ones that make the moment what it is.
 
     Source: N. J. Johnson, Modified t tests and confidence intervals for asymmetrical populations,
         Journal of the American Statistical Association 73 (1978) 536-544.
@@ -141,9 +158,7 @@ def skewed_interval(estimates: np.ndarray, confidence: float) -> tuple[float, fl
 
     low, high = log_normal_interval(estimates, confidence)
     count, mean = len(estimates), float(np.mean(estimates))
-    deviation = float(np.std(estimates, ddof=1))
-    spread = float(np.std(estimates))
-    skew = float(np.mean((estimates - mean) ** 3)) / spread**3 if spread else 0.0
+    deviation, skew = float(np.std(estimates, ddof=1)), max(skew, skewness(estimates))
     t = float(stdtrit(count - 1, 0.5 + confidence / 2.0)) / math.sqrt(count)
     return low, max(high, mean + deviation * (t + skew * (1.0 / (6.0 * count) + t**2 / 3.0)))
 
@@ -177,3 +192,47 @@ def doubt_of(found: RareEstimate, check: RareEstimate | None, plain: PlainEpisod
 
 def _overlap(one: RareEstimate, other: RareEstimate | PlainEpisodes) -> bool:
     return one.ci_low <= other.ci_high and other.ci_low <= one.ci_high
+
+
+def plain_episodes(found: Repetitions, confidence: float) -> PlainEpisodes:
+    """Return the episodes with which repetitions begin.
+
+    Args:
+        found: the repetitions.
+        confidence: of the interval of the violations among them.
+    """
+    paths, count = found.paths, found.paths.lowest.size
+    low, high = exact_interval(found.first, count, confidence)
+    return PlainEpisodes(count, found.first, low, high, paths.outside, paths.kept_length)
+
+
+def why_none(
+    found: Repetitions, particles: int, problem: SafetyProblem, plain: PlainEpisodes
+) -> str:
+    """Return why repetitions have no estimate.
+
+    Args:
+        found: the repetitions, of which some were given up.
+        particles: of each.
+        problem: that was simulated.
+        plain: the episodes with which they begin.
+    """
+    repetitions = len(found.estimates)
+    h = "h" if len(problem.barriers) == 1 else "h/h(start)"
+    if found.stuck:
+        reason = (
+            f"in {len(found.stuck)} of {repetitions} repetitions all {particles} particles stood at"
+            f" one level and none came below {h} = {min(found.stuck):.3g}. There h may be flat,"
+            " jump or never fall, or those that come lower are too few: more particles or a"
+            " smaller dt may help"
+        )
+    else:
+        reason = (
+            f"in {len(found.endless)} of {repetitions} repetitions the probability to come below"
+            f" {h} = {min(found.endless):.3g} is less than {LEAST:g} already; h = 0 may never be"
+            " reached"
+        )
+    if not plain.violations:
+        return reason
+    seen = f"{plain.violations} of the {plain.episodes} plain episodes at its beginning violated"
+    return f"{reason}. But {seen}, which says [{plain.ci_low:.3g}, {plain.ci_high:.3g}]"

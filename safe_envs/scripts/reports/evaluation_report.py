@@ -72,11 +72,9 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
     """
     interval, given = interval_name(refinement.given), refinement.given
     smallest = refinement.periods[-1] / given.problem.substeps
-    say(
-        console,
-        f"\nRefinement: safe [{interval}] with smaller control periods, on the same noise, in"
-        f" integration steps of {smallest:g} s",
-    )
+    noise = f"on the same noise, in integration steps of {smallest:g} s"
+    noise = noise if refinement.coupled else "from the same starts, each with noise of its own"
+    say(console, f"\nRefinement: safe [{interval}] with smaller control periods, {noise}")
     rows = []
     for row in refinement.rows:
         rates = [*zip(row.safety_rate, row.ci_low, row.ci_high, strict=True)]

@@ -92,6 +92,15 @@ def test_rates_that_do_not_change_have_converged_if_there_are_episodes_enough(ep
     assert row.verdict == verdict
 
 
+def test_filters_with_tables_have_noise_of_their_own():
+    options = {"dt": 0.1, "horizon": 0.2, "noise": 1.0, "start": [0.5]}
+    answer = refine("Scalar-v0", filters=["promise:p=0.9"], options=options, episodes=20)
+    assert answer.coupled is False
+    assert answer.evaluations[0].rows == answer.given.rows
+    assert [e.problem.substeps for e in answer.evaluations] == [1, 1, 1]
+    assert refine("Scalar-v0", filters=["scbf"], options=options, episodes=2).coupled is True
+
+
 def test_a_rate_that_the_integration_step_changes_is_said_to():
     # Euler's step of this decay is unstable with dt, and stable with dt/4.
     options = {"dt": 0.25, "horizon": 2.0}

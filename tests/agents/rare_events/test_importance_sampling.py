@@ -188,6 +188,7 @@ def test_an_interval_of_skewed_estimates_reaches_further_up():
     skewed = np.array([1.0] * 19 + [3.0])
     (low, high), (coxs_low, coxs_high) = skewed_interval(skewed, 0.95), log_normal_interval(skewed)
     assert (low, high > coxs_high) == (coxs_low, True)
+    assert skewed_interval(even, 0.95, 2.0)[1] > log_normal_interval(even)[1]
     assert skewed_interval(np.array([2.0, 2.0]), 0.95) == (2.0, 2.0)
 
 
