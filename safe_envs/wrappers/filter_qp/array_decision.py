@@ -8,9 +8,10 @@ from typing import Any
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
-from safe_envs.wrappers.filter_qp.compiled import domain_of
+from safe_envs.wrappers.filter_qp.compiled import domain_of, second_order
 from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
+from safe_envs.wrappers.filter_qp.held_row_text import write_held_rows
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp.kernels.interval import project_interval, work_of_interval
 from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
@@ -49,7 +50,7 @@ class ArrayDecision:
         self._reciprocal = [i for i, c in constraints if c.demand is not None]
         self._sampled = [i for i, c in constraints if c.change is not None]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
-        self._second_order = bool(self._uncertain) and self._m == 1 and not self._goal
+        self._second_order = second_order(qp)
         self._method, self._room = _method(
             self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
@@ -82,8 +83,9 @@ class ArrayDecision:
         self._constraints()
         self._minimise()
         if self._sampled:
-            self._sample()
-            self._minimise()
+            method = _method(self._k + len(self._sampled), self._m, uncertain=False)
+            rows = self._rows, self._offsets[: self._k]
+            self._finite += write_held_rows(body, self._values, self._qp, rows, method)
         self._leave_domains()
         self._answer()
         return self._values.source + body.source(self.parameters)
@@ -156,9 +158,8 @@ class ArrayDecision:
             demand = self._values.call(f"filter_demand_{i}", [self._qp.constraints[i].demand])
             asked[i] = f"{asked[i]} - {demand}[0] if inside[{i}] > 0.0 else 0.0"
             held[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in held[i]]
-        changed = self._reciprocal or self._sampled
-        self._asked = "asked" if changed else "b"
-        if changed:
+        self._asked = "asked" if self._reciprocal else "b"
+        if self._reciprocal:
             body.vector("asked", asked)
         self._offsets = [f"{self._asked}[{i}]" for i in range(k)]
         for place, i in enumerate(self._uncertain):
@@ -173,6 +174,7 @@ class ArrayDecision:
                 for i in range(k)
             ]
             body.table("form", entries)
+        self._rows = held
         if self._goal:
             goal_row = [f"goal_row[0, {j}]" for j in range(self._m + 1)]
             held = [*([*row, "0.0"] for row in held), goal_row]
@@ -235,16 +237,6 @@ class ArrayDecision:
             ]
             body.add(f"feasible = {' and '.join(met)}")
             body.uses.append(row_tolerance)
-
-    def _sample(self) -> None:
-        """Write how far the constraints fall while the input is held."""
-        qp, body = self._qp, self._body
-        dt = body.number(qp.dt)
-        held = f"({''.join(f'action[{j}], ' for j in range(self._m))})"
-        for i in self._sampled:
-            change = self._values.call(f"filter_change_{i}", [qp.constraints[i].change], held)
-            fall = f"asked[{i}] -= {dt} * max(-{change}[0], 0.0)"
-            body.add(f"if inside[{i}] > 0.0:\n        {fall}" if i in self._reciprocal else fall)
 
     def _leave_domains(self) -> None:
         """Write what conditions outside their domain make of the decision."""

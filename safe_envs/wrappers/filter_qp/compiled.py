@@ -48,6 +48,7 @@ class CompiledQP:
         self._domains = [domain_of(qp.constraints[i]) for i in self._reciprocal]
         self._sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
+        self._exact = second_order(qp)
         arrays = flavour == "arrays"
         self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
         self._symbols = (*qp.symbols, *(s for term in qp.terms for s in term.symbols))
@@ -55,7 +56,7 @@ class CompiledQP:
             (constants(qp.low), constants(qp.high)) if arrays else (qp.low, qp.high)
         )
         self.weights = qp.weights
-        self._choose: Any = np.where if arrays else _choose
+        self._choose: Any = np.where if arrays else choose
         self._larger: Any = np.maximum if arrays else max
         self._tolerance: Any = tolerances if arrays else tolerance
         self._project: Any = dispatch.project_arrays if arrays else dispatch.project_floats
@@ -153,12 +154,15 @@ class CompiledQP:
         """Return what a reciprocal condition demands; floats have no 1/h outside its domain."""
         return 0.0 if inside is False else self._demands[i](*x)[0]
 
-    def _loss(self, i: int, x: Sequence[Any], action: Sequence[Any], inside: Any) -> Any:
-        """Return the rate at which a constraint falls under an action, else 0."""
+    def _fall(self, i: int, x: Sequence[Any], inside: Any) -> Sequence[Any]:
+        """Return the coefficients of a constraint's change within a period; outside, 0."""
         if inside is False:
-            return 0.0
-        loss = self._larger(-self._changes[i](*x, *action)[0], 0.0)
-        return loss if inside is None else self._choose(inside, loss, 0.0)
+            return [0.0] * (self._m + 1 + self._m * (self._m + 1) // 2)
+        fall = [self._qp.dt * entry for entry in self._changes[i](*x)]
+        if inside is not None:
+            fall = [self._choose(inside, entry, 0.0) for entry in fall]
+        self._require_finite(fall)
+        return fall
 
     @cached_property
     def _values(self) -> Any:
@@ -185,16 +189,17 @@ class CompiledQP:
 
     @cached_property
     def _changes(self) -> dict[int, Any]:
-        return {
-            i: self._compiled([self._qp.constraints[i].change], self._qp.model.inputs)
-            for i in self._sampled
-        }
+        return {i: self._compiled(change_coefficients(self._qp, i)) for i in self._sampled}
 
-    def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
-        model = self._qp.model
-        return compile_function(
-            (*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour
-        )
+    def _compiled(self, expressions: Sequence[Any]) -> Any:
+        numbers = [self._qp.model.numeric(e) for e in expressions]
+        return compile_function(self._symbols, numbers, self._flavour)
+
+
+def second_order(qp: FilterQP) -> bool:
+    """Return whether uncertain constraints are solved as they are, not by planes above them."""
+    uncertain = any(c.uncertainty is not None for c in qp.constraints)
+    return uncertain and qp.model.m == 1 and qp.clf is None
 
 
 def domain_of(constraint: AffineConstraint) -> tuple[sp.Expr, ...]:
@@ -220,5 +225,24 @@ def _size(expression: sp.Expr) -> sp.Expr:
     return sp.Abs(expression)
 
 
-def _choose(condition: bool, chosen: Any, other: Any) -> Any:
+def change_coefficients(qp: FilterQP, i: int) -> list[sp.Expr]:
+    """Return the coefficients of a constraint's change: of 1, of u_j, and of u_j u_n, j <= n.
+
+    Args:
+        qp: of the constraint.
+        i: its number.
+    """
+    change, inputs = sp.sympify(qp.constraints[i].change), qp.model.inputs
+    at_zero = dict.fromkeys(inputs, sp.Integer(0))
+    slopes = [sp.diff(change, u) for u in inputs]
+    bends = [
+        sp.diff(slope, other) / (2 if u == other else 1)
+        for j, (u, slope) in enumerate(zip(inputs, slopes, strict=True))
+        for other in inputs[j:]
+    ]
+    return [*(e.xreplace(at_zero) for e in (change, *slopes)), *bends]
+
+
+def choose(condition: bool, chosen: Any, other: Any) -> Any:
+    """Return one of two values, as `numpy.where` does."""
     return chosen if condition else other

@@ -13,6 +13,7 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import Bounds, CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
 from safe_envs.wrappers.filter_qp.furthest import dot, furthest_active
+from safe_envs.wrappers.filter_qp.held_rows import HeldRows
 from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 
@@ -125,11 +126,15 @@ class FilterQPSolver(CompiledQP):
             for i in range(self._count)
         ]
         aim = self._outwards(a, inside, target, bounds)
-        action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
+        rows = self._on_the_safe_side(held, asked, forms, bounds)
+        exact = forms if self._exact else {}
+        action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
         if self._sampled:
-            for i in self._sampled:
-                asked[i] = asked[i] - self._qp.dt * self._loss(i, x, action, inside.get(i))
-            action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
+            falls = {i: self._fall(i, x, inside.get(i)) for i in self._sampled}
+            held = HeldRows(*rows, falls, exact, self._qp.priorities, self._flavour)
+            action, margin, active, feasible = held.hold(
+                action, active, self._project, bounds, self.weights
+            )
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
@@ -203,15 +208,11 @@ class FilterQPSolver(CompiledQP):
     ) -> tuple[Any, Any, Any, Any]:
         p, (low, high) = self._qp, bounds
         if forms:
-            for form in forms.values():
-                self._require_finite(form)
-            if self._m == 1 and not goal:
-                q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
-                action, margin, active, feasible = self._project_uncertain(
-                    [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
-                )
-                return [action], list(margin), list(active), feasible
-            a, b = self._on_the_safe_side(a, b, forms, bounds)
+            q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
+            action, margin, active, feasible = self._project_uncertain(
+                [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
+            )
+            return [action], list(margin), list(active), feasible
         if not goal:
             return self._project(a, b, u, low, high, self.weights, p.priorities)
         # The goal's slack is d = unit e, since the square of d would overflow before d does. Twice
@@ -239,9 +240,15 @@ class FilterQPSolver(CompiledQP):
     def _on_the_safe_side(
         self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components], bounds: Bounds
     ) -> tuple[list[Any], list[Any]]:
-        """Return affine constraints that are met only where the uncertain ones are."""
+        """Return affine constraints that are met only where the uncertain ones are.
+
+        Those that are solved as they are stay as they are.
+        """
         a, b = list(a), list(b)
         for i, form in forms.items():
+            self._require_finite(form)
+            if self._exact:
+                continue
             known = bounds is self.bounds and i in self.planes
             slopes, constant = self.planes[i] if known else self._plane(form, bounds)
             a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
