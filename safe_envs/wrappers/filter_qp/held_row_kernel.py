@@ -17,9 +17,11 @@ ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
 INWARDS = 1e-8
 """Share of its terms without input by which a row of the end of the period has to exceed 0."""
-BETTER = 1.0 - 1e-9
+FAR = 1e37
+"""No point of a line is further away; it is a number in single precision as well."""
+BETTER = 0.999999999
 """Share of the squared violations that is left by a step that helps."""
-ENOUGH = 0.99
+ENOUGH = 0.9
 """Share of them that is left by a round after which another one is tried."""
 SLOW = 0.25
 """Share of them that is left by a step after which lines along each input are tried."""
@@ -133,7 +135,7 @@ def move_on_line(  # noqa: PLR0913
     proposed = 1.0
     if m == 1:
         proposed, v[0] = v[0], 1.0
-    first, last = -1e300, 1e300
+    first, last = -FAR, FAR
     for j in range(m):
         if v[j] > 0.0:
             first, last = max(first, (low[j] - u[j]) / v[j]), min(last, (high[j] - u[j]) / v[j])

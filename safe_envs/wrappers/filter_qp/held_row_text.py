@@ -81,9 +81,9 @@ def write_held_rows(
         " target_margin, target_active, target_scratch)",
         f"    left = {step}",
         *(axes if m > 1 else ()),
+        f"    feasible = {hold}",
         f"    if not left < {ENOUGH}:",
         "        break",
-        f"    feasible = {hold}",
     )
     for place, i in enumerate(owners):
         value = f"value[{place}]"

@@ -18,23 +18,19 @@ curvatures; several inputs end at one that has been checked, which need not be t
 from __future__ import annotations
 
 import functools
-import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import Flavour
-from safe_envs.wrappers.filter_qp.compiled import choose
+from safe_envs.wrappers.filter_qp.row_lines import Rows
 from safe_envs.wrappers.qp.rounding import ROUNDING
 
 ROUNDS = 12
-"""Of Newton's method; it stops where all rows hold, or where a step does not help."""
-BETTER = 1.0 - 1e-9
-"""Share of the squared violations that is left by a step that helps, beyond rounding."""
-ENOUGH = 0.99
-"""Share of them that is left by a round after which another one is tried."""
+"""Of Newton's method; it stops where all rows hold, or where a round does not help."""
+ENOUGH = 0.9
+"""Share of the squared violations that is left by a round after which another one is tried."""
 SLOW = 0.25
 """Share of them that is left by a step after which lines along each input are tried."""
 INWARDS = 1e-8
@@ -42,245 +38,167 @@ INWARDS = 1e-8
 filter that rides the edge would else be carried beyond it by the errors of integrators."""
 
 
-class _Held(NamedTuple):
-    """Rows at an input.
+def rows_of_period(
+    a: Sequence[Sequence[Any]], b: Sequence[Any], falls: Mapping[int, Sequence[Any]]
+) -> tuple[list[list[Any]], list[int]]:
+    """Return the rows at the beginning of a period and at its end, and of which constraint each is.
 
-    Attributes:
-        slopes: coefficients of the rows, linearised there.
-        offsets: of these.
-        value: of each row.
-        met: whether each row holds.
+    Args:
+        a: m coefficients of each of k constraints.
+        b: k offsets.
+        falls: by the number of the constraint, the row of its change within the period.
     """
-
-    slopes: list[list[Any]]
-    offsets: list[Any]
-    value: list[Any]
-    met: list[Any]
-
-
-class _OnLine(NamedTuple):
-    """A row on a line: constant + rate t + bend t^2, and the size of its terms.
-
-    Of an uncertain one, the form has the coefficients of 1, t and t^2.
-    """
-
-    constant: Any
-    rate: Any
-    bend: Any
-    size: Any
-    form: tuple[Any, Any, Any] | None
+    rows = [[bi, *ai] for ai, bi in zip(a, b, strict=True)]
+    for i, fall in falls.items():
+        offset = b[i] + fall[0] - INWARDS * (abs(b[i]) + abs(fall[0]))
+        slopes = [aj + cj for aj, cj in zip(a[i], fall[1:], strict=False)]
+        rows.append([offset, *slopes, *fall[1 + len(slopes) :]])
+    return rows, [*range(len(b)), *falls]
 
 
 class HeldRows:
-    """The rows of k constraints at the beginning of a period, and of some at its end.
-
-    A row has the coefficients of 1, of the m inputs u_j and, if it is quadratic, of u_j u_n, j <=
-    n.
+    """Moves inputs to where rows hold.
 
     Args:
-        a: m coefficients of each constraint, of one state or of a batch.
-        b: k offsets.
-        falls: by the number of the constraint, the row of its change within the period.
-        forms: of constraints on one input with an uncertainty q_0, q_1, q_2, which ask for a u + b
-            >= sqrt(q_0 + 2 q_1 u + q_2 u^2), by their number.
-        priorities: k weights of the squared violations.
-        flavour: "floats" of one state, or "arrays" of a batch.
+        rows: the rows.
+        owners: the number of the constraint of each; those of the beginning come first.
+        project: projects inputs; see `safe_envs.wrappers.qp.dispatch`.
+        bounds: m lower and m upper bounds.
+        w: m weights of the inputs.
     """
 
     def __init__(
         self,
-        a: Sequence[Sequence[Any]],
-        b: Sequence[Any],
-        falls: Mapping[int, Sequence[Any]],
-        forms: Mapping[int, Sequence[Any]],
-        priorities: Sequence[float],
-        flavour: Flavour,
+        rows: Rows,
+        owners: Sequence[int],
+        project: Callable[..., Any],
+        bounds: Sequence[Sequence[Any]],
+        w: Sequence[float],
     ) -> None:
-        self._owners = [*range(len(b)), *falls]
-        self._rows = [[bi, *ai] for ai, bi in zip(a, b, strict=True)]
-        self._rows += [_end_of_period(self._rows[i], fall) for i, fall in falls.items()]
-        self._forms, self._priorities = forms, [priorities[i] for i in self._owners]
-        arrays = flavour == "arrays"
-        self._choose: Any = np.where if arrays else choose
-        self._larger: Any = np.maximum if arrays else max
-        self._square_root: Any = np.sqrt if arrays else math.sqrt
+        self._rows, self._owners, self._project = rows, owners, project
+        self._bounds, self._w = bounds, w
 
     def hold(
-        self,
-        u: Sequence[Any],
-        active: Sequence[Any],
-        project: Callable[..., Any],
-        bounds: tuple[Sequence[Any], Sequence[Any]],
-        w: Sequence[float],
-    ) -> tuple[Sequence[Any], list[Any], list[Any], Any]:
+        self, u: Sequence[Any], active: Sequence[Any], known: Sequence[Any], rounds: int = ROUNDS
+    ) -> tuple[list[Any], list[Any], list[Any], Any]:
         """Move an input to where the rows hold.
 
         Args:
             u: m components of the input.
             active: which constraints have changed it so far.
-            project: projects inputs; see `safe_envs.wrappers.qp.dispatch`.
-            bounds: m lower and m upper bounds.
-            w: m weights of the inputs.
+            known: values of the rows there, as far as they are known.
+            rounds: how many there may be.
 
         Returns:
             The input, the lesser value of each constraint, which have changed the input, and
             whether all rows hold.
         """
-        active = list(active)
-        for remaining in reversed(range(ROUNDS + 1)):
-            found = self._at(u)
-            for i, met in zip(self._owners, found.met, strict=True):
-                active[i] = self._choose(met, active[i], True)
-            all_met = functools.reduce(operator.and_, found.met)
-            if not remaining or np.all(all_met):
-                break
-            v = project(found.slopes, found.offsets, u, *bounds, w, self._priorities)[0]
-            u, left = self._step(u, v, *bounds)
-            slow = left > SLOW
-            for j in range(len(u) if len(u) > 1 and np.any(slow) else 0):
-                axis = [uj + self._choose(slow, 1.0, 0.0) * (n == j) for n, uj in enumerate(u)]
-                u, more = self._step(u, axis, *bounds)
-                left = left * more
-            if not np.any(left < ENOUGH):
-                break
-        margin = found.value[: len(active)]
-        for i, value in zip(self._owners, found.value, strict=True):
-            margin[i] = self._choose(value < margin[i], value, margin[i])
-        return u, margin, active, all_met
+        alone = self._rows.alone
+        u, active, margin, kept = list(u), list(active), list(known), []
+        for n, i in enumerate(self._owners):
+            value = known[n] if n < len(known) else self._value(n, u)
+            some = (value < 0.0) if alone else np.any(~(value >= 0.0))
+            kept.append(value >= -self._allowed(n, u) if some else value >= 0.0)
+            if i < n:
+                margin[i] = self._rows.choose(value < margin[i], value, margin[i])
+            elif n >= len(known):
+                margin.append(value)
+            active[i] = self._rows.choose(kept[n], active[i], True)
+        met = all(kept) if alone else functools.reduce(operator.and_, kept)
+        if not rounds or (met if alone else met.all()):
+            return u, margin, active, met
+        if alone:
+            u, left = self._round(u)
+            return self.hold(u, active, (), rounds - 1 if left < ENOUGH else 0)
+        # Each state has the rounds that it would have alone.
+        lost = np.flatnonzero(~met)
+        part, inputs = self._of(lost), _take(u, lost)
+        inputs, left = part._round(inputs)
+        for going in (True, False):
+            which = np.flatnonzero((left < ENOUGH) == going)
+            if which.size:
+                place, some = lost[which], (_take(inputs, which), _take(active, lost[which]))
+                found = part._of(which).hold(*some, (), rounds - 1 if going else 0)
+                for whole, entries in zip((u, margin, active), found[:3], strict=True):
+                    for n, entry in enumerate(entries):
+                        whole[n] = _put(whole[n], place, entry, len(met))
+                met[place] = found[3]
+        return u, margin, active, met
 
-    def _at(self, u: Sequence[Any]) -> _Held:
-        """Return the rows at an input."""
-        found = _Held([], [], [], [])
-        for i, row in enumerate(self._rows):
-            value, size, offset = row[0], abs(row[0]), row[0]
-            slopes = list(row[1 : 1 + len(u)])
-            for cj, uj in zip(slopes, u, strict=True):
-                value, size = value + cj * uj, size + abs(cj * uj)
-            for c, j, n in _bends(row, len(u)):
-                term = c * u[j] * u[n]
-                value, size, offset = value + term, size + abs(term), offset - term
-                slopes[j] = slopes[j] + c * u[n]
-                slopes[n] = slopes[n] + c * u[j]
-            allowed = ROUNDING * size
-            if i in self._forms:
-                root, steepness, blur = self._root(self._forms[i], u[0])
-                value, allowed = value - root, allowed + blur
-                slopes, offset = [slopes[0] - steepness], offset + (steepness * u[0] - root)
-            for part, entry in zip(found, (slopes, offset, value, value >= -allowed), strict=True):
-                part.append(entry)
-        return found
+    def _of(self, which: np.ndarray) -> HeldRows:
+        """Return the rows of some states of a batch."""
+        rows = self._rows
+        forms = {i: _take(form, which) for i, form in rows.forms.items()}
+        some = Rows(
+            [_take(row, which) for row in rows.rows], forms, rows.priorities, rows.flavour, rows.m
+        )
+        bounds = [_take(end, which) for end in self._bounds]
+        return HeldRows(some, self._owners, self._project, bounds, self._w)
 
-    def _root(self, form: Sequence[Any], u: Any) -> tuple[Any, Any, Any]:
+    def _value(self, i: int, u: Sequence[Any]) -> Any:
+        """Return the value of a row."""
+        value = self._rows.rows[i][0]
+        for cj, uj in zip(self._rows.rows[i][1:], u, strict=False):
+            value = value + cj * uj
+        for c, j, n in self._rows.bends[i]:
+            value = value + c * u[j] * u[n]
+        return value - self._root(i, u[0])[0] if i in self._rows.forms else value
+
+    def _allowed(self, i: int, u: Sequence[Any]) -> Any:
+        """Return by how much a row may be violated and count as met."""
+        size = abs(self._rows.rows[i][0])
+        for cj, uj in zip(self._rows.rows[i][1:], u, strict=False):
+            size = size + abs(cj * uj)
+        for c, j, n in self._rows.bends[i]:
+            size = size + abs(c * u[j] * u[n])
+        blur = self._root(i, u[0])[2] if i in self._rows.forms else 0.0
+        return ROUNDING * size + blur
+
+    def _root(self, i: int, u: Any) -> tuple[Any, Any, Any]:
         """Return the root of an uncertainty, its slope, and the error of its rounding."""
-        linear, square = 2.0 * form[1] * u, form[2] * u * u
-        inside = self._larger(form[0] + linear + square, 0.0)
-        root, blur = self._square_root(inside), ROUNDING * (abs(form[0]) + abs(linear) + square)
-        allowed = self._choose(inside > 0.0, self._square_root(inside + blur) - root, 0.0)
-        return root, self._ratio(form[1] + form[2] * u, root), allowed
+        rows, (q0, q1, q2) = self._rows, self._rows.forms[i]
+        linear, square = 2.0 * q1 * u, q2 * u * u
+        inside = rows.larger(q0 + linear + square, 0.0)
+        root, error = rows.square_root(inside), ROUNDING * (abs(q0) + abs(linear) + square)
+        blur = rows.choose(inside > 0.0, rows.square_root(inside + error) - root, 0.0)
+        return root, rows.ratio(q1 + q2 * u, root), blur
 
-    def _step(
-        self, u: Sequence[Any], v: Sequence[Any], low: Sequence[Any], high: Sequence[Any]
-    ) -> tuple[list[Any], Any]:
-        """Move along the line from u through v.
+    def _linear(self, u: Sequence[Any]) -> tuple[list[list[Any]], list[Any]]:
+        """Return the slopes and offsets of the rows, linearised at an input."""
+        slopes, offsets = [], []
+        for i, row in enumerate(self._rows.rows):
+            offset, along = row[0], list(row[1 : 1 + len(u)])
+            for c, j, n in self._rows.bends[i]:
+                offset = offset - c * u[j] * u[n]
+                along[j] = along[j] + c * u[n]
+                along[n] = along[n] + c * u[j]
+            if i in self._rows.forms:
+                root, steepness, _ = self._root(i, u[0])
+                along, offset = [along[0] - steepness], offset + (steepness * u[0] - root)
+            slopes.append(along)
+            offsets.append(offset)
+        return slopes, offsets
 
-        Returns:
-            The input, and which share of the squared violations is left.
-        """
-        choose = self._choose
-        d, proposed = [vj - uj for vj, uj in zip(v, u, strict=True)], 1.0
-        if len(d) == 1:  # there is one line, whatever the QP proposes
-            d, proposed = [1.0], d[0]
-        first, last = -1e300, 1e300
-        for dj, uj, lo, hi in zip(d, u, low, high, strict=True):
-            unit = choose(dj == 0.0, 1.0, dj)
-            ends = (lo - uj) / unit, (hi - uj) / unit
-            near, far = choose(dj > 0.0, ends[0], ends[1]), choose(dj > 0.0, ends[1], ends[0])
-            first = choose(dj == 0.0, first, self._larger(first, near))
-            last = choose(dj == 0.0, last, -self._larger(-last, -far))
-        lines = [self._on_line(i, u, d) for i in range(len(self._rows))]
-        before = self._violation(lines, 0.0)
-        best, least = 0.0, before
-        for point in (*[t for line in lines for t in self._points(line)], proposed):
-            t = choose(point < first, first, choose(point > last, last, point))
-            missed = self._violation(lines, t)
-            better = (missed < BETTER * least) | ((missed == least) & (abs(t) < abs(best)))
-            best, least = choose(better, t, best), choose(better, missed, least)
-        ends = zip(u, d, low, high, strict=True)
-        moved = [(uj + best * dj, lo, hi) for uj, dj, lo, hi in ends]
-        inside = [choose(z < lo, lo, choose(z > hi, hi, z)) for z, lo, hi in moved]
-        return inside, self._ratio(least, before, 1.0)
-
-    def _on_line(self, i: int, u: Sequence[Any], d: Sequence[Any]) -> _OnLine:
-        row = self._rows[i]
-        constant, rate, bend, size = row[0], 0.0, 0.0, abs(row[0])
-        bends = _bends(row, len(u))
-        for j, (cj, uj, dj) in enumerate(zip(row[1:], u, d, strict=False)):
-            constant, rate, size = constant + cj * uj, rate + cj * dj, size + abs(cj * uj)
-            for c, first, n in bends:
-                if first == j:
-                    constant = constant + c * uj * u[n]
-                    rate = rate + c * (uj * d[n] + dj * u[n])
-                    bend = bend + c * dj * d[n]
-                    size = size + abs(c * uj * u[n])
-        form = None
-        if i in self._forms:
-            q0, q1, q2 = self._forms[i]
-            at = q0 + 2.0 * q1 * u[0] + q2 * u[0] * u[0]
-            form = at, 2.0 * (q1 + q2 * u[0]) * d[0], q2 * d[0] * d[0]
-        return _OnLine(constant, rate, bend, size, form)
-
-    def _violation(self, lines: Sequence[_OnLine], t: Any) -> Any:
-        """Return the sum of the squared violations at a point of a line."""
-        total = 0.0
-        for line, priority in zip(lines, self._priorities, strict=True):
-            linear, square = line.rate * t, line.bend * t * t
-            value = line.constant + linear + square
-            if line.form:
-                inside = line.form[0] + line.form[1] * t + line.form[2] * t * t
-                value = value - self._square_root(self._larger(inside, 0.0))
-            met = value >= -ROUNDING * (line.size + abs(linear) + abs(square))
-            total = self._choose(met, total, total + priority * value * value)
-        return total
-
-    def _points(self, line: _OnLine) -> list[Any]:
-        """Return where on a line a row may begin to hold, or is violated least.
-
-        These are its roots, a little beyond, so that it holds, and the vertex between them.
-        """
-        constant, rate, bend = line.constant, line.rate, line.bend
-        found = [self._ratio(-0.5 * rate, bend), *self._roots(constant, rate, bend)]
-        if line.form:
-            found += self._roots(
-                constant * constant - line.form[0],
-                2.0 * constant * rate - line.form[1],
-                rate * rate - line.form[2],
-            )
-        return found
-
-    def _roots(self, constant: Any, rate: Any, bend: Any) -> tuple[Any, Any]:
-        square = rate * rate - 4.0 * bend * constant
-        root = self._square_root(self._choose(square < 0.0, 0.0, square))
-        half = -0.5 * (rate + self._choose(rate > 0.0, root, -root))
-        found = self._ratio(half, bend), self._ratio(constant, half)
-        return found[0] + ROUNDING * found[0], found[1] + ROUNDING * found[1]
-
-    def _ratio(self, numerator: Any, denominator: Any, other: float = 0.0) -> Any:
-        """Return a quotient, or another number where it is none."""
-        some = denominator != 0.0
-        return self._choose(some, numerator / self._choose(some, denominator, 1.0), other)
+    def _round(self, u: Sequence[Any]) -> tuple[list[Any], Any]:
+        """Take a step, and others where it helps little; return the input and what is left."""
+        rows = self._rows
+        v = self._project(*self._linear(u), u, *self._bounds, self._w, rows.priorities)[0]
+        u, left = rows.step(u, v, *self._bounds)
+        slow = rows.choose(left > SLOW, 1.0, 0.0)
+        for j in range(rows.m if rows.m > 1 and np.any(slow) else 0):
+            axis = [uj + slow * (n == j) for n, uj in enumerate(u)]
+            u, more = rows.step(u, axis, *self._bounds)
+            left = left * more
+        return u, left
 
 
-def _bends(row: Sequence[Any], m: int) -> list[tuple[Any, int, int]]:
-    """Return the coefficients of u_j u_n with j and n; none of linear rows."""
-    places = ((j, n) for j in range(m) for n in range(j, m))
-    return [(c, j, n) for c, (j, n) in zip(row[1 + m :], places, strict=False)]
+def _take(entries: Sequence[Any], which: np.ndarray) -> list[Any]:
+    """Return the numbers of some states; those of all have no axis."""
+    return [entry[which] if np.ndim(entry) else entry for entry in entries]
 
 
-def _end_of_period(row: Sequence[Any], fall: Sequence[Any]) -> list[Any]:
-    """Return the row of a constraint at the end of the period."""
-    offset = row[0] + fall[0] - INWARDS * (abs(row[0]) + abs(fall[0]))
-    return [
-        offset,
-        *[aj + cj for aj, cj in zip(row[1:], fall[1:], strict=False)],
-        *fall[len(row) :],
-    ]
+def _put(entry: Any, place: np.ndarray, some: Any, count: int) -> np.ndarray:
+    """Return numbers of a batch with other ones in the place of some."""
+    found = np.array(np.broadcast_to(entry, count))
+    found[place] = some
+    return found

@@ -13,7 +13,8 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import Bounds, CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
 from safe_envs.wrappers.filter_qp.furthest import dot, furthest_active
-from safe_envs.wrappers.filter_qp.held_rows import HeldRows
+from safe_envs.wrappers.filter_qp.held_rows import HeldRows, rows_of_period
+from safe_envs.wrappers.filter_qp.row_lines import Rows
 from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 
@@ -131,10 +132,16 @@ class FilterQPSolver(CompiledQP):
         action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
         if self._sampled:
             falls = {i: self._fall(i, x, inside.get(i)) for i in self._sampled}
-            held = HeldRows(*rows, falls, exact, self._qp.priorities, self._flavour)
-            action, margin, active, feasible = held.hold(
-                action, active, self._project, bounds, self.weights
+            period, owners = rows_of_period(*rows, falls)
+            weights = [self._qp.priorities[i] for i in owners]
+            held = HeldRows(
+                Rows(period, exact, weights, self._flavour, self._m),
+                owners,
+                self._project,
+                bounds,
+                self.weights,
             )
+            action, margin, active, feasible = held.hold(action, active, margin)
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
