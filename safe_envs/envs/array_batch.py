@@ -177,18 +177,18 @@ class ArrayBatch:
         if self.actuators is not None:
             info |= self.actuators.report()
         terminated = filled(outside > 0.0, self._shape)
-        sound = finite(h) and finite(rows)
+        reward = filled(reward, self._shape).copy()
+        sound = finite(rows) and finite(reward)
         for i in self._unobserved:
             sound = sound and finite(x[i])
         if np.count_nonzero(terminated):
             envs = np.flatnonzero(terminated)
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
         if not sound:
-            require_sound(x, h, observation, self._problem)
+            require_sound(x, observation, reward, self._problem)
         if self.sensor is not None:
             observation = self.sensor.observe(x, counted)
             info |= self.sensor.report(x)
         if self._problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        reward = filled(reward, self._shape).copy()
         return observation, reward, terminated, self._episodes.steps >= self._limit, info

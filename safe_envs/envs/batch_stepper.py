@@ -179,8 +179,7 @@ class BatchStepper:
         if stepping:
             batch.inputs = told.inputs
         if status:
-            h = readings[:, layout.BARRIERS :].min(axis=1)
-            require_sound(batch.components, h, observations, problem)
+            require_sound(batch.components, observations, rewards, problem)
         # As with NumPy's filter, a step that raises is in no count of the filter.
         self.tallies, self._told = tallies, told
         flags = told.flags

@@ -7,7 +7,7 @@ float64 arrays from a scalar env, arrays with the batch in front from a vector e
 |---|---|---|
 | `cost` | float | 1.0 where the state is unsafe, 0.0 elsewhere |
 | `violation` | bool | some barrier is negative |
-| `barrier` | float64 (k,) | value of each barrier |
+| `barrier` | float64 (k,) | value of each barrier, -inf where it has none |
 | `h_min` | float | smallest barrier value of the episode so far |
 | `episode_cost` | float | sum of the costs of the episode so far |
 

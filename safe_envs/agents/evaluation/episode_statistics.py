@@ -77,7 +77,10 @@ class EpisodeStatistics:
         """Return statistics with intervals of a confidence; None where no step counts."""
         episodes, safe = len(self.safe), self._safe
         low, high = rate_interval(safe, episodes, confidence)
-        p05, median = np.quantile(self._min_h[:episodes], (0.05, 0.5)).tolist()
+        h = self._min_h[:episodes]
+        # Between -inf and a number there is nothing.
+        method = "linear" if np.isfinite(h).all() else "lower"
+        p05, median = np.quantile(h, (0.05, 0.5), method=method).tolist()
         return EpisodeSummary(
             episodes=episodes,
             safe=safe,

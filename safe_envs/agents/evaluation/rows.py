@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
@@ -102,7 +103,8 @@ class EpisodeSummary:
         safety_rate: their share.
         ci_low: lower end of its interval.
         ci_high: upper end.
-        min_h_median: median of the minimum h over the first 65,536 episodes.
+        min_h_median: median of the minimum h over the first 65,536 episodes, -inf where h has no
+            value.
         min_h_p05: 5 % quantile of it.
         violations: number of episodes that are not safe.
         touching: how many of these come no lower than h = 0 to rounding.
@@ -225,6 +227,9 @@ class LearningSummary:
     rates: list[float]
 
 
+_HEIGHTS = ("min_h_median", "min_h_p05")
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRow(BoundSummary, EpisodeSummary):
     """All that an evaluation finds for one filter.
@@ -242,10 +247,11 @@ class EvaluationRow(BoundSummary, EpisodeSummary):
     estimation: EstimationSummary | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as JSON-able data."""
+        """Return the row as JSON-able data; h is null where it has no value."""
         head = {"filter": self.filter, "policy": self.policy}
         bound = self.posterior_bound
         found = head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
+        found |= {name: None for name in _HEIGHTS if not math.isfinite(found[name])}
         if self.estimation is None:
             del found["estimation"]
         return found

@@ -10,10 +10,10 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function, filled
+from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.wrappers.backup.closed_part import closed_part
-from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
 
 _FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.dynamics.codegen import Components
+from safe_envs.dynamics.codegen import Components, stacked
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.errors import InvalidInputError
@@ -17,7 +17,7 @@ from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.autoreset import autoreset_mode
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.env_wrappers.layers_below import doubt_layers
-from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer, barrier_table
+from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer
 
 
 class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
@@ -159,7 +159,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
     def _seen(self, observation: np.ndarray, counted: np.ndarray) -> Info:
         """Read the states; `counted` are the envs whose observations are new."""
         self._x = _columns(self._spec.state(observation, (self.num_envs,)))
-        barrier = barrier_table(self._barriers, self.problem.name, self._x)
+        barrier = stacked(self._barriers(*self._x), self.num_envs)
         return self.episodes.count(barrier, barrier.min(axis=1), counted)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import Any
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
@@ -12,18 +10,15 @@ from safe_envs.wrappers.filter_qp.compiled import domain_of, second_order
 from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
 from safe_envs.wrappers.filter_qp.held_row_text import write_held_rows
+from safe_envs.wrappers.filter_qp.projection_choice import projection_for
 from safe_envs.wrappers.filter_qp.qp import FilterQP
-from safe_envs.wrappers.qp.kernels.interval import project_interval, work_of_interval
 from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
-from safe_envs.wrappers.qp.kernels.many import project_many, work_of_many
 from safe_envs.wrappers.qp.kernels.one_constraint import (
     project_one_constraint,
     row_margin,
     row_tolerance,
     work_of_one_constraint,
 )
-from safe_envs.wrappers.qp.kernels.plane import project_plane, work_of_plane
-from safe_envs.wrappers.qp.kernels.second_order import project_second_order, work_of_second_order
 
 
 class ArrayDecision:
@@ -51,25 +46,38 @@ class ArrayDecision:
         self._sampled = [i for i, c in constraints if c.change is not None]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
         self._second_order = second_order(qp)
-        self._method, self._room = _method(
+        self._method, self._room = projection_for(
             self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
         self._values, self._body = Values(qp, data), Body(data)
         self._planes = self._values.solver.planes
         self._single = self._k == 1 and qp.plain
         width = self._m + 1
-        self._a = [[f"values[{i * width + j}]" for j in range(self._m)] for i in range(self._k)]
-        self._b = [f"values[{i * width + self._m}]" for i in range(self._k)]
+        self._a = [[self._value(i * width + j, i) for j in range(self._m)] for i in range(self._k)]
+        self._b = [self._value(i * width + self._m, i) for i in range(self._k)]
         self._growth = self._k * width
         self._h = self._growth + self._goal * width
         self._levels = [len(domain_of(qp.constraints[i])) for i in self._reciprocal]
-        self._forms = self._h + sum(self._levels)
+        self._heights = self._h + sum(self._levels)
+        self._forms = self._heights + len(qp.partial)
         self._finite: list[str] = []
+
+    def _value(self, place: int, i: int) -> str:
+        """Return the text of a value of constraint i; 0 where its barrier has none."""
+        value = f"values[{place}]"
+        return f"({value} if known[{i}] > 0.0 else 0.0)" if i in self._qp.partial else value
 
     def source(self) -> Source:
         """Return the function, and those that it calls."""
         body, m, size = self._body, self._m + self._goal, self._k + self._goal
         body.add(*self._values.lines)
+        if self._qp.partial:
+            known = ["1.0"] * self._k
+            for place, i in enumerate(self._qp.partial, start=self._heights):
+                row = range(i * (self._m + 1), (i + 1) * (self._m + 1))
+                total = " + ".join(f"values[{entry}]" for entry in (place, *row))
+                known[i] = f"1.0 if isfinite({total}) else 0.0"
+            body.vector("known", known)
         body.table("a", self._a)
         body.vector("b", self._b)
         if not self._single:
@@ -83,9 +91,10 @@ class ArrayDecision:
         self._constraints()
         self._minimise()
         if self._sampled:
-            method = _method(self._k + len(self._sampled), self._m, uncertain=False)
+            method = projection_for(self._k + len(self._sampled), self._m)
             rows = self._rows, self._offsets[: self._k]
-            self._finite += write_held_rows(body, self._values, self._qp, rows, method)
+            counts = [self._counts(i) for i in range(self._k)]
+            self._finite += write_held_rows(body, self._values, self._qp, rows, method, counts)
         self._leave_domains()
         self._answer()
         return self._values.source + body.source(self.parameters)
@@ -143,6 +152,7 @@ class ArrayDecision:
         inside, start = ["1.0"] * self._k, self._h
         for i, count in zip(self._reciprocal, self._levels, strict=True):
             above = " and ".join(f"values[{start + j}] > 0.0" for j in range(count))
+            above = f"known[{i}] == 0.0 or {above}" if i in self._qp.partial else above
             inside[i] = f"1.0 if {above} else 0.0"
             start += count
         body.vector("inside", inside)
@@ -156,7 +166,7 @@ class ArrayDecision:
         asked, held = list(self._b), [list(row) for row in self._a]
         for i in self._reciprocal:
             demand = self._values.call(f"filter_demand_{i}", [self._qp.constraints[i].demand])
-            asked[i] = f"{asked[i]} - {demand}[0] if inside[{i}] > 0.0 else 0.0"
+            asked[i] = f"{asked[i]} - {demand}[0] if {self._counts(i)} else 0.0"
             held[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in held[i]]
         self._asked = "asked" if self._reciprocal else "b"
         if self._reciprocal:
@@ -168,7 +178,7 @@ class ArrayDecision:
             forms = {i: place for place, i in enumerate(self._uncertain)}
             entries = [
                 [
-                    f"values[{self._forms + 3 * forms[i] + e}]" if i in forms else "0.0"
+                    self._value(self._forms + 3 * forms[i] + e, i) if i in forms else "0.0"
                     for e in range(3)
                 ]
                 for i in range(k)
@@ -194,7 +204,7 @@ class ArrayDecision:
         """
         body, m = self._body, self._m
         count = (m + 1) * (m + 2) // 2
-        form = [f"values[{self._forms + place * count + e}]" for e in range(count)]
+        form = [self._value(self._forms + place * count + e, i) for e in range(count)]
         self._finite.append(" + ".join(form))
         if self._second_order:
             return
@@ -238,9 +248,17 @@ class ArrayDecision:
             body.add(f"feasible = {' and '.join(met)}")
             body.uses.append(row_tolerance)
 
+    def _counts(self, i: int) -> str:
+        """Return the text of whether constraint i has a meaning; "" where it always has."""
+        parts = [f"inside[{i}] > 0.0"] if i in self._reciprocal else []
+        parts += [f"known[{i}] > 0.0"] if i in self._qp.partial else []
+        return " and ".join(parts)
+
     def _leave_domains(self) -> None:
-        """Write what conditions outside their domain make of the decision."""
+        """Write what conditions without a meaning make of the decision."""
         body = self._body
+        for i in self._qp.partial:
+            body.add(f"if known[{i}] == 0.0:", f"    active[{i}] = 1.0", "    feasible = False")
         for i in self._reciprocal:
             body.uses.append(row_margin)
             body.add(
@@ -271,19 +289,6 @@ class ArrayDecision:
             f"wanted = {f'({proposed})' if self._goal else 'u'}",
             f"return chosen, wanted, acts, feasible, slack, {cause}, sound",
         )
-
-
-def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int]:
-    """Return the kernel for k constraints on m inputs, and the scratch entries that it needs."""
-    if uncertain:
-        return project_second_order, work_of_second_order(k, m)
-    if k == 1:
-        return project_one_constraint, work_of_one_constraint(k, m)
-    if m == 1:
-        return project_interval, work_of_interval(k, m)
-    if m == 2:
-        return project_plane, work_of_plane(k, m)
-    return project_many, work_of_many(k, m)
 
 
 def _pairs(m: int) -> list[tuple[int, int]]:

@@ -25,6 +25,7 @@ def write_held_rows(
     qp: FilterQP,
     rows: tuple[Sequence[Sequence[str]], Sequence[str]],
     method: tuple[Callable[..., Any], int],
+    counts: Sequence[str],
 ) -> list[str]:
     """Write how the action moves to where the constraints hold; see `held_rows`.
 
@@ -34,6 +35,7 @@ def write_held_rows(
         qp: the QP.
         rows: texts of the coefficients and offsets of its k constraints.
         method: kernel that projects the m inputs, and the scratch entries that it needs.
+        counts: text of whether each constraint has a meaning; "" where it always has.
 
     Returns:
         Texts of sums that are to be finite.
@@ -47,8 +49,8 @@ def write_held_rows(
     for place, i in enumerate(sampled, start=k):
         change = values.call(f"filter_change_{i}", change_coefficients(qp, i))
         lines = [f"end_of_period({place}, {dt}, {change}, held)"]
-        if qp.constraints[i].demand is not None:
-            lines = [f"if inside[{i}] > 0.0:", *(f"    {line}" for line in lines)]
+        if counts[i]:
+            lines = [f"if {counts[i]}:", *(f"    {line}" for line in lines)]
         body.add(*lines)
         finite.append(" + ".join(f"held[{place}, {e}]" for e in range(1 + m + bends)))
     form = [[f"form[{i}, {e}]" for e in range(3)] for i in range(k)] if second_order(qp) else []

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import sympy as sp
 
+from safe_envs.dynamics.defined import may_lack_value
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.clf import CLF
 from safe_envs.wrappers.conditions.constraint import AffineConstraint, Terms
@@ -28,6 +29,8 @@ class FilterQP:
         clf: goal of the joint QP, if there is one.
         runtime: what the constraints may hold besides the states: the model's signals, and the time
             if it occurs.
+        partial: the constraints whose barrier may have no value at some state. There it is not
+            safe: the constraint is left out, and the decision is not feasible.
     """
 
     model: ControlAffineSDE
@@ -39,8 +42,15 @@ class FilterQP:
     dt: float
     clf: CLF | None
     runtime: tuple[sp.Symbol, ...] = ()
+    partial: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        partial = [
+            i
+            for i, c in enumerate(self.constraints)
+            if c.chain and may_lack_value(self.model.numeric(sp.sympify(c.chain[0])))
+        ]
+        object.__setattr__(self, "partial", tuple(partial))
         # What is compiled into solvers does not change from outside.
         for name in ("low", "high", "weights", "priorities"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
@@ -55,11 +65,17 @@ class FilterQP:
         """Whether the constraints at the proposed input are all there is.
 
         Then there is no demand of a reciprocal condition, no sampling margin of first order, no
-        goal, and uncertainty only for one input.
+        goal, no barrier that may have no value, and uncertainty only for one input.
         """
-        return self.clf is None and all(
-            c.demand is None and c.change is None and (c.uncertainty is None or self.model.m == 1)
-            for c in self.constraints
+        return (
+            not self.partial
+            and self.clf is None
+            and all(
+                c.demand is None
+                and c.change is None
+                and (c.uncertainty is None or self.model.m == 1)
+                for c in self.constraints
+            )
         )
 
     @property

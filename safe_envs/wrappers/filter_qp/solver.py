@@ -107,16 +107,16 @@ class FilterQPSolver(CompiledQP):
         """
         bounds = bounds or self.bounds
         x = self._with_terms(x)
-        a, b, goal, levels, forms = self._split(self._values(*x))
+        a, b, goal, inside, forms, known = self._split(self._values(*x))
         target = u
         if goal:
             target = [0.0 * uj for uj in u]
             u = self._best(goal, target, bounds)
-        inside = self._inside(levels)
         self._require_finite([*b, *[aj for ai in a for aj in ai]])
+        counts = [inside.get(i, True) & known.get(i, True) for i in range(self._count)]
         asked = [
             (
-                self._choose(inside[i], b[i] - self._demand(i, x, inside[i]), 0.0)
+                self._choose(inside[i], b[i] - self._demand(i, x, counts[i]), 0.0)
                 if i in inside
                 else b[i]
             )
@@ -131,7 +131,7 @@ class FilterQPSolver(CompiledQP):
         exact = forms if self._exact else {}
         action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
         if self._sampled:
-            falls = {i: self._fall(i, x, inside.get(i)) for i in self._sampled}
+            falls = {i: self._fall(i, x, counts[i]) for i in self._sampled}
             period, owners = rows_of_period(*rows, falls)
             weights = [self._qp.priorities[i] for i in owners]
             held = HeldRows(
@@ -146,6 +146,9 @@ class FilterQPSolver(CompiledQP):
             margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
             feasible = feasible & defined
+        for i, has_value in known.items():
+            active[i] = self._choose(has_value, active[i], True)
+            feasible = feasible & has_value
         # A demand or a loss without a value shows here, and so does what overflows on the way to
         # the action.
         self._require_finite([*action, *margin])
