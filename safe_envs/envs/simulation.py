@@ -108,6 +108,8 @@ def require_sound(
 ) -> None:
     """Check that the states of a batch, their observations and rewards are finite.
 
+    States are numbers of single precision, as observations are.
+
     Args:
         x: components of the states.
         observation: of each.
@@ -117,13 +119,13 @@ def require_sound(
     Raises:
         NumericalError: Some are not.
     """
-    seen, there = np.isfinite(observation), np.isfinite(x).all(axis=0)
+    seen, there = np.isfinite(observation), (np.abs(x) < LARGEST).all(axis=0)
     sound = there & seen.all(axis=1) & np.isfinite(reward)
     if sound.all():
         return
-    worst = int(np.flatnonzero(~sound)[0])
-    state = [float(component[worst]) for component in x]
-    if there.all() and np.abs(state).max() < LARGEST:
+    if there.all():
+        worst = int(np.flatnonzero(~sound)[0])
+        state = [float(component[worst]) for component in x]
         i = int(seen[worst].argmin())
         what = "reward" if seen[worst, i] else f"observation {problem.features[i].name}"
         at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(problem.plant.states, state, strict=True))
@@ -131,6 +133,6 @@ def require_sound(
             f"the {what} of {problem.name!r} has no finite value at {at}; check it there"
         )
     raise NumericalError(
-        f"the states of envs {np.flatnonzero(~sound)[:5].tolist()} of {problem.name!r}"
+        f"the states of envs {np.flatnonzero(~there)[:5].tolist()} of {problem.name!r}"
         " have left the finite numbers; reduce dt or raise substeps"
     )

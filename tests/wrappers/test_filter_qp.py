@@ -125,8 +125,8 @@ def test_numeric_margins_are_kept_and_first_order_needs_a_period():
         SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)])
     with pytest.raises(ConfigurationError, match=r"dt = -1"):
         SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=-1.0)
-    # psi = -u + 1 - x, psi' = -u: the action 1/1.1 makes psi fall by .1/1.1 within the period dt = .1,
-    # from .1/1.1 to 0.
+    # psi = -u + 1 - x, psi' = -u: within the period dt = .1 the action 1/1.1 makes psi fall from
+    # .1/1.1 to 0.
     for state, nominal in (([0.0], [5.0]), ([[0.0]], [[5.0]])):
         result = SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=0.1).filter(
             state, nominal

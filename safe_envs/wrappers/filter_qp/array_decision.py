@@ -96,6 +96,7 @@ class ArrayDecision:
             counts = [self._counts(i) for i in range(self._k)]
             self._finite += write_held_rows(body, self._values, self._qp, rows, method, counts)
         self._leave_domains()
+        self._check()
         self._answer()
         return self._values.source + body.source(self.parameters)
 
@@ -212,7 +213,8 @@ class ArrayDecision:
             slopes, constant = self._planes[i]
             slopes, constant = [body.number(s) for s in slopes], body.number(constant)
         else:
-            entry = dict(zip(_pairs(m), form, strict=True))
+            pairs = itertools.combinations_with_replacement(range(m + 1), 2)
+            entry = dict(zip(pairs, form, strict=True))
             square = range(m + 1)
             body.table(f"form_{i}", [[entry[min(j, e), max(j, e)] for e in square] for j in square])
             body.room(f"slopes_{i}", m)
@@ -257,8 +259,6 @@ class ArrayDecision:
     def _leave_domains(self) -> None:
         """Write what conditions without a meaning make of the decision."""
         body = self._body
-        for i in self._qp.partial:
-            body.add(f"if known[{i}] == 0.0:", f"    active[{i}] = 1.0", "    feasible = False")
         for i in self._reciprocal:
             body.uses.append(row_margin)
             body.add(
@@ -268,12 +268,21 @@ class ArrayDecision:
                 "    feasible = False",
             )
 
+    def _check(self) -> None:
+        """Write whether all numbers are finite, and what barriers without a value make of them."""
+        body = self._body
+        action = [f"action[{j}]" for j in range(0 if self._single else self._m)]
+        self._finite.append(" + ".join([*action, *(f"margin[{i}]" for i in range(self._k))]))
+        body.add(f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}")
+        for i in self._qp.partial:
+            lost = f"margin[{i}], active[{i}], feasible = -inf, 1.0, False"
+            body.add(f"if known[{i}] == 0.0:", f"    {lost}")
+
     def _answer(self) -> None:
         """Write the decision."""
         body, k, m = self._body, self._k, self._m
         action = [f"action[{j}]" for j in range(m)]
         margin = [f"margin[{i}]" for i in range(k)]
-        self._finite.append(" + ".join(margin if self._single else [*action, *margin]))
         cause = "0"
         if not self._single:
             cause = "cause"
@@ -283,14 +292,8 @@ class ArrayDecision:
         proposed = "".join(f"proposed[{j}], " for j in range(m))
         body.add(
             f"acts = {' or '.join(f'active[{i}] > 0.0' for i in range(k))}",
-            f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}",
             f"chosen = ({''.join(f'{entry}, ' for entry in action)})",
             f"slack = ({slack})",
             f"wanted = {f'({proposed})' if self._goal else 'u'}",
             f"return chosen, wanted, acts, feasible, slack, {cause}, sound",
         )
-
-
-def _pairs(m: int) -> list[tuple[int, int]]:
-    """Return the places of the entries of an uncertainty in its symmetric matrix."""
-    return list(itertools.combinations_with_replacement(range(m + 1), 2))

@@ -30,7 +30,7 @@ class FilterQP:
         runtime: what the constraints may hold besides the states: the model's signals, and the time
             if it occurs.
         partial: the constraints whose barrier may have no value at some state. There it is not
-            safe: the constraint is left out, and the decision is not feasible.
+            safe: the input does not regard the constraint, which is violated by infinity.
     """
 
     model: ControlAffineSDE

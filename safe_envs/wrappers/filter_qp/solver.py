@@ -146,12 +146,13 @@ class FilterQPSolver(CompiledQP):
             margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
             feasible = feasible & defined
-        for i, has_value in known.items():
-            active[i] = self._choose(has_value, active[i], True)
-            feasible = feasible & has_value
         # A demand or a loss without a value shows here, and so does what overflows on the way to
         # the action.
         self._require_finite([*action, *margin])
+        for i, has_value in known.items():
+            margin[i] = self._choose(has_value, margin[i], -math.inf)
+            active[i] = self._choose(has_value, active[i], True)
+            feasible = feasible & has_value
         slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
         return FilterDecision(
             action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u

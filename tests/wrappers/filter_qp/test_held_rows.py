@@ -83,7 +83,8 @@ def test_one_input_is_the_nearest_at_which_all_rows_hold(seed):
     ours = abs(found.action - nominal)[:, 0]
     np.testing.assert_array_less(ours[solvable], distance[solvable] + 1e-5)
     # The margin holds at the executed input itself, wherever the filter says so.
-    reached = [rows_of(safety_filter, s[None], i[None]) for s, i in zip(states, found.action)]
+    pairs = zip(states[:, None], found.action[:, None], strict=True)
+    reached = [rows_of(safety_filter, *pair) for pair in pairs]
     assert (np.min(reached, axis=(1, 2, 3))[found.feasible] > -1e-12).all()
     assert (abs(found.action) <= 6.0).all()
 
@@ -101,7 +102,8 @@ def test_several_inputs_end_at_one_that_has_been_checked(seed):
     solvable = (values >= 0.0).all(axis=0).any(axis=1)
     assert solvable.sum() > 10
     assert found.feasible[solvable].mean() > 0.95
-    reached = [rows_of(safety_filter, s[None], i[None]) for s, i in zip(states, found.action)]
+    pairs = zip(states[:, None], found.action[:, None], strict=True)
+    reached = [rows_of(safety_filter, *pair) for pair in pairs]
     assert (np.min(reached, axis=(1, 2, 3))[found.feasible] > -1e-12).all()
     # Where none holds, the squared violations are about as small as on the grid.
     lost = ~solvable & ~found.feasible
@@ -129,7 +131,7 @@ def test_where_no_input_holds_the_filter_says_so():
 def test_a_cart_pole_at_15_hz_is_no_less_safe_with_the_margin(policy, alpha, half, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "examples"))
     monkeypatch.delitem(sys.modules, "cart_pole", raising=False)
-    import cart_pole as example  # noqa: PLC0415
+    import cart_pole as example
 
     theta, omega = example.theta, example.omega
     problem = state_problem(
