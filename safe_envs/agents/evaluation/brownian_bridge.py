@@ -91,7 +91,7 @@ class BrownianBridge:
         """
         ends = np.minimum(before, after)
         if any(self.reached):
-            # Beside an end without a value, which is -inf, there is nothing to draw.
+            # With an end without a value, which is -inf, there is nothing to draw.
             with np.errstate(invalid="ignore"):
                 reach = np.sqrt((after - before) ** 2 + stacked(self._rates(*x), len(ends)) * draws)
                 # Rounding must not lift the minimum above an end.

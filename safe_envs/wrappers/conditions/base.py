@@ -50,8 +50,8 @@ class Condition(ABC):
     along the flow (for stochastic conditions the generator: then it is the expectation that
     changes). `sampling_margin` "first-order" therefore asks for psi >= 0 and psi + dt psi' >= 0, so
     that psi stays nonnegative over the period up to O(dt^2). Both hold at the executed input, in
-    which psi' is quadratic; see `safe_envs.wrappers.filter_qp.held_rows`. A number asks for psi >=
-    that number.
+    which psi' is quadratic; see `safe_envs.wrappers.filter_qp.period_search`. A number asks for psi
+    >= that number.
 
     Attributes:
         name: under which messages show it; by default that of the class. Names of

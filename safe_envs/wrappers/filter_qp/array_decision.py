@@ -9,7 +9,7 @@ from safe_envs.compiled.formulas import Source
 from safe_envs.wrappers.filter_qp.compiled import domain_of, second_order
 from safe_envs.wrappers.filter_qp.decision_kernel import aim_outwards, furthest_constraint
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
-from safe_envs.wrappers.filter_qp.held_row_text import write_held_rows
+from safe_envs.wrappers.filter_qp.period_text import write_period
 from safe_envs.wrappers.filter_qp.projection_choice import projection_for
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
@@ -94,7 +94,7 @@ class ArrayDecision:
             method = projection_for(self._k + len(self._sampled), self._m)
             rows = self._rows, self._offsets[: self._k]
             counts = [self._counts(i) for i in range(self._k)]
-            self._finite += write_held_rows(body, self._values, self._qp, rows, method, counts)
+            self._finite += write_period(body, self._values, self._qp, rows, method, counts)
         self._leave_domains()
         self._check()
         self._answer()

@@ -279,5 +279,11 @@ def change_coefficients(qp: FilterQP, i: int) -> list[sp.Expr]:
 
 
 def choose(condition: bool, chosen: Any, other: Any) -> Any:
-    """Return one of two values, as `numpy.where` does."""
+    """Return one of two values, as `numpy.where` does.
+
+    Args:
+        condition: whether it is the first.
+        chosen: the first.
+        other: the second.
+    """
     return chosen if condition else other

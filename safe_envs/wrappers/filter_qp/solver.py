@@ -13,8 +13,8 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import Bounds, CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
 from safe_envs.wrappers.filter_qp.furthest import dot, furthest_active
-from safe_envs.wrappers.filter_qp.held_rows import HeldRows, rows_of_period
-from safe_envs.wrappers.filter_qp.row_lines import Rows
+from safe_envs.wrappers.filter_qp.period_constraints import PeriodConstraints
+from safe_envs.wrappers.filter_qp.period_search import PeriodSearch, constraints_of_period
 from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 
@@ -132,10 +132,10 @@ class FilterQPSolver(CompiledQP):
         action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
         if self._sampled:
             falls = {i: self._fall(i, x, counts[i]) for i in self._sampled}
-            period, owners = rows_of_period(*rows, falls)
+            period, owners = constraints_of_period(*rows, falls)
             weights = [self._qp.priorities[i] for i in owners]
-            held = HeldRows(
-                Rows(period, exact, weights, self._flavour, self._m),
+            held = PeriodSearch(
+                PeriodConstraints(period, exact, weights, self._flavour, self._m),
                 owners,
                 self._project,
                 bounds,

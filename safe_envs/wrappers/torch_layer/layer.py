@@ -164,7 +164,7 @@ class TorchFilter(torch.nn.Module):
         everywhere = torch.ones(len(states), dtype=torch.bool)
         acting = np.flatnonzero(active.any(axis=1))
         if self.safety_filter.qp.partial and acting.size:
-            # Beside a barrier without a value there is no formula.
+            # With a barrier without a value there is no formula.
             with torch.no_grad():
                 parts = self._constraints(states[acting])
             lost = ~torch.stack([p.isfinite().flatten(1).all(dim=1) for p in parts]).all(dim=0)

@@ -1,7 +1,7 @@
-"""`safe_envs.wrappers.filter_qp.held_rows` for one state, as functions that can be compiled.
+"""`safe_envs.wrappers.filter_qp.period_search` for one state, as functions that can be compiled.
 
-A row has the coefficients of 1, of the m inputs u_j, and of u_j u_n, j <= n. On one input it may
-have an uncertainty q_0, q_1, q_2 as well, and asks for them to exceed its root.
+A constraint has the coefficients of 1, of the m inputs u_j, and of u_j u_n, j <= n. On one input it
+may have an uncertainty q_0, q_1, q_2 as well, and asks for them to exceed its root.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from math import sqrt
 import numpy as np
 
 ROUNDS = 12
-"""As in `safe_envs.wrappers.filter_qp.held_rows`, like the other constants."""
+"""As in `safe_envs.wrappers.filter_qp.period_search`, like the other constants."""
 ROUNDING = 3.552713678800501e-15
 """That of `safe_envs.wrappers.qp.rounding`, 16 eps."""
 INWARDS = 1e-8
-"""Share of its terms without input by which a row of the end of the period has to exceed 0."""
+"""Share of its terms without input by which a constraint at the end of the period exceeds 0."""
 FAR = 1e37
 """No point of a line is further away; it is a number in single precision as well."""
 BETTER = 0.999999999
@@ -26,29 +26,29 @@ ENOUGH = 0.9
 SLOW = 0.25
 """Share of them that is left by a step after which lines along each input are tried."""
 POINTS = 5
-"""Where on a line a row changes; see `point_of_change`."""
+"""Where on a line a constraint changes; see `point_of_change`."""
 COEFFICIENTS = 7
-"""Of a row on a line: of 1, t and t^2, the size of its terms, and those of its uncertainty."""
+"""Of a constraint on a line: of 1, t, t^2, the size of its terms, and those of its uncertainty."""
 
 
-def end_of_period(i: int, dt: float, change: Sequence[float], rows: np.ndarray) -> None:
-    """Turn a row of the beginning of the period into that of its end.
+def end_of_period(i: int, dt: float, change: Sequence[float], constraints: np.ndarray) -> None:
+    """Turn a constraint of the beginning of the period into that of its end.
 
     Args:
-        i: number of the row.
+        i: number of the constraint.
         dt: period in s.
         change: coefficients of its rate of change.
-        rows: coefficients, shape (K, 1 + m + m (m + 1)/2).
+        constraints: coefficients, shape (K, 1 + m + m (m + 1)/2).
     """
     fall = dt * change[0]
-    rows[i, 0] = rows[i, 0] + fall - INWARDS * (abs(rows[i, 0]) + abs(fall))
+    constraints[i, 0] = constraints[i, 0] + fall - INWARDS * (abs(constraints[i, 0]) + abs(fall))
     for e in range(1, len(change)):
-        rows[i, e] += dt * change[e]
+        constraints[i, e] += dt * change[e]
 
 
-def rows_hold(
+def constraints_hold(
     m: int,
-    rows: np.ndarray,
+    constraints: np.ndarray,
     form: np.ndarray,
     u: np.ndarray,
     slopes: np.ndarray,
@@ -56,35 +56,35 @@ def rows_hold(
     value: np.ndarray,
     missed: np.ndarray,
 ) -> bool:
-    """Return whether all rows hold at an input, and linearise them there.
+    """Return whether all constraints hold at an input, and linearise them there.
 
     Args:
         m: number of inputs.
-        rows: coefficients, shape (K, 1 + m + m (m + 1)/2).
-        form: uncertainties, 0 for certain rows, shape (K, 3).
+        constraints: coefficients, shape (K, 1 + m + m (m + 1)/2).
+        form: uncertainties, 0 for certain constraints, shape (K, 3).
         u: the input, m entries or more.
         slopes: receives the coefficients of the inputs, shape (K, m).
         offsets: receives the offsets, shape (K,).
         value: receives the values, shape (K,).
-        missed: receives 1 for rows that do not hold, and keeps the others, shape (K,).
+        missed: receives 1 for constraints that do not hold, and keeps the others, shape (K,).
     """
     holds = True
     for i in range(len(offsets)):
-        reached, size, offsets[i] = rows[i, 0], abs(rows[i, 0]), rows[i, 0]
+        reached, size, offsets[i] = constraints[i, 0], abs(constraints[i, 0]), constraints[i, 0]
         for j in range(m):
-            term = rows[i, 1 + j] * u[j]
+            term = constraints[i, 1 + j] * u[j]
             reached += term
             size += abs(term)
-            slopes[i, j] = rows[i, 1 + j]
+            slopes[i, j] = constraints[i, 1 + j]
         e = 1 + m
         for j in range(m):
             for n in range(j, m):
-                term = rows[i, e] * u[j] * u[n]
+                term = constraints[i, e] * u[j] * u[n]
                 reached += term
                 size += abs(term)
                 offsets[i] -= term
-                slopes[i, j] += rows[i, e] * u[n]
-                slopes[i, n] += rows[i, e] * u[j]
+                slopes[i, j] += constraints[i, e] * u[n]
+                slopes[i, n] += constraints[i, e] * u[j]
                 e += 1
         allowed = ROUNDING * size
         linear, square = 2.0 * form[i, 1] * u[0], form[i, 2] * u[0] * u[0]
@@ -105,7 +105,7 @@ def rows_hold(
 
 def move_on_line(  # noqa: PLR0913
     m: int,
-    rows: np.ndarray,
+    constraints: np.ndarray,
     form: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
@@ -114,12 +114,12 @@ def move_on_line(  # noqa: PLR0913
     v: np.ndarray,
     line: np.ndarray,
 ) -> float:
-    """Move an input along the line to another one, to where rows are violated least.
+    """Move an input along the line to another one, to where constraints are violated least.
 
     Args:
         m: number of inputs.
-        rows: coefficients, shape (K, 1 + m + m (m + 1)/2).
-        form: uncertainties, 0 for certain rows, shape (K, 3).
+        constraints: coefficients, shape (K, 1 + m + m (m + 1)/2).
+        form: uncertainties, 0 for certain constraints, shape (K, 3).
         low: lower bounds, m entries or more.
         high: upper bounds, likewise.
         priority: positive weights of the squared violations, shape (K,).
@@ -142,17 +142,17 @@ def move_on_line(  # noqa: PLR0913
         if v[j] < 0.0:
             first, last = max(first, (high[j] - u[j]) / v[j]), min(last, (low[j] - u[j]) / v[j])
     for i in range(len(priority)):
-        reached, slope, bend, size = rows[i, 0], 0.0, 0.0, abs(rows[i, 0])
+        reached, slope, bend, size = constraints[i, 0], 0.0, 0.0, abs(constraints[i, 0])
         e = 1 + m
         for j in range(m):
-            reached += rows[i, 1 + j] * u[j]
-            slope += rows[i, 1 + j] * v[j]
-            size += abs(rows[i, 1 + j] * u[j])
+            reached += constraints[i, 1 + j] * u[j]
+            slope += constraints[i, 1 + j] * v[j]
+            size += abs(constraints[i, 1 + j] * u[j])
             for n in range(j, m):
-                reached += rows[i, e] * u[j] * u[n]
-                slope += rows[i, e] * (u[j] * v[n] + v[j] * u[n])
-                bend += rows[i, e] * v[j] * v[n]
-                size += abs(rows[i, e] * u[j] * u[n])
+                reached += constraints[i, e] * u[j] * u[n]
+                slope += constraints[i, e] * (u[j] * v[n] + v[j] * u[n])
+                bend += constraints[i, e] * v[j] * v[n]
+                size += abs(constraints[i, e] * u[j] * u[n])
                 e += 1
         line[i, 0], line[i, 1], line[i, 2], line[i, 3] = reached, slope, bend, size
         line[i, 4] = form[i, 0] + 2.0 * form[i, 1] * u[0] + form[i, 2] * u[0] * u[0]
@@ -178,7 +178,7 @@ def violation_on_line(line: np.ndarray, priority: np.ndarray, t: float) -> float
     """Return the sum of the squared violations at a point of a line.
 
     Args:
-        line: coefficients of the rows, shape (K, `COEFFICIENTS`).
+        line: coefficients of the constraints, shape (K, `COEFFICIENTS`).
         priority: weights, shape (K,).
         t: the point.
     """
@@ -193,12 +193,12 @@ def violation_on_line(line: np.ndarray, priority: np.ndarray, t: float) -> float
 
 
 def point_of_change(which: int, i: int, line: np.ndarray) -> float:
-    """Return a point of a line at which a row may begin to hold, or is violated least.
+    """Return a point of a line at which a constraint may begin to hold, or is violated least.
 
     Args:
-        which: 0 for the vertex of a row, 1 and 2 for its roots, 3 and 4 for those of an uncertain
-            one.
-        i: number of the row.
+        which: 0 for the vertex of a constraint, 1 and 2 for its roots, 3 and 4 for those of an
+            uncertain one.
+        i: number of the constraint.
         line: coefficients, shape (K, `COEFFICIENTS`).
 
     Returns:
@@ -209,7 +209,7 @@ def point_of_change(which: int, i: int, line: np.ndarray) -> float:
         return ratio(-0.5 * rate, bend)
     if which > 2:
         if line[i, 4] == 0.0 and line[i, 6] == 0.0:
-            return 0.0  # the row is certain
+            return 0.0  # the constraint is certain
         constant, rate = constant * constant - line[i, 4], 2.0 * constant * rate - line[i, 5]
         bend = line[i, 1] * line[i, 1] - line[i, 6]
     square = rate * rate - 4.0 * bend * constant
@@ -220,5 +220,10 @@ def point_of_change(which: int, i: int, line: np.ndarray) -> float:
 
 
 def ratio(numerator: float, denominator: float) -> float:
-    """Return a quotient, 0 where it is none."""
+    """Return a quotient, 0 where it is none.
+
+    Args:
+        numerator: of it.
+        denominator: of it.
+    """
     return numerator / denominator if denominator != 0.0 else 0.0

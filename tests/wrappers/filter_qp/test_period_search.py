@@ -14,7 +14,7 @@ from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.wrappers import SafetyFilter
-from safe_envs.wrappers.filter_qp.held_rows import INWARDS
+from safe_envs.wrappers.filter_qp.period_search import INWARDS
 from tests.wrappers.filter_qp.test_filter_source import Decided
 
 x, v, y, w, u, a = sp.symbols("x v y w u a", real=True)
@@ -68,7 +68,7 @@ def test_a_harmless_input_stays_harmless():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_one_input_is_the_nearest_at_which_all_rows_hold(seed):
+def test_one_input_is_the_nearest_at_which_all_constraints_hold(seed):
     rng = np.random.default_rng(seed)
     barriers = list(random_barriers(rng, (x, v), 1 + seed % 2))
     safety_filter = SafetyFilter(CART, barriers, MARGIN, bounds=(-6, 6), dt=DT)

@@ -1,6 +1,7 @@
-"""Rows on a line of inputs, where all of them are known in closed form; see `held_rows`.
+"""Constraints on a line of inputs, where all are known in closed form; see `period_search`.
 
-A row has the coefficients of 1, of the m inputs u_j and, if it is quadratic, of u_j u_n, j <= n.
+A constraint has the coefficients of 1, of the m inputs u_j and, if it is quadratic, of u_j u_n, j
+<= n.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ BETTER = 0.999999999
 """Share of the squared violations that is left by a step that helps, beyond rounding."""
 
 
-class Rows:
-    """Rows of one state, or of a batch.
+class PeriodConstraints:
+    """Constraints of one state, or of a batch.
 
     Args:
-        rows: coefficients of each row, those of quadratic rows longer.
-        forms: of rows on one input with an uncertainty q_0, q_1, q_2, which ask for a u + b >=
+        coefficients: of each constraint, more of quadratic ones.
+        forms: of those on one input with an uncertainty q_0, q_1, q_2, which ask for a u + b >=
             sqrt(q_0 + 2 q_1 u + q_2 u^2), by their number.
         priorities: weights of the squared violations.
         flavour: "floats" of one state, or "arrays" of a batch.
@@ -35,16 +36,17 @@ class Rows:
 
     def __init__(
         self,
-        rows: Sequence[Sequence[Any]],
+        coefficients: Sequence[Sequence[Any]],
         forms: Mapping[int, Sequence[Any]],
         priorities: Sequence[float],
         flavour: Flavour,
         m: int,
     ) -> None:
-        self.rows, self.forms, self.priorities, self.m = rows, forms, priorities, m
+        self.coefficients, self.forms, self.priorities, self.m = coefficients, forms, priorities, m
         places = [(j, n) for j in range(m) for n in range(j, m)]
         self.bends = [
-            [(c, j, n) for c, (j, n) in zip(row[1 + m :], places, strict=False)] for row in rows
+            [(c, j, n) for c, (j, n) in zip(constraint[1 + m :], places, strict=False)]
+            for constraint in coefficients
         ]
         self.flavour: Flavour = flavour
         self.alone = flavour == "floats"
@@ -66,7 +68,7 @@ class Rows:
     def step(
         self, u: Sequence[Any], v: Sequence[Any], low: Sequence[Any], high: Sequence[Any]
     ) -> tuple[list[Any], Any]:
-        """Move along a line to where rows are violated least.
+        """Move along a line to where constraints are violated least.
 
         Args:
             u: m inputs.
@@ -88,7 +90,7 @@ class Rows:
             near, far = choose(dj > 0.0, ends[0], ends[1]), choose(dj > 0.0, ends[1], ends[0])
             first = choose(dj == 0.0, first, self.larger(first, near))
             last = choose(dj == 0.0, last, -self.larger(-last, -far))
-        lines = [self._line(i, u, d) for i in range(len(self.rows))]
+        lines = [self._line(i, u, d) for i in range(len(self.coefficients))]
         before = self._violation(lines, 0.0)
         best, least = 0.0, before
         for point in (*[t for line in lines for t in self._points(line)], proposed):
@@ -102,9 +104,9 @@ class Rows:
         return inside, self.ratio(least, before, 1.0)
 
     def _line(self, i: int, u: Sequence[Any], d: Sequence[Any]) -> _Line:
-        row, bends = self.rows[i], self.bends[i]
-        constant, rate, bend, size = row[0], 0.0, 0.0, abs(row[0])
-        for j, (cj, uj, dj) in enumerate(zip(row[1:], u, d, strict=False)):
+        constraint, bends = self.coefficients[i], self.bends[i]
+        constant, rate, bend, size = constraint[0], 0.0, 0.0, abs(constraint[0])
+        for j, (cj, uj, dj) in enumerate(zip(constraint[1:], u, d, strict=False)):
             constant, rate, size = constant + cj * uj, rate + cj * dj, size + abs(cj * uj)
             for c, first, n in bends:
                 if first == j:
@@ -137,7 +139,7 @@ class Rows:
         return total
 
     def _points(self, line: _Line) -> list[Any]:
-        """Return where on a line a row may begin to hold, or is violated least.
+        """Return where on a line a constraint may begin to hold, or is violated least.
 
         These are its roots, a little beyond, so that it holds, and the vertex between them.
         """
@@ -160,7 +162,7 @@ class Rows:
 
 
 class _Line(NamedTuple):
-    """A row on a line: constant + rate t + bend t^2, and the size of its terms.
+    """A constraint on a line: constant + rate t + bend t^2, and the size of its terms.
 
     Of an uncertain one, the form has the coefficients of 1, t and t^2.
     """

@@ -7,33 +7,33 @@ from typing import Any
 
 from safe_envs.wrappers.filter_qp.compiled import change_coefficients, second_order
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
-from safe_envs.wrappers.filter_qp.held_row_kernel import (
+from safe_envs.wrappers.filter_qp.period_kernel import (
     COEFFICIENTS,
     ENOUGH,
     ROUNDS,
     SLOW,
+    constraints_hold,
     end_of_period,
     move_on_line,
-    rows_hold,
 )
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 
 
-def write_held_rows(
+def write_period(
     body: Body,
     values: Values,
     qp: FilterQP,
-    rows: tuple[Sequence[Sequence[str]], Sequence[str]],
+    constraints: tuple[Sequence[Sequence[str]], Sequence[str]],
     method: tuple[Callable[..., Any], int],
     counts: Sequence[str],
 ) -> list[str]:
-    """Write how the action moves to where the constraints hold; see `held_rows`.
+    """Write how the action moves to where the constraints hold; see `period_search`.
 
     Args:
         body: receives the statements, which name the arrays of `ArrayDecision`.
         values: receives the formulas.
         qp: the QP.
-        rows: texts of the coefficients and offsets of its k constraints.
+        constraints: texts of the coefficients and offsets of its k constraints.
         method: kernel that projects the m inputs, and the scratch entries that it needs.
         counts: text of whether each constraint has a meaning; "" where it always has.
 
@@ -44,7 +44,7 @@ def write_held_rows(
     sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
     dt, bends, size = body.number(qp.dt), m * (m + 1) // 2, k + len(sampled)
     owners = [*range(k), *sampled]
-    body.table("held", [[rows[1][i], *rows[0][i], *["0.0"] * bends] for i in owners])
+    body.table("held", [[constraints[1][i], *constraints[0][i], *["0.0"] * bends] for i in owners])
     finite = []
     for place, i in enumerate(sampled, start=k):
         change = values.call(f"filter_change_{i}", change_coefficients(qp, i))
@@ -64,8 +64,8 @@ def write_held_rows(
     body.room("target", m)
     body.room("target_scratch", method[1])
     views = ", ".join(f"vector_view({name}, 0, {m})" for name in ("action", "low", "high", "w"))
-    hold = f"rows_hold({m}, held, held_form, action, slopes, held_offsets, value, missed)"
-    body.uses += [end_of_period, rows_hold, move_on_line, method[0]]
+    hold = f"constraints_hold({m}, held, held_form, action, slopes, held_offsets, value, missed)"
+    body.uses += [end_of_period, constraints_hold, move_on_line, method[0]]
     step = f"move_on_line({m}, held, held_form, low, high, held_priority, action, target, line)"
     axes = [
         f"    if left > {SLOW}:",
