@@ -110,7 +110,7 @@ class ArrayBatch:
         Raises:
             InvalidInputError: See `BatchActions.physical`.
         """
-        return self.step_physical(self._actions.physical(actions), due)
+        return self._hold(self._actions.physical(actions), due)
 
     def step_physical(self, u: Sequence[Any], due: np.ndarray | None) -> VectorStep:
         """Hold inputs for one control period.
@@ -125,6 +125,10 @@ class ArrayBatch:
         Raises:
             NumericalError: A state is not finite any more.
         """
+        # The caller may write to theirs again.
+        return self._hold([np.array(component, dtype=float) for component in u], due)
+
+    def _hold(self, u: Sequence[Any], due: np.ndarray | None) -> VectorStep:
         self.sent = u
         if self.actuators is not None:
             u = self.actuators.execute(u)

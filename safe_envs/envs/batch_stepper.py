@@ -176,12 +176,13 @@ class BatchStepper:
         if status not in (layout.DONE, layout.NOT_FINITE):
             self._refuse(status, given, restarts)
         batch.commit(states, counts, restarts)
+        own = told.copied()  # what the caller gets is the caller's
         if stepping:
-            batch.inputs = told.inputs
+            batch.inputs = own.inputs
         if status:
             require_sound(batch.components, observations, rewards, problem)
         # As with NumPy's filter, a step that raises is in no count of the filter.
-        self.tallies, self._told = tallies, told
+        self.tallies, self._told = tallies, own
         flags = told.flags
         info = self._info(readings, told)
         return observations, rewards, flags[layout.TERMINATED], flags[layout.TRUNCATED], info

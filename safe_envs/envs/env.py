@@ -110,7 +110,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     @property
     def measured(self) -> Sample | None:
         """What has arrived from the sensor; None where the observation is of the true state."""
-        return None if self._sensor is None else self._sensor.sample
+        return None if self._sensor is None else Sample(*map(tuple, self._sensor.sample))
 
     @property
     def state(self) -> np.ndarray:
@@ -207,7 +207,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Step with a physical input inside its bounds, as a filter returns it."""
-        self.sent = u
+        self.sent = u = tuple(u)
         if self._actuators is not None:
             u = self._actuators.execute(u)
         self.executed = u

@@ -161,12 +161,15 @@ def with_masks(info: Info, present: np.ndarray) -> Info:
 
     Args:
         info: of a batch, changed in place.
-        present: the envs that report it, bool (num_envs,).
+        present: the envs that report it, bool (num_envs,), of which each key gets a copy.
 
     Returns:
         The same object.
     """
-    info.update(dict.fromkeys(_mask_names(tuple(info)), present))
+    names = _mask_names(tuple(info))
+    masks = np.empty((len(names), len(present)), dtype=bool)
+    masks[:] = present
+    info.update(zip(names, masks, strict=True))
     return info
 
 

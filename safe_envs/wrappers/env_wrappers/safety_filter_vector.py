@@ -248,5 +248,5 @@ def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
 
 
 def _as_columns(components: Sequence[np.ndarray]) -> np.ndarray:
-    """Fresh components as columns; a single one needs no copy."""
-    return components[0].reshape(-1, 1) if len(components) == 1 else np.stack(components, axis=-1)
+    """Return components as columns, which the caller may write to."""
+    return np.stack(components, axis=-1)
