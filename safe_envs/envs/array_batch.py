@@ -95,7 +95,8 @@ class ArrayBatch:
             What is read off the states.
         """
         self._restart(np.flatnonzero(envs), points)
-        return self._read(tuple(self._actions.center), counted=envs)
+        with np.errstate(all="ignore"):
+            return self._read(tuple(self._actions.center), counted=envs)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `step_physical`.
@@ -135,7 +136,7 @@ class ArrayBatch:
         self.executed = u
         draws = self.noise.next(None if due is None else ~due)
         # A state that overflows is found by `_read`, which says so better than a warning.
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             self.components = self._simulation.integrator.step(self.components, u, draws)
             self._episodes.steps += 1
             if due is not None:

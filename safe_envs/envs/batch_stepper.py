@@ -176,7 +176,8 @@ class BatchStepper:
         if status not in (layout.DONE, layout.NOT_FINITE):
             self._refuse(status, given, restarts)
         batch.commit(states, counts, restarts)
-        own = told.copied()  # what the caller gets is the caller's
+        # What the caller gets of the filter is the caller's; of the other parts nothing is kept.
+        own = told.copied() if filtered else told
         if stepping:
             batch.inputs = own.inputs
         if status:

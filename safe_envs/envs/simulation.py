@@ -38,7 +38,7 @@ class Simulation:
     def measure(
         self, x: Components, u: Sequence[Any], time: Any
     ) -> tuple[Components, Components, Any, Any, Any]:
-        """Return what can be read off a state.
+        """Return what can be read off a state; arrays warn where a formula has no value.
 
         Args:
             x: components of the state.
@@ -51,8 +51,7 @@ class Simulation:
         """
         f, b = self._features, self._barriers
         if not self._floats:
-            with np.errstate(all="ignore"):
-                values = self._measure(*x, *u, time)
+            values = self._measure(*x, *u, time)
             return values[:f], defined_arrays(values[f:b]), *values[b:]
         try:
             values = self._measure(*x, *u, time)

@@ -276,7 +276,7 @@ class SafeVectorEnv(VectorInterface):
         if self.viewer is not None:
             begun = np.flatnonzero(episodes.begun).tolist()
             self.viewer.advance(self.state, self._times, np.stack(self.executed, axis=-1), begun)
-        info = with_masks(info, episodes.everywhere.copy())
+        info = with_masks(info, episodes.everywhere)
         if last:
             info.update(last)
         return observation, reward, terminated, truncated, info

@@ -118,7 +118,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
             reward,
             terminated,
             truncated,
-            {**info, **with_masks(shown, episodes.everywhere.copy())},
+            {**info, **with_masks(shown, episodes.everywhere)},
         )
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
