@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from safe_envs.dynamics.codegen import Components, stacked
 from safe_envs.envs.episode import Episodes
@@ -145,9 +146,12 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         """
         if not ended.any():
             return self._seen(observation, self.episodes.everywhere)
-        last = np.array(observation)
+        # Observations may be dicts or tuples of arrays.
+        space = self.single_observation_space
+        each = list(iterate(self.observation_space, observation))
         for i in np.flatnonzero(ended).tolist():
-            last[i] = info["final_obs"][i]
+            each[i] = info["final_obs"][i]
+        last = concatenate(space, each, create_empty_array(space, self.num_envs))
         info["final_info"] = {
             **info.get("final_info", {}),
             **with_masks(self._seen(last, self.episodes.everywhere), ended),
