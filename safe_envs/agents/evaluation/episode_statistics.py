@@ -7,6 +7,7 @@ import numpy as np
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.estimation import EstimationResults
 from safe_envs.agents.evaluation.rows import EpisodeSummary
+from safe_envs.agents.evaluation.rounding import SlightViolations
 from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.safe_flags import SafeFlags
 from safe_envs.agents.evaluation.safety_curve import CurveCounts
@@ -38,7 +39,7 @@ class EpisodeStatistics:
         self.safe = SafeFlags()
         self.steps = 0
         self.visited = VisitedStates.nothing(problem)
-        self._touching = 0
+        self._slight = SlightViolations(0, 0, 0.0)
         self._curve = CurveCounts(problem.steps)
         self._min_h = np.empty(_QUANTILES_OF)
         self._safe = self._counted = self._interventions = self._infeasible = 0
@@ -56,7 +57,7 @@ class EpisodeStatistics:
         self.safe.add(found.safe)
         self.steps += int(found.length.sum())
         self.visited = self.visited.joined(batch.visited)
-        self._touching += batch.touching
+        self._slight = self._slight.joined(batch.slight)
         self._curve.add(found.first_violation)
         self._safe += int(np.count_nonzero(found.safe))
         self._counted += int(counted.sum())
@@ -90,7 +91,9 @@ class EpisodeStatistics:
             min_h_median=median,
             min_h_p05=p05,
             violations=episodes - safe,
-            touching=self._touching,
+            touching=self._slight.touching,
+            below_rounding=self._slight.count,
+            worst_below_rounding=self._slight.worst,
             intervention_rate=share(self._interventions, self._counted),
             infeasible_rate=share(self._infeasible, self._counted),
             effort_mean=share(self._efforts.total, self._with_effort),

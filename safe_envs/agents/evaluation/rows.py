@@ -108,6 +108,9 @@ class EpisodeSummary:
         min_h_p05: 5 % quantile of it.
         violations: number of episodes that are not safe.
         touching: how many of these come no lower than h = 0 to rounding.
+        below_rounding: how many, these included, go no lower than a billionth of the largest h of
+            their episode, as where a filter rides h = 0.
+        worst_below_rounding: how low the lowest of them goes.
         intervention_rate: share of the steps up to a first violation; None if there is no such.
         infeasible_rate: share of these steps.
         effort_mean: mean over episodes of the mean |u|^2 of these steps.
@@ -124,6 +127,8 @@ class EpisodeSummary:
     min_h_p05: float
     violations: int
     touching: int
+    below_rounding: int = 0
+    worst_below_rounding: float = 0.0
     intervention_rate: float | None
     infeasible_rate: float | None
     effort_mean: float | None
@@ -254,4 +259,6 @@ class EvaluationRow(BoundSummary, EpisodeSummary):
         found |= {name: None for name in _HEIGHTS if not math.isfinite(found[name])}
         if self.estimation is None:
             del found["estimation"]
+        if not self.below_rounding:
+            del found["below_rounding"], found["worst_below_rounding"]
         return found
