@@ -6,8 +6,8 @@ import numpy as np
 
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.estimation import EstimationResults
-from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.agents.evaluation.rounding import SlightViolations
+from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.safe_flags import SafeFlags
 from safe_envs.agents.evaluation.safety_curve import CurveCounts

@@ -176,8 +176,8 @@ def test_violations_of_a_filter_that_rides_the_edge_are_told():
     assert (stored["violations"], stored["touching"], stored["below_rounding"]) == (4, 0, 4)
     worst = -answer.episode_columns()["min_h"].min()
     assert stored["worst_below_rounding"] == worst < 1e-10
-    told_of = f"all violations of hocbf:p=10,10 are below rounding, worst violation {worst:.2g}: they"
-    assert told_of in text
+    all_of_them = "all violations of hocbf:p=10,10 are below rounding"
+    assert f"{all_of_them}, worst violation {worst:.2g}: they settle on the edge" in text
     answer, stored, text = told("none")
     assert answer.rows[0].violations == 4
     assert "below_rounding" not in stored
