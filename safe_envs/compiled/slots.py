@@ -70,12 +70,12 @@ def observation_of(values: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def barriers_of(values: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the barriers."""
+    """Return the barriers, -inf where one has no value."""
     raise NotImplementedError
 
 
 def smallest_barrier(barriers: tuple[float, ...]) -> float:
-    """Return the smallest of the barriers; NaN where one is."""
+    """Return the smallest of the barriers."""
     raise NotImplementedError
 
 

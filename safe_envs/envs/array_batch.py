@@ -95,7 +95,8 @@ class ArrayBatch:
             What is read off the states.
         """
         self._restart(np.flatnonzero(envs), points)
-        return self._read(tuple(self._actions.center), counted=envs)
+        with np.errstate(all="ignore"):
+            return self._read(tuple(self._actions.center), counted=envs)
 
     def step(self, actions: Any, due: np.ndarray | None) -> VectorStep:
         """Hold actions in [-1, 1]; see `step_physical`.
@@ -110,7 +111,7 @@ class ArrayBatch:
         Raises:
             InvalidInputError: See `BatchActions.physical`.
         """
-        return self.step_physical(self._actions.physical(actions), due)
+        return self._hold(self._actions.physical(actions), due)
 
     def step_physical(self, u: Sequence[Any], due: np.ndarray | None) -> VectorStep:
         """Hold inputs for one control period.
@@ -125,13 +126,17 @@ class ArrayBatch:
         Raises:
             NumericalError: A state is not finite any more.
         """
+        # The caller may write to theirs again.
+        return self._hold([np.array(component, dtype=float) for component in u], due)
+
+    def _hold(self, u: Sequence[Any], due: np.ndarray | None) -> VectorStep:
         self.sent = u
         if self.actuators is not None:
             u = self.actuators.execute(u)
         self.executed = u
         draws = self.noise.next(None if due is None else ~due)
         # A state that overflows is found by `_read`, which says so better than a warning.
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(all="ignore"):
             self.components = self._simulation.integrator.step(self.components, u, draws)
             self._episodes.steps += 1
             if due is not None:
@@ -177,18 +182,18 @@ class ArrayBatch:
         if self.actuators is not None:
             info |= self.actuators.report()
         terminated = filled(outside > 0.0, self._shape)
-        sound = finite(h) and finite(rows)
+        reward = filled(reward, self._shape).copy()
+        sound = finite(rows) and finite(reward)
         for i in self._unobserved:
             sound = sound and finite(x[i])
         if np.count_nonzero(terminated):
             envs = np.flatnonzero(terminated)
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
         if not sound:
-            require_sound(x, h, observation, self._problem)
+            require_sound(x, observation, reward, self._problem)
         if self.sensor is not None:
             observation = self.sensor.observe(x, counted)
             info |= self.sensor.report(x)
         if self._problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        reward = filled(reward, self._shape).copy()
         return observation, reward, terminated, self._episodes.steps >= self._limit, info

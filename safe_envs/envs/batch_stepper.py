@@ -176,13 +176,14 @@ class BatchStepper:
         if status not in (layout.DONE, layout.NOT_FINITE):
             self._refuse(status, given, restarts)
         batch.commit(states, counts, restarts)
+        # What the caller gets of the filter is the caller's; of the other parts nothing is kept.
+        own = told.copied() if filtered else told
         if stepping:
-            batch.inputs = told.inputs
+            batch.inputs = own.inputs
         if status:
-            h = readings[:, layout.BARRIERS :].min(axis=1)
-            require_sound(batch.components, h, observations, problem)
+            require_sound(batch.components, observations, rewards, problem)
         # As with NumPy's filter, a step that raises is in no count of the filter.
-        self.tallies, self._told = tallies, told
+        self.tallies, self._told = tallies, own
         flags = told.flags
         info = self._info(readings, told)
         return observations, rewards, flags[layout.TERMINATED], flags[layout.TRUNCATED], info

@@ -42,7 +42,9 @@ class DelayLine:
 
     def exchange(self, u: Sequence[Any]) -> tuple[Any, ...]:
         """Send an input, and return the one that arrives in the same control period."""
-        self.under_way.append(tuple(u))
+        # What others do to their arrays must not reach what is under way.
+        own = tuple(u) if self._num_envs is None else tuple([np.array(c, dtype=float) for c in u])
+        self.under_way.append(own)
         return self.under_way.popleft()
 
     def restart(self, envs: np.ndarray | None = None) -> None:

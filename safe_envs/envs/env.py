@@ -17,7 +17,7 @@ from safe_envs.envs.noise import NoiseStream
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions
 from safe_envs.envs.sample import Sample
 from safe_envs.envs.sensor import sensor_of
-from safe_envs.envs.simulation import Simulation, steps_until
+from safe_envs.envs.simulation import LARGEST, Simulation, require_sound, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import OwnSpec
 from safe_envs.errors import InvalidInputError, NumericalError, flag
@@ -110,7 +110,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
     @property
     def measured(self) -> Sample | None:
         """What has arrived from the sensor; None where the observation is of the true state."""
-        return None if self._sensor is None else self._sensor.sample
+        return None if self._sensor is None else Sample(*map(tuple, self._sensor.sample))
 
     @property
     def state(self) -> np.ndarray:
@@ -207,7 +207,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Step with a physical input inside its bounds, as a filter returns it."""
-        self.sent = u
+        self.sent = u = tuple(u)
         if self._actuators is not None:
             u = self._actuators.execute(u)
         self.executed = u
@@ -281,12 +281,11 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         features, barriers, reward, outside, goal = self._simulation.measure(
             x, u, episode.steps * self.problem.dt
         )
+        if not abs(sum(x) + sum(features) + reward) < LARGEST:
+            with np.errstate(over="ignore"):
+                seen = np.array([features], dtype=np.float32)
+            require_sound([np.array([c]) for c in x], seen, np.array([reward]), self.problem)
         h = min(barriers)
-        if not math.isfinite(h + sum(x)):
-            raise NumericalError(
-                f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or"
-                " raise substeps"
-            )
         if left := outside > 0.0:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)

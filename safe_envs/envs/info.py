@@ -7,7 +7,7 @@ float64 arrays from a scalar env, arrays with the batch in front from a vector e
 |---|---|---|
 | `cost` | float | 1.0 where the state is unsafe, 0.0 elsewhere |
 | `violation` | bool | some barrier is negative |
-| `barrier` | float64 (k,) | value of each barrier |
+| `barrier` | float64 (k,) | value of each barrier, -inf where it has none |
 | `h_min` | float | smallest barrier value of the episode so far |
 | `episode_cost` | float | sum of the costs of the episode so far |
 
@@ -178,12 +178,15 @@ def with_masks(info: Info, present: np.ndarray) -> Info:
 
     Args:
         info: of a batch, changed in place.
-        present: the envs that report it, bool (num_envs,).
+        present: the envs that report it, bool (num_envs,), of which each key gets a copy.
 
     Returns:
         The same object.
     """
-    info.update(dict.fromkeys(_mask_names(tuple(info)), present))
+    names = _mask_names(tuple(info))
+    masks = np.empty((len(names), len(present)), dtype=bool)
+    masks[:] = present
+    info.update(zip(names, masks, strict=True))
     return info
 
 

@@ -21,6 +21,18 @@ class Sample(NamedTuple):
     received: Sequence[Any]
 
 
+def read_only(components: Sequence[Any]) -> tuple[Any, ...]:
+    """Return components that others may read, and not write to.
+
+    Args:
+        components: arrays.
+    """
+    found = tuple([np.asarray(component).view() for component in components])
+    for component in found:
+        component.flags.writeable = False
+    return found
+
+
 def merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
     """Return samples of a batch that are one in some envs and another elsewhere.
 

@@ -9,11 +9,15 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function
+from safe_envs.dynamics.defined import NO_VALUE, careful_floats, defined, defined_arrays
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.initial_distribution import StartSampler
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
+
+LARGEST = 3e38
+"""Below it single precision has all numbers."""
 
 
 class Simulation:
@@ -26,15 +30,15 @@ class Simulation:
         self._barriers = self._features + len(problem.barriers)
         read = readings(problem)
         self.timed = TIME in set().union(*(sp.sympify(e).free_symbols for e in read))
-        self._measure = compile_function(
-            (*problem.plant.states, *problem.plant.inputs, TIME), read, flavour
-        )
+        self._read = (*problem.plant.states, *problem.plant.inputs, TIME), tuple(read)
+        self._measure = compile_function(*self._read, flavour)
+        self._floats = flavour == "floats"
         self.starts = start_sampler(problem)
 
     def measure(
         self, x: Components, u: Sequence[Any], time: Any
     ) -> tuple[Components, Components, Any, Any, Any]:
-        """Return what can be read off a state.
+        """Return what can be read off a state; arrays warn where a formula has no value.
 
         Args:
             x: components of the state.
@@ -42,12 +46,18 @@ class Simulation:
             time: since the start of the episode, in s.
 
         Returns:
-            The features, the barriers, the reward, the distance by which the workspace was left (>
-            0 outside), and the goal (>= 0 where it is reached).
+            The features, the barriers (-inf where one has no value), the reward, the distance by
+            which the workspace was left (> 0 outside), and the goal (>= 0 where it is reached).
         """
-        values = self._measure(*x, *u, time)
         f, b = self._features, self._barriers
-        return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
+        if not self._floats:
+            values = self._measure(*x, *u, time)
+            return values[:f], defined_arrays(values[f:b]), *values[b:]
+        try:
+            values = self._measure(*x, *u, time)
+        except NO_VALUE:
+            values = careful_floats(*self._read, (*x, *u, time))
+        return values[:f], defined(values[f:b]), *values[b:]
 
 
 def start_sampler(problem: SafetyProblem, start: str | None = None) -> StartSampler:
@@ -93,22 +103,35 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
 
 
 def require_sound(
-    x: Components, h: np.ndarray, observation: np.ndarray, problem: SafetyProblem
+    x: Components, observation: np.ndarray, reward: np.ndarray, problem: SafetyProblem
 ) -> None:
-    """Check that the states of a batch and what is read off them are finite.
+    """Check that the states of a batch, their observations and rewards are finite.
+
+    States are numbers of single precision, as observations are.
 
     Args:
         x: components of the states.
-        h: smallest barrier of each.
         observation: of each.
+        reward: of each.
         problem: that is simulated.
 
     Raises:
         NumericalError: Some are not.
     """
-    sound = np.isfinite(x).all(axis=0) & np.isfinite(observation).all(axis=1) & np.isfinite(h)
-    if not sound.all():
+    seen, there = np.isfinite(observation), (np.abs(x) < LARGEST).all(axis=0)
+    sound = there & seen.all(axis=1) & np.isfinite(reward)
+    if sound.all():
+        return
+    if there.all():
+        worst = int(np.flatnonzero(~sound)[0])
+        state = [float(component[worst]) for component in x]
+        i = int(seen[worst].argmin())
+        what = "reward" if seen[worst, i] else f"observation {problem.features[i].name}"
+        at = ", ".join(f"{s} = {v:.6g}" for s, v in zip(problem.plant.states, state, strict=True))
         raise NumericalError(
-            f"the states of envs {np.flatnonzero(~sound)[:5].tolist()} of {problem.name!r}"
-            " have left the finite numbers; reduce dt or raise substeps"
+            f"the {what} of {problem.name!r} has no finite value at {at}; check it there"
         )
+    raise NumericalError(
+        f"the states of envs {np.flatnonzero(~there)[:5].tolist()} of {problem.name!r}"
+        " have left the finite numbers; reduce dt or raise substeps"
+    )

@@ -18,7 +18,7 @@ from safe_envs.envs.compiled_batch import CompiledBatch
 from safe_envs.envs.episode import Episodes, last_of_episode
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.envs.reset_options import RequestedStart, ResetOptions, StartingPoints
-from safe_envs.envs.sample import Sample
+from safe_envs.envs.sample import Sample, read_only
 from safe_envs.envs.seeding import Seeds
 from safe_envs.envs.vector_interface import VectorInterface
 from safe_envs.errors import InvalidInputError, flag, require_whole
@@ -86,19 +86,19 @@ class SafeVectorEnv(VectorInterface):
 
     @property
     def sent(self) -> Sequence[Any]:
-        """The components of the physical inputs that the last step was given."""
-        return self._batch.sent
+        """The components of the physical inputs that the last step was given, read-only."""
+        return read_only(self._batch.sent)
 
     @property
     def executed(self) -> Sequence[Any]:
-        """The components of those that were executed in it; see `SafeEnv`."""
-        return self._batch.executed
+        """The components of those that were executed in it, read-only; see `SafeEnv`."""
+        return read_only(self._batch.executed)
 
     @property
     def measured(self) -> Sample | None:
-        """What has arrived from the sensors; see `SafeEnv.measured`."""
+        """What has arrived from the sensors, read-only; see `SafeEnv.measured`."""
         sensor = getattr(self._batch, "sensor", None)
-        return None if sensor is None else sensor.sample
+        return None if sensor is None else Sample(*map(read_only, sensor.sample))
 
     @property
     def state(self) -> np.ndarray:
@@ -276,7 +276,7 @@ class SafeVectorEnv(VectorInterface):
         if self.viewer is not None:
             begun = np.flatnonzero(episodes.begun).tolist()
             self.viewer.advance(self.state, self._times, np.stack(self.executed, axis=-1), begun)
-        info = with_masks(info, episodes.everywhere.copy())
+        info = with_masks(info, episodes.everywhere)
         if last:
             info.update(last)
         return observation, reward, terminated, truncated, info

@@ -6,14 +6,11 @@ from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.integrators import euler_maruyama_step, rate
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.simulation import readings
+from safe_envs.envs.simulation import LARGEST, readings
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NotCompilableError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
-
-_LARGEST = 3e38
-"""Below it single precision has all numbers."""
 
 
 def world_source(problem: SafetyProblem, data: Data) -> Source:
@@ -114,10 +111,12 @@ def _measure(problem: SafetyProblem, data: Data) -> Source:
         "measure", {"x": plant.states, "u": plant.inputs, "time": TIME}, readings(problem), data
     )
     seen = [f"single(values[{i}])" for i in range(features)]
-    heights = [f"values[{features + i}]" for i in range(barriers)]
+    values = [f"values[{features + i}]" for i in range(barriers)]
+    heights = [f"{h} if isfinite({h}) else -inf" for h in values]
     observed = {f.expression for f in problem.features}
     unseen = [f"x[{i}]" for i, state in enumerate(plant.states) if state not in observed]
-    sizes = [f"abs(values[{i}])" for i in range(last)] + [f"abs({entry})" for entry in unseen]
+    read = [*unseen, *(f"values[{i}]" for i in (*range(features), last))]
+    sizes = [f"abs({entry})" for entry in read]
     smaller = "".join(
         f"    h = h if barriers[{i}] >= h else barriers[{i}]\n" for i in range(1, barriers)
     )
@@ -129,7 +128,7 @@ def _measure(problem: SafetyProblem, data: Data) -> Source:
         f"def has_left(values):\n    return values[{last + 1}] > 0.0\n"
         f"def has_ended(values):\n"
         f"    return values[{last + 1}] > 0.0 or values[{last + 2}] >= 0.0\n"
-        f"def is_finite(x, values):\n    return {_sum(sizes)} < {_LARGEST}\n"
+        f"def is_finite(x, values):\n    return {_sum(sizes)} < {LARGEST}\n"
     )
 
 

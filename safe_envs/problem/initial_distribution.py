@@ -11,6 +11,7 @@ import sympy as sp
 
 from safe_envs.compiled.draws import MOST_TRIES
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.dynamics.philox import START, Key, StreamReader
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
@@ -94,7 +95,7 @@ class StartSampler:
         if start.condition is not None:
             condition = model.numeric(start.condition)
             self._tries = _TRIES_AT_ONCE
-            self._accept = compile_function(model.states, (condition,), "floats")
+            self._accept = BarrierFunction(model.states, (condition,), "floats")
 
     def draw(self, reader: StreamReader, key: Key, episode: int) -> Components:
         """Draw the initial state of an episode.

@@ -83,6 +83,9 @@ class NamedSets:
         with np.errstate(all="ignore"):
             table = stacked(self._values(*x), len(x[0]))
         parts = np.split(table, self._ends, axis=1)
+        for name, part in zip(self.names, parts, strict=True):
+            if name == SAFE:  # a barrier without a value is not safe
+                part[~np.isfinite(part)] = -np.inf
         values = np.array([part.min(axis=1) for part in parts])
         if np.isnan(values).any():
             i, b = np.argwhere(np.isnan(values))[0].tolist()

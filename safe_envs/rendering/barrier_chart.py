@@ -49,8 +49,10 @@ class BarrierChart:
             snapshot: of the episode.
         """
         times, h = thinned_minima(snapshot.times, snapshot.h)
-        low, high = min(float(h.min()), 0.0), max(float(h.max()), 0.0)
+        known = h[np.isfinite(h)]
+        low, high = min(known.min(initial=0.0), 0.0), max(known.max(initial=0.0), 0.0)
         room = 0.12 * max(high - low, 1e-9)
+        h = np.maximum(h, low - room)  # what has no value is at the lower end
         axes = Axes(self._box, self._period(float(times[-1])), (low - room, high + room))
         self._draw_curve(canvas, axes, times, h)
         left, top, width, height = self._box

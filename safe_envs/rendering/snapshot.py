@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.problem.problem import SafetyProblem
 
 _KEPT = 5000
@@ -75,7 +75,7 @@ class History:
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
-        self._barriers = compile_function(
+        self._barriers = BarrierFunction(
             problem.plant.states, [b.expression for b in problem.barriers], "floats"
         )
         # The columns are the time, the smallest barrier, and the states.

@@ -105,6 +105,8 @@ def number(value: float, scale: float = 0.0) -> str:
         The text.
     """
     size = abs(value)
+    if size == math.inf:
+        return "inf" if value > 0.0 else "\u2212inf"
     if size <= 1e-3 * scale:
         value = size = 0.0
     if size >= 1e6 or 0.0 < size < 1e-3:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -205,7 +206,7 @@ class Run:
         return {
             "filter": self.name,
             "violated_at": self._violated_at,
-            "h_min": float(self._info["h_min"]),
+            "h_min": h if math.isfinite(h := float(self._info["h_min"])) else None,
             "interventions": self._info.get("episode_interventions"),
             "seconds": self._steps * self._dt,
         }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -67,7 +68,7 @@ class MeasurementFilter:
     @property
     def lost(self) -> Any:
         """How many values were lost since the reset, of all channels."""
-        return self._known.lost
+        return copy(self._known.lost)
 
     @property
     def tracker(self) -> BeliefTracker:

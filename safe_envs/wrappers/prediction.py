@@ -10,12 +10,12 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components
+from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import NumericalError
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers.filter_qp import FilterQP
-from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
 
 
 class Prediction:

@@ -10,6 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import finite, stacked
+from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import InvalidInputError
 from safe_envs.problem.clf import CLF
@@ -26,7 +27,7 @@ from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.estimation import Estimator, make_estimator
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
 from safe_envs.wrappers.filter_qp.barrier_values import BarrierValues
-from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
+from safe_envs.wrappers.filter_qp.component_filter import ComponentFilter
 from safe_envs.wrappers.filter_qp.problem_arguments import known_for_problem
 from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
 from safe_envs.wrappers.measurement_filter import FiltersMeasurements, certain_states
@@ -221,7 +222,7 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
                 bound is above its upper one.
             ConfigurationError: A name is unknown, a value is missing, or a bound is infinite where
                 it may not be.
-            NumericalError: The constraint has no finite value at a state.
+            NumericalError: A constraint has no finite value at a state where its barrier has one.
         """
         x, u = doubles("state", x), doubles("nominal input", u_nominal)
         if x.shape == self._state_shape and u.shape == self._input_shape:
@@ -250,7 +251,8 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
                 for part in (action, margin, active, slack, barriers, *given)
             ]
             if not finite(barrier.T):
-                self._require_values(barrier.reshape(-1, len(barriers)), states)
+                table = self._defined(barrier.reshape(-1, len(barriers)), states)
+                barrier = table.reshape(barrier.shape)
         cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
         cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
         return FilterDecision(
@@ -284,7 +286,7 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
         if not math.isfinite(sum(barrier)):
             with np.errstate(all="ignore"):
                 barrier = stacked(self._barriers_arrays(*[np.array([c]) for c in state]), 1)[0]
-            self._require_values(barrier[None], state)
+            barrier = self._defined(np.asarray(barrier)[None], state)[0]
         return FilterDecision(
             np.array(action),
             np.array(margin),

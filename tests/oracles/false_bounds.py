@@ -87,7 +87,7 @@ def rotated():
 
 
 def corridor():
-    """Two rows on one input, whose margins of first order cannot both be met."""
+    """Two rows on one input, which overshoot at this period without margins of first order."""
     system = ControlAffineSDE.from_rate((x,), (u,), [u], diffusion=[0])
     ranges = {x: (-2, 2)}
     return state_problem(

@@ -98,7 +98,7 @@ def test_a_stochastic_condition_takes_the_generator_of_its_row():
             {"box": [-20.0, 20.0], "horizon": 10.0},
             "zero",
         ),
-        ("safe_envs/DubinsObstacle-v0", "hocbf:p=20,20", {"box": [-20.0, 20.0]}, "nominal"),
+        ("safe_envs/DubinsObstacle-v0", "hocbf:p=12,12", {"box": [-20.0, 20.0]}, "nominal"),
         ("safe_envs/QuadrotorAltitude-v0", "hocbf:p=18,18", {"box": [-50.0, 50.0]}, "nominal"),
     ],
 )
@@ -125,12 +125,13 @@ def test_numeric_margins_are_kept_and_first_order_needs_a_period():
         SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)])
     with pytest.raises(ConfigurationError, match=r"dt = -1"):
         SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=-1.0)
-    # psi = -u + 1 - x, psi' = -u: the plain action 1 makes psi fall by dt = .1 within the period.
+    # psi = -u + 1 - x, psi' = -u: within the period dt = .1 the action 1/1.1 makes psi fall from
+    # .1/1.1 to 0.
     for state, nominal in (([0.0], [5.0]), ([[0.0]], [[5.0]])):
         result = SafetyFilter(integrator(), row, bounds=[(-9.0, 9.0)], dt=0.1).filter(
             state, nominal
         )
-        assert np.ravel(result.action) == pytest.approx([0.9])
+        assert np.ravel(result.action) == pytest.approx([1 / 1.1])
 
 
 def joint(low=-3.0, high=3.0, rows=None, **changes):

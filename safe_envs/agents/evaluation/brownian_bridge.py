@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.dynamics.lie import quadratic_variation_rate, vanishes
 from safe_envs.dynamics.normal import standard_exponentials
 from safe_envs.dynamics.philox import BRIDGE, EpisodeUniforms
@@ -59,7 +60,7 @@ class BrownianBridge:
         plant = problem.plant
         self.reached = reached_by_noise(problem)
         self._rates = compile_function(plant.states, bridge_rates(problem), "arrays")
-        self._h = compile_function(
+        self._h = BarrierFunction(
             plant.states,
             [plant.numeric(barrier.expression) for barrier in problem.barriers],
             "arrays",
@@ -90,9 +91,11 @@ class BrownianBridge:
         """
         ends = np.minimum(before, after)
         if any(self.reached):
-            reach = np.sqrt((after - before) ** 2 + stacked(self._rates(*x), len(ends)) * draws)
-            # Rounding must not lift the minimum above an end.
-            ends = np.minimum(ends, 0.5 * (before + after - reach))
+            # With an end without a value, which is -inf, there is nothing to draw.
+            with np.errstate(invalid="ignore"):
+                reach = np.sqrt((after - before) ** 2 + stacked(self._rates(*x), len(ends)) * draws)
+                # Rounding must not lift the minimum above an end.
+                ends = np.fmin(ends, 0.5 * (before + after - reach))
         return ends
 
 

@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.bridge_source import bridge_draws, bridge_sourc
 from safe_envs.agents.evaluation.decision_source import Decider, decision_source
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.episode_kernel import play_episodes
-from safe_envs.agents.evaluation.rounding import touching
+from safe_envs.agents.evaluation.rounding import slight_violations
 from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.agents.policies.policy_source import policy_source
@@ -180,6 +180,6 @@ def _batch(
     return PlayedBatch(
         results,
         start,
-        touching(problem, ~results.safe, h_min, depth, lowest),
+        slight_violations(problem, ~results.safe, h_min, depth, lowest),
         VisitedStates.of(violating, inputs, slack, deepest, depth),
     )

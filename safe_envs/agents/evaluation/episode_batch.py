@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_envs.agents.evaluation.estimation import EstimationCounts, EstimationResults
-from safe_envs.agents.evaluation.rounding import touching
+from safe_envs.agents.evaluation.rounding import SlightViolations, slight_violations
 from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.visited_states import StateWatch, VisitedStates
 from safe_envs.dynamics.codegen import Components
@@ -86,18 +86,18 @@ class EpisodeBatch:
             effort=np.where(counted > 0, self.effort[part] / np.maximum(counted, 1), np.nan),
         )
 
-    def touching(self, problem: SafetyProblem, count: int) -> int:
-        """Count the violations among the first `count` episodes that only touch h = 0.
+    def slight(self, problem: SafetyProblem, count: int) -> SlightViolations:
+        """Return which violations among the first `count` episodes are no more than rounding.
 
         Args:
             problem: whose barriers they are.
             count: number of episodes.
 
         Returns:
-            The number of such violations.
+            Their numbers, and the worst of them.
         """
         part = slice(count)
-        return touching(
+        return slight_violations(
             problem,
             ~self.safe[part],
             self.h_min[part],
@@ -113,13 +113,13 @@ class PlayedBatch:
     Attributes:
         results: of each episode that counts.
         starts: their start states, shape (E, n).
-        touching: number of violations that only touch h = 0.
+        slight: violations that are no more than rounding.
         visited: states that may contradict a bound.
         estimation: sums over the estimates of each episode; None without an estimator.
     """
 
     results: EpisodeResults
     starts: np.ndarray
-    touching: int
+    slight: SlightViolations
     visited: VisitedStates
     estimation: EstimationResults | None = None

@@ -6,6 +6,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.estimation import EstimationResults
+from safe_envs.agents.evaluation.rounding import SlightViolations
 from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.safe_flags import SafeFlags
@@ -38,7 +39,7 @@ class EpisodeStatistics:
         self.safe = SafeFlags()
         self.steps = 0
         self.visited = VisitedStates.nothing(problem)
-        self._touching = 0
+        self._slight = SlightViolations(0, 0, 0.0)
         self._curve = CurveCounts(problem.steps)
         self._min_h = np.empty(_QUANTILES_OF)
         self._safe = self._counted = self._interventions = self._infeasible = 0
@@ -56,7 +57,7 @@ class EpisodeStatistics:
         self.safe.add(found.safe)
         self.steps += int(found.length.sum())
         self.visited = self.visited.joined(batch.visited)
-        self._touching += batch.touching
+        self._slight = self._slight.joined(batch.slight)
         self._curve.add(found.first_violation)
         self._safe += int(np.count_nonzero(found.safe))
         self._counted += int(counted.sum())
@@ -77,7 +78,10 @@ class EpisodeStatistics:
         """Return statistics with intervals of a confidence; None where no step counts."""
         episodes, safe = len(self.safe), self._safe
         low, high = rate_interval(safe, episodes, confidence)
-        p05, median = np.quantile(self._min_h[:episodes], (0.05, 0.5)).tolist()
+        h = self._min_h[:episodes]
+        # Between -inf and a number there is nothing.
+        method = "linear" if np.isfinite(h).all() else "lower"
+        p05, median = np.quantile(h, (0.05, 0.5), method=method).tolist()
         return EpisodeSummary(
             episodes=episodes,
             safe=safe,
@@ -87,7 +91,9 @@ class EpisodeStatistics:
             min_h_median=median,
             min_h_p05=p05,
             violations=episodes - safe,
-            touching=self._touching,
+            touching=self._slight.touching,
+            below_rounding=self._slight.count,
+            worst_below_rounding=self._slight.worst,
             intervention_rate=share(self._interventions, self._counted),
             infeasible_rate=share(self._infeasible, self._counted),
             effort_mean=share(self._efforts.total, self._with_effort),

@@ -44,12 +44,16 @@ def _of_starts(row: EvaluationRow) -> list[str]:
 
 def _of_violations(row: EvaluationRow) -> list[str]:
     """Return how many violations are no more than rounding."""
-    touching, violations = row.touching, row.violations
-    if not touching:
+    touching, below, violations = row.touching, row.below_rounding, row.violations
+    if not (touching or below):
         return []
-    some = (
-        "all violations" if touching == violations else f"{touching} of the {violations} violations"
-    )
+    count = max(touching, below)
+    some = "all violations" if count == violations else f"{count} of the {violations} violations"
+    if below > touching:
+        return [
+            f"{some} of {row.filter} are below rounding, worst violation"
+            f" {row.worst_below_rounding:.2g}: they settle on the edge h = 0, and safe is h > 0"
+        ]
     return [
         f"{some} of {row.filter} come no lower than h = 0 to rounding: they touch the edge, and"
         " safe is h > 0"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +17,7 @@ from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.trajectories import EpisodeRecorder
 from safe_envs.agents.policies.base import Policy
 from safe_envs.dynamics.codegen import Components, compile_function, filled
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.wrappers.value.priced_values import PricedValues
 
@@ -145,7 +145,7 @@ class PricedPolicy(Policy):
     def __init__(self, values: PricedValues, price: int, env: SafeVectorEnv) -> None:
         self._values, self._price, self._env = values, price, env
         problem = env.problem
-        self._barriers: Callable[..., Components] = compile_function(
+        self._barriers = BarrierFunction(
             problem.plant.states, tuple(b.expression for b in problem.barriers), "arrays"
         )
 

@@ -20,7 +20,7 @@ _MEANS = (
     "effort_mean",
     "return_mean",
 )
-_SUMS = ("episodes", "safe", "violations", "touching")
+_SUMS = ("episodes", "safe", "violations", "touching", "below_rounding")
 
 
 def pooled(summaries: Sequence[EpisodeSummary], confidence: float) -> EpisodeSummary:
@@ -40,6 +40,7 @@ def pooled(summaries: Sequence[EpisodeSummary], confidence: float) -> EpisodeSum
     return EpisodeSummary(
         **sums,
         **means,
+        worst_below_rounding=max(each.worst_below_rounding for each in summaries),
         safety_rate=math.fsum(rates) / len(rates),
         ci_low=low,
         ci_high=high,

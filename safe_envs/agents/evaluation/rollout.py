@@ -87,7 +87,7 @@ def play(
         yield PlayedBatch(
             batch.results(count),
             np.stack(starts, axis=1)[:count],
-            batch.touching(world.problem, count),
+            batch.slight(world.problem, count),
             batch.watch.visited(count),
             batch.estimation and batch.estimation.results(count),
         )

@@ -1,10 +1,10 @@
-"""Whether an episode violates, or only touches h = 0 to rounding."""
+"""Violations that are no more than rounding."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -17,29 +17,40 @@ _EPSILONS = 64 * np.finfo(float).eps
 
 
 _NEARLY = 1e-6
+"""In parts of the largest h: `touches`, which compiles formulas, looks at no violation beyond."""
+
+_SLIGHT = 1e-9
+"""What rounding and integration may add up to where a filter rides h = 0, in parts of the largest
+h."""
 
 
-def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Select the episodes for `touches`, which compiles formulas.
+class SlightViolations(NamedTuple):
+    """Violations that are no more than rounding.
 
-    Args:
-        lowest: minimum h of each episode, shape (B,).
-        largest: maximum h of each, shape (B,).
-
-    Returns:
-        Which episodes are to be looked at, shape (B,).
+    Attributes:
+        touching: how many only touch h = 0.
+        count: how many, these included, go no lower than a billionth of the episode's largest h.
+        worst: how low the lowest of them goes.
     """
-    return lowest >= -_NEARLY * largest
+
+    touching: int
+    count: int
+    worst: float
+
+    def joined(self, other: SlightViolations) -> SlightViolations:
+        """Return those of both."""
+        worst = max(self.worst, other.worst)
+        return SlightViolations(self.touching + other.touching, self.count + other.count, worst)
 
 
-def touching(
+def slight_violations(
     problem: SafetyProblem,
     violating: np.ndarray,
     lowest: np.ndarray,
     largest: np.ndarray,
     x: np.ndarray,
-) -> int:
-    """Count the violations that only touch h = 0.
+) -> SlightViolations:
+    """Return which violations are no more than rounding.
 
     Args:
         problem: whose barriers they are of.
@@ -49,10 +60,12 @@ def touching(
         x: the states where the minima were, shape (B, n).
 
     Returns:
-        The number of such violations.
+        Their numbers, and the worst of them.
     """
-    part = violating & may_touch(lowest, largest)
-    return int(touches(problem, lowest[part], x[part]).sum()) if part.any() else 0
+    part = violating & (lowest >= -_NEARLY * largest)
+    touching = int(touches(problem, lowest[part], x[part]).sum()) if part.any() else 0
+    slight = lowest[violating & (lowest >= -_SLIGHT * largest)]
+    return SlightViolations(touching, len(slight), float(-slight.min(initial=0.0)))
 
 
 def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
@@ -106,10 +107,14 @@ class EpisodeSummary:
         safety_rate: their share.
         ci_low: lower end of its interval.
         ci_high: upper end.
-        min_h_median: median of the minimum h over the first 65,536 episodes.
+        min_h_median: median of the minimum h over the first 65,536 episodes, -inf where h has no
+            value.
         min_h_p05: 5 % quantile of it.
         violations: number of episodes that are not safe.
         touching: how many of these come no lower than h = 0 to rounding.
+        below_rounding: how many, these included, go no lower than a billionth of the largest h of
+            their episode, as where a filter rides h = 0.
+        worst_below_rounding: how low the lowest of them goes.
         intervention_rate: share of the steps up to a first violation; None if there is no such.
         infeasible_rate: share of these steps.
         effort_mean: mean over episodes of the mean |u|^2 of these steps.
@@ -126,6 +131,8 @@ class EpisodeSummary:
     min_h_p05: float
     violations: int
     touching: int
+    below_rounding: int = 0
+    worst_below_rounding: float = 0.0
     intervention_rate: float | None
     infeasible_rate: float | None
     effort_mean: float | None
@@ -231,6 +238,9 @@ class LearningSummary:
     rates: list[float]
 
 
+_HEIGHTS = ("min_h_median", "min_h_p05")
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRow(BoundSummary, EpisodeSummary):
     """All that an evaluation finds for one filter.
@@ -250,10 +260,13 @@ class EvaluationRow(BoundSummary, EpisodeSummary):
     estimation: EstimationSummary | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as JSON-able data."""
+        """Return the row as JSON-able data; h is null where it has no value."""
         head = {"filter": self.filter, "policy": self.policy, "kind": self.kind}
         bound = self.posterior_bound
         found = head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
+        found |= {name: None for name in _HEIGHTS if not math.isfinite(found[name])}
         if self.estimation is None:
             del found["estimation"]
+        if not self.below_rounding:
+            del found["below_rounding"], found["worst_below_rounding"]
         return found

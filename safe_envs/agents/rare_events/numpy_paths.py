@@ -148,7 +148,8 @@ class _Batch:
         count, world, lowest, time = len(self._paths), self._world, self._lowest, self._time
         x = world.components
         rest, _ = center_and_half_width(world.problem)
-        features = simulation.measure(x, rest, self._begun * world.problem.dt)[0]
+        with np.errstate(all="ignore"):
+            features = simulation.measure(x, rest, self._begun * world.problem.dt)[0]
         observation = stacked(features, len(x[0])).astype(np.float32)
         ends = time.copy()
         alive = (lowest > 0.0) & ~self._over

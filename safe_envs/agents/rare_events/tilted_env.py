@@ -11,6 +11,7 @@ import sympy as sp
 
 from safe_envs.agents.rare_events.path_noise import PathNoise
 from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.dynamics.lie import gradient
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.envs.world_source import noise_channels
@@ -42,7 +43,7 @@ class TiltedNoiseEnv(SafeVectorEnv):
         super().__init__(problem, len(lengths))
         plant = problem.plant
         self._slopes = compile_function(plant.states, barrier_slopes(problem), "arrays")
-        self._barriers = compile_function(
+        self._barriers = BarrierFunction(
             plant.states,
             [plant.numeric(barrier.expression) for barrier in problem.barriers],
             "arrays",

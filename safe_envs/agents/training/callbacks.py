@@ -30,7 +30,7 @@ class SafetyFigures(BaseCallback):
     |---|---|
     | `rate` | share of the last 100 episodes without a violation |
     | `episode_cost` | their mean number of unsafe steps |
-    | `h_min` | their mean smallest barrier value |
+    | `h_min` | their mean smallest barrier value, where all have one |
     | `violations` | unsafe steps in the training so far |
     | `interventions`, `infeasible` | shares of all steps so far, with a filter |
 
@@ -53,9 +53,9 @@ class SafetyFigures(BaseCallback):
             )
             counts["infeasible"] = counts.get("infeasible", 0) + int((~batch["feasible"]).sum())
         if done.size:
-            ended = zip(
-                batch["episode_cost"][done].tolist(), batch["h_min"][done].tolist(), strict=True
-            )
+            # Files have no -inf, which stands for a barrier without a value.
+            lowest = [h if math.isfinite(h) else None for h in batch["h_min"][done].tolist()]
+            ended = zip(batch["episode_cost"][done].tolist(), lowest, strict=True)
             counts["episodes"] = list(deque([*counts["episodes"], *map(list, ended)], _EPISODES))
         return True
 
@@ -71,6 +71,7 @@ class SafetyFigures(BaseCallback):
         """
         whole = [count for name, count in counts.items() if name != "episodes"]
         ended = [number for episode in counts["episodes"] for number in episode]
+        numbers = [n for place, n in enumerate(ended) if n is not None or place % 2 == 0]
         known = (
             {"steps", "violations", "episodes"}
             <= set(counts)
@@ -82,7 +83,7 @@ class SafetyFigures(BaseCallback):
             and len(ended) == 2 * len(counts["episodes"]) <= 2 * _EPISODES
         ):
             raise ValueError(f"the counts are {list(counts)}")
-        if not all(type(number) in (int, float) and math.isfinite(number) for number in ended):
+        if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
             raise ValueError("the last episodes are not numbers")
         self.counts = counts
 
@@ -96,12 +97,13 @@ class SafetyFigures(BaseCallback):
             if name in counts
         }
         if counts["episodes"]:
-            cost, h_min = np.array(counts["episodes"]).T
+            cost, h_min = zip(*counts["episodes"], strict=True)
             found |= {
-                "rate": float(np.mean(cost == 0)),
-                "episode_cost": float(cost.mean()),
-                "h_min": float(h_min.mean()),
+                "rate": float(np.mean(np.equal(cost, 0))),
+                "episode_cost": float(np.mean(cost)),
             }
+            if None not in h_min:
+                found["h_min"] = float(np.mean(h_min))
         return found
 
 

@@ -27,6 +27,7 @@ from safe_envs.scripts.figures.style import (
     WARM,
     add_legend,
     add_title,
+    drawable,
     look,
     wrapped,
 )
@@ -196,7 +197,7 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
     for row in evaluation.rows:
         name = row.filter
         h = evaluation.trajectories[name].barrier
-        h = h[np.isfinite(h).mean(axis=1) >= 0.5]
+        h = drawable(h[np.isnan(h).mean(axis=1) <= 0.5])
         time = np.arange(len(h)) * evaluation.problem.dt
         low, median, high = np.nanquantile(h, (0.05, 0.5, 0.95), axis=1)
         color = looks[name]["color"]

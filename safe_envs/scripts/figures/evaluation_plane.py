@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from safe_envs.agents.evaluation.results import Evaluation
-from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.figures.labels import quantity
-from safe_envs.scripts.figures.style import UNSAFE
+from safe_envs.scripts.figures.style import UNSAFE, drawable
 
 _SHOWN = 8
 _GRID = 300
@@ -70,16 +70,15 @@ def _safe_function(
     problem: SafetyProblem, across: int, up: int, start: np.ndarray
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Return the smallest barrier over the plane, with the other states as at the start."""
-    barriers = compile_function(
+    barriers = BarrierFunction(
         problem.plant.states, tuple(b.expression for b in problem.barriers), "arrays"
     )
 
     def smallest(horizontal: np.ndarray, vertical: np.ndarray) -> np.ndarray:
         state: list[Any] = list(start)
         state[across], state[up] = horizontal, vertical
-        return np.minimum.reduce(
-            [np.broadcast_to(value, horizontal.shape) for value in barriers(*state)]
-        )
+        found = [np.broadcast_to(value, horizontal.shape) for value in barriers(*state)]
+        return drawable(np.minimum.reduce(found))
 
     return smallest
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
@@ -183,3 +184,13 @@ def add_legend(figure: Figure, handles: Sequence[Any], most: int = _MOST_COLUMNS
 
 def _legend(figure: Figure, handles: Sequence[Any], columns: int) -> Any:
     return figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
+
+
+def drawable(h: np.ndarray) -> np.ndarray:
+    """Return values of barriers that can be drawn: -inf is twice as deep as all else is large.
+
+    Args:
+        h: values, -inf where there is none, NaN where nothing is to be drawn.
+    """
+    known = np.abs(h[np.isfinite(h)])
+    return np.maximum(h, -2.0 * known.max(initial=1.0))

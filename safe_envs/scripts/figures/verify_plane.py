@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.figures.labels import labelled, symbol
-from safe_envs.scripts.figures.style import COLORS, DASHES, QUIET, UNSAFE
+from safe_envs.scripts.figures.style import COLORS, DASHES, QUIET, UNSAFE, drawable
 from safe_envs.scripts.figures.verify_panel import (
     INFEASIBLE,
     DrawnVerification,
@@ -45,7 +45,7 @@ def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
     formulas, plane = found.formulas, _plane(problem)
     grid, x = _states_over(answer, plane, worst, _GRID)
     chain = formulas.chain(x)
-    h = chain[:, formulas.barriers].min(axis=1)
+    h = drawable(np.nan_to_num(chain[:, formulas.barriers].min(axis=1), nan=-np.inf))
 
     def shaped(values: np.ndarray) -> np.ndarray:
         return values.reshape(grid[0].shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -69,7 +70,7 @@ def _columns(rows: Sequence[Row]) -> list[Column]:
     }
     safety, _ = without_empty([Column(title, tuple(each)) for title, each in cells.items()])
     behavior = {
-        "min\u00a0h 5\u00a0%": [f"{row['min_h_p05']:.3g}" for row in rows],
+        "min\u00a0h 5\u00a0%": [f"{_lowest(row):.3g}" for row in rows],
         "inter\u00advened": [_share(row, "intervention_rate") for row in rows],
         "infeas\u00adible": [_share(row, "infeasible_rate") for row in rows],
         "return": [f"{row['return_mean']:.4g}" for row in rows],
@@ -145,7 +146,12 @@ def failures_text(sweep: Sweep, failures: Sequence[JobOutcome]) -> str:
 def _worst(rows: Sequence[Row], count: int) -> list[Row]:
     """Return the cells with the smallest rate, and among equals the smallest h."""
     done = [row for row in rows if row["error"] is None]
-    return sorted(done, key=lambda row: (row["safety_rate"], row["min_h_p05"]))[:count]
+    return sorted(done, key=lambda row: (row["safety_rate"], _lowest(row)))[:count]
+
+
+def _lowest(row: Row) -> float:
+    """Return the 5 % quantile of the minimum h, which is null where h has no value."""
+    return -math.inf if row["min_h_p05"] is None else row["min_h_p05"]
 
 
 def _best_cells(row: Row) -> tuple[str, str]:

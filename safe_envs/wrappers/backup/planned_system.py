@@ -10,10 +10,10 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function, filled
+from safe_envs.dynamics.defined import NO_VALUE, defined_arrays
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.wrappers.backup.closed_part import closed_part
-from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
 
 _FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
 
@@ -156,13 +156,13 @@ class PlannedSystem:
         return tuple(found)
 
     def barriers(self, x: Components) -> Components:
-        """Return the barriers at states, k components.
+        """Return the barriers at states, k components, -inf where one has no value.
 
         Args:
             x: p components (B,).
         """
         with np.errstate(all="ignore"):
-            return self.compiled["arrays"][0](*x)[: self.count]
+            return defined_arrays(self.compiled["arrays"][0](*x)[: self.count])
 
     def advanced(self, x: Components, u: Components) -> Components:
         """Return the states one period later.

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, filled
+from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.wrappers.backup.planned_system import PlannedSystem
-from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE
 
 _CHUNK = 2048
 """States that are simulated at once: more of them no longer fit into a processor's cache."""

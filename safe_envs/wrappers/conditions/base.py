@@ -54,10 +54,10 @@ class Condition(ABC):
     A condition holds in continuous time, but an input is held for a control period dt. Along the
     held input the constraint psi = a u + b changes by dt psi' + O(dt^2), with psi' the derivative
     along the flow (for stochastic conditions the generator: then it is the expectation that
-    changes). `sampling_margin` "first-order" therefore asks for psi + dt min(psi', 0) >= 0, so that
-    psi stays nonnegative over the period up to O(dt^2); psi' is quadratic in u and is taken at the
-    action that the condition without a margin allows, which is O(dt) away. A number asks for psi >=
-    that number.
+    changes). `sampling_margin` "first-order" therefore asks for psi >= 0 and psi + dt psi' >= 0, so
+    that psi stays nonnegative over the period up to O(dt^2). Both hold at the executed input, in
+    which psi' is quadratic; see `safe_envs.wrappers.filter_qp.period_search`. A number asks for psi
+    >= that number.
 
     Attributes:
         name: under which messages show it; by default that of the class. Names of

@@ -96,6 +96,11 @@ class AffineConstraint:
     domain: tuple[sp.Expr, ...] = ()
     alternatives: tuple[AffineConstraint, ...] = ()
 
+    @property
+    def functions(self) -> tuple[sp.Expr, ...]:
+        """The barrier, or the functions that it is the maximum of; () where none is stated."""
+        return tuple(c.chain[0] for c in self.alternatives or (self,) if c.chain)
+
     @classmethod
     def after(
         cls,

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.dynamics.codegen import Components, Flavour, compile_function, stacked
+from safe_envs.dynamics.codegen import Flavour
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
-from safe_envs.errors import InvalidInputError, NumericalError
+from safe_envs.errors import InvalidInputError
 from safe_envs.independent_copies import IndependentCopies
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
@@ -46,7 +46,7 @@ class MonitorLayer(IndependentCopies):
         self.problem = spec.problem(one, space, name, limit)
         self._spec = spec
         h = [spec.model.numeric(barrier.expression) for barrier in spec.named]
-        self._barriers: Any = compile_function(spec.model.states, h, flavour)
+        self._barriers = BarrierFunction(spec.model.states, h, flavour)
         self._low, self._high = space.low.astype(np.float64), space.high.astype(np.float64)
         self._kind = space.dtype
         is_drawn = env.render_mode == "rgb_array"
@@ -158,36 +158,5 @@ class SafetyMonitor(
 
     def _seen(self, observation: Any) -> Info:
         self._x = tuple(self._spec.state(observation).tolist())
-        try:
-            barrier = self._barriers(*self._x)
-        except (ArithmeticError, ValueError) as error:
-            raise _undefined(self.problem.name, self._x) from error
-        h = min(barrier)
-        if not math.isfinite(h):
-            raise _undefined(self.problem.name, self._x)
-        return self._episode.count(barrier, h)
-
-
-def _undefined(name: str, x: Sequence[float]) -> NumericalError:
-    return NumericalError(
-        f"a barrier over {name} has no finite value at the state {list(x)}; check it there"
-    )
-
-
-def barrier_table(barriers: Any, name: str, x: Components) -> np.ndarray:
-    """Return the values of the barriers at a batch of states, shape (B, k).
-
-    Args:
-        barriers: compiled for arrays.
-        name: of the problem, for errors.
-        x: n components of the states.
-
-    Raises:
-        NumericalError: one is not finite.
-    """
-    with np.errstate(all="ignore"):
-        table = stacked(barriers(*x), len(x[0]))
-    bad = ~np.isfinite(table).all(axis=1)
-    if bad.any():
-        raise _undefined(name, [float(c[bad][0]) for c in x])
-    return table
+        barrier = self._barriers(*self._x)
+        return self._episode.count(barrier, min(barrier))

@@ -8,8 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from safe_envs.dynamics.codegen import Components
+from safe_envs.dynamics.codegen import Components, stacked
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, VectorStep, with_masks
 from safe_envs.errors import InvalidInputError
@@ -17,7 +18,7 @@ from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.autoreset import autoreset_mode
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.env_wrappers.layers_below import doubt_layers
-from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer, barrier_table
+from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer
 
 
 class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
@@ -118,7 +119,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
             reward,
             terminated,
             truncated,
-            {**info, **with_masks(shown, episodes.everywhere.copy())},
+            {**info, **with_masks(shown, episodes.everywhere)},
         )
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
@@ -145,9 +146,12 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         """
         if not ended.any():
             return self._seen(observation, self.episodes.everywhere)
-        last = np.array(observation)
+        # Observations may be dicts or tuples of arrays.
+        space = self.single_observation_space
+        each = list(iterate(self.observation_space, observation))
         for i in np.flatnonzero(ended).tolist():
-            last[i] = info["final_obs"][i]
+            each[i] = info["final_obs"][i]
+        last = concatenate(space, each, create_empty_array(space, self.num_envs))
         info["final_info"] = {
             **info.get("final_info", {}),
             **with_masks(self._seen(last, self.episodes.everywhere), ended),
@@ -159,7 +163,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
     def _seen(self, observation: np.ndarray, counted: np.ndarray) -> Info:
         """Read the states; `counted` are the envs whose observations are new."""
         self._x = _columns(self._spec.state(observation, (self.num_envs,)))
-        barrier = barrier_table(self._barriers, self.problem.name, self._x)
+        barrier = stacked(self._barriers(*self._x), self.num_envs)
         return self.episodes.count(barrier, barrier.min(axis=1), counted)
 
 

@@ -89,7 +89,7 @@ typedef struct {{
 typedef struct {{
     {name}_inputs action; /* input to be executed, always inside its bounds */
     {name}_inputs pursued; /* the proposed input{", or that of the goal" * interface.proposes} */
-    {real} barrier[{macro}_CONSTRAINTS]; /* value of each barrier; safe where it is not negative */
+    {real} barrier[{macro}_CONSTRAINTS]; /* safe where not negative; -INFINITY without a value */
     {real} margin[{macro}_CONSTRAINTS]; /* of each constraint at the action */
     {real} slack[{macro}_CONSTRAINTS]; /* by how much the action violates each, if not feasible */
     bool active[{macro}_CONSTRAINTS]; /* constraints that bind or cannot be met */

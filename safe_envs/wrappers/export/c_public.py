@@ -82,6 +82,8 @@ def public_functions(
     )
     data = f"    const numbers data = {{constants, {program.data.array().size}}};\n" * needs_data
     nan = number(float("nan"))
+    everywhere = [i for i in range(len(interface.constraints)) if i not in program.partial]
+    overflows = "".join(f" || !isfinite(barrier.at[{i}])" for i in everywhere)
     bounded = "true"
     if not interface.endless:
         ends = [f"all_finite({part}_values, {macro}_INPUTS)" for part in ("low", "high")]
@@ -158,13 +160,13 @@ static {name}_status refuse(const {name}_input *input, {name}_status status, {na
     const vector work = {{scratch, {max(interface.scratch, 1)}}};
 {data}    const decide_result found = {call};
     const numbers_{len(interface.constraints)} barrier = {barrier};
-    if (!found.sound || !all_finite(barrier.at, {macro}_CONSTRAINTS)) {{
+    if (!found.sound{overflows}) {{
         return refuse(input, {macro}_UNDEFINED, result);
     }}
 {chosen}
     bool acts = false;
     for (int i = 0; i < {macro}_CONSTRAINTS; i++) {{
-        result->barrier[i] = barrier.at[i];
+        result->barrier[i] = isfinite(barrier.at[i]) ? barrier.at[i] : ({real})-INFINITY;
         result->margin[i] = found.reached.at[i];
         result->slack[i] = found.slack.at[i];
         result->active[i] = found.acting.at[i] > 0;

@@ -30,11 +30,13 @@ class FilterProgram(NamedTuple):
         source: the functions `decide` and `barrier_values`.
         data: their numbers.
         proposes: whether the filter pursues a goal of its own, in place of the proposed input.
+        partial: the constraints whose barrier may have no value.
     """
 
     source: Source
     data: Data
     proposes: bool
+    partial: tuple[int, ...]
 
 
 def filter_program(safety_filter: SafetyFilter) -> FilterProgram:
@@ -51,7 +53,7 @@ def filter_program(safety_filter: SafetyFilter) -> FilterProgram:
     barriers = [model.numeric(barrier.expression) for barrier, _ in safety_filter.pairs]
     source = _Decision(qp, data).source()
     source += formulas("barrier_values", {"x": qp.symbols}, barriers, data)
-    return FilterProgram(source, data, qp.clf is not None)
+    return FilterProgram(source, data, qp.clf is not None, qp.partial)
 
 
 class _Decision(ArrayDecision):
@@ -79,7 +81,6 @@ class _Decision(ArrayDecision):
         body, k, m = self._body, self._k, self._m
         action = [f"action[{j}]" for j in range(m)]
         margin = [f"margin[{i}]" for i in range(k)]
-        self._finite.append(" + ".join(margin if self._single else [*action, *margin]))
         if self._single:
             body.add("cause = 0")
         else:
@@ -96,10 +97,7 @@ class _Decision(ArrayDecision):
             "slack": [f"0.0 if feasible else max(-{g}, 0.0)" for g in margin],
         }
         body.add(*(f"{name} = ({''.join(f'{e}, ' for e in es)})" for name, es in parts.items()))
-        body.add(
-            f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}",
-            f"return {', '.join(parts)}, feasible, cause, sound",
-        )
+        body.add(f"return {', '.join(parts)}, feasible, cause, sound")
 
 
 class _WritableBody(Body):

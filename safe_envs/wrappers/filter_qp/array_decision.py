@@ -6,14 +6,15 @@ import itertools
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
-from safe_envs.wrappers.filter_qp.compiled import domain_of, functions_of
+from safe_envs.wrappers.filter_qp.compiled import domain_of, functions_of, second_order
 from safe_envs.wrappers.filter_qp.decision_kernel import (
     aim_outwards,
     furthest_constraint,
     take_nearest_function,
 )
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values, causing_barrier, largest_slacks
-from safe_envs.wrappers.filter_qp.kernel_choice import kernel_for
+from safe_envs.wrappers.filter_qp.period_text import write_period
+from safe_envs.wrappers.filter_qp.projection_choice import projection_for
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.qp.kernels.majorant import majorant_plane, work_of_majorant
 from safe_envs.wrappers.qp.kernels.one_constraint import (
@@ -49,26 +50,39 @@ class ArrayDecision:
         self._sampled = [i for i, c in constraints if c.change is not None]
         self._maxima = [i for i, c in constraints if c.alternatives]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
-        self._second_order = bool(self._uncertain) and self._m == 1 and not self._goal
-        self._method, self._room = kernel_for(
+        self._second_order = second_order(qp)
+        self._method, self._room = projection_for(
             self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
         self._values, self._body = Values(qp, data), Body(data)
         self._planes = self._values.solver.planes
         self._single = self._k == 1 and qp.plain
         width = self._m + 1
-        self._a = [[f"values[{i * width + j}]" for j in range(self._m)] for i in range(self._k)]
-        self._b = [f"values[{i * width + self._m}]" for i in range(self._k)]
+        self._a = [[self._value(i * width + j, i) for j in range(self._m)] for i in range(self._k)]
+        self._b = [self._value(i * width + self._m, i) for i in range(self._k)]
         self._growth = self._k * width
         self._h = self._growth + self._goal * width
         self._levels = [len(domain_of(qp.constraints[i])) for i in self._reciprocal]
-        self._forms = self._h + sum(self._levels)
+        self._heights = self._h + sum(self._levels)
+        self._forms = self._heights + len(qp.partial)
         self._finite: list[str] = []
+
+    def _value(self, place: int, i: int) -> str:
+        """Return the text of a value of constraint i; 0 where its barrier has none."""
+        value = f"values[{place}]"
+        return f"({value} if known[{i}] > 0.0 else 0.0)" if i in self._qp.partial else value
 
     def source(self) -> Source:
         """Return the function, and those that it calls."""
         body, m, size = self._body, self._m + self._goal, self._k + self._goal
         body.add(*self._values.lines)
+        if self._qp.partial:
+            known = ["1.0"] * self._k
+            for place, i in enumerate(self._qp.partial, start=self._heights):
+                row = range(i * (self._m + 1), (i + 1) * (self._m + 1))
+                total = " + ".join(f"values[{entry}]" for entry in (place, *row))
+                known[i] = f"1.0 if isfinite({total}) else 0.0"
+            body.vector("known", known)
         body.table("a", self._a)
         body.vector("b", self._b)
         for name, count in (("action", m), ("margin", size), ("active", size)):
@@ -83,9 +97,12 @@ class ArrayDecision:
         self._constraints()
         self._minimise()
         if self._sampled:
-            self._sample()
-            self._minimise()
+            method = projection_for(self._k + len(self._sampled), self._m)
+            rows = self._rows, self._offsets[: self._k]
+            counts = [self._counts(i) for i in range(self._k)]
+            self._finite += write_period(body, self._values, self._qp, rows, method, counts)
         self._leave_domains()
+        self._check()
         self._answer()
         return self._values.source + body.source(self.parameters)
 
@@ -141,6 +158,10 @@ class ArrayDecision:
             expressions = functions_of(self._qp.constraints[i])
             self._body.add(f"of_{i} = {self._values.call(f'filter_functions_{i}', expressions)}")
             entries = [f"of_{i}[{e}]" for e in range(len(expressions))]
+            if i in self._qp.partial:
+                defined = f"known[{i}] > 0.0 and isfinite({' + '.join(entries)})"
+                self._body.add(f"known[{i}] = 1.0 if {defined} else 0.0")
+                entries = [f"({entry} if known[{i}] > 0.0 else 0.0)" for entry in entries]
             lines = [entries[k : k + m + 2] for k in range(0, len(entries), m + 2)]
             self._body.table(f"given_{i}", lines)
             self._finite.append(" + ".join(line[-1] for line in lines))
@@ -157,6 +178,7 @@ class ArrayDecision:
         inside, start = ["1.0"] * self._k, self._h
         for i, count in zip(self._reciprocal, self._levels, strict=True):
             above = " and ".join(f"values[{start + j}] > 0.0" for j in range(count))
+            above = f"known[{i}] == 0.0 or {above}" if i in self._qp.partial else above
             inside[i] = f"1.0 if {above} else 0.0"
             start += count
         body.vector("inside", inside)
@@ -170,11 +192,10 @@ class ArrayDecision:
         asked, held = list(self._b), [list(row) for row in self._a]
         for i in self._reciprocal:
             demand = self._values.call(f"filter_demand_{i}", [self._qp.constraints[i].demand])
-            asked[i] = f"{asked[i]} - {demand}[0] if inside[{i}] > 0.0 else 0.0"
+            asked[i] = f"{asked[i]} - {demand}[0] if {self._counts(i)} else 0.0"
             held[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in held[i]]
-        changed = self._reciprocal or self._sampled
-        self._asked = "asked" if changed else "b"
-        if changed:
+        self._asked = "asked" if self._reciprocal else "b"
+        if self._reciprocal:
             body.vector("asked", asked)
         self._offsets = [f"{self._asked}[{i}]" for i in range(k)]
         for place, i in enumerate(self._uncertain):
@@ -183,12 +204,13 @@ class ArrayDecision:
             forms = {i: place for place, i in enumerate(self._uncertain)}
             entries = [
                 [
-                    f"values[{self._forms + 3 * forms[i] + e}]" if i in forms else "0.0"
+                    self._value(self._forms + 3 * forms[i] + e, i) if i in forms else "0.0"
                     for e in range(3)
                 ]
                 for i in range(k)
             ]
             body.table("form", entries)
+        self._rows = held
         if self._goal:
             goal_row = [f"goal_row[0, {j}]" for j in range(self._m + 1)]
             held = [*([*row, "0.0"] for row in held), goal_row]
@@ -208,7 +230,7 @@ class ArrayDecision:
         """
         body, m = self._body, self._m
         count = (m + 1) * (m + 2) // 2
-        form = [f"values[{self._forms + place * count + e}]" for e in range(count)]
+        form = [self._value(self._forms + place * count + e, i) for e in range(count)]
         self._finite.append(" + ".join(form))
         if self._second_order:
             return
@@ -216,8 +238,8 @@ class ArrayDecision:
             slopes, constant = self._planes[i]
             slopes, constant = [body.number(s) for s in slopes], body.number(constant)
         else:
-            places = itertools.combinations_with_replacement(range(m + 1), 2)
-            entry = dict(zip(places, form, strict=True))
+            pairs = itertools.combinations_with_replacement(range(m + 1), 2)
+            entry = dict(zip(pairs, form, strict=True))
             square = range(m + 1)
             body.table(f"form_{i}", [[entry[min(j, e), max(j, e)] for e in square] for j in square])
             body.room(f"slopes_{i}", m)
@@ -253,18 +275,14 @@ class ArrayDecision:
             body.add(f"feasible = {' and '.join(met)}")
             body.uses.append(row_tolerance)
 
-    def _sample(self) -> None:
-        """Write how far the constraints fall while the input is held."""
-        qp, body = self._qp, self._body
-        dt = body.number(qp.dt)
-        held = f"({''.join(f'action[{j}], ' for j in range(self._m))})"
-        for i in self._sampled:
-            change = self._values.call(f"filter_change_{i}", [qp.constraints[i].change], held)
-            fall = f"asked[{i}] -= {dt} * max(-{change}[0], 0.0)"
-            body.add(f"if inside[{i}] > 0.0:\n        {fall}" if i in self._reciprocal else fall)
+    def _counts(self, i: int) -> str:
+        """Return the text of whether constraint i has a meaning; "" where it always has."""
+        parts = [f"inside[{i}] > 0.0"] if i in self._reciprocal else []
+        parts += [f"known[{i}] > 0.0"] if i in self._qp.partial else []
+        return " and ".join(parts)
 
     def _leave_domains(self) -> None:
-        """Write what conditions outside their domain make of the decision."""
+        """Write what conditions without a meaning make of the decision."""
         body = self._body
         for i in self._reciprocal:
             body.uses.append(row_margin)
@@ -275,12 +293,20 @@ class ArrayDecision:
                 "    feasible = False",
             )
 
+    def _check(self) -> None:
+        """Write whether all numbers are finite, and what barriers without a value make of them."""
+        body = self._body
+        action = [f"action[{j}]" for j in range(0 if self._single else self._m)]
+        self._finite.append(" + ".join([*action, *(f"margin[{i}]" for i in range(self._k))]))
+        body.add(f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}")
+        for i in self._qp.partial:
+            lost = f"margin[{i}], active[{i}], feasible = -inf, 1.0, False"
+            body.add(f"if known[{i}] == 0.0:", f"    {lost}")
+
     def _answer(self) -> None:
         """Write the decision."""
         body, k, m = self._body, self._k, self._m
         action = [f"action[{j}]" for j in range(m)]
-        margin = [f"margin[{i}]" for i in range(k)]
-        self._finite.append(" + ".join(margin if self._single else [*action, *margin]))
         cause = "0"
         if not self._single:
             arguments = f"{m}, a, {self._asked}, proposed, w, inside, active"
@@ -290,7 +316,6 @@ class ArrayDecision:
         proposed = "".join(f"proposed[{j}], " for j in range(m))
         body.add(
             f"acts = {' or '.join(f'active[{i}] > 0.0' for i in range(k))}",
-            f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}",
             f"chosen = ({''.join(f'{entry}, ' for entry in action)})",
             f"slack = ({slack})",
             f"wanted = {f'({proposed})' if self._goal else 'u'}",

@@ -12,6 +12,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Flavour, compile_function
+from safe_envs.dynamics.defined import defined_arrays
 from safe_envs.errors import NumericalError
 from safe_envs.wrappers.conditions import AffineConstraint
 from safe_envs.wrappers.conditions.parts import Pairs
@@ -68,10 +69,13 @@ class BarrierValues:
         Args:
             values: of the symbols of `qp`, arrays (B,).
         """
-        return self._barriers_arrays(*values)
+        return defined_arrays(self._barriers_arrays(*values))
 
-    def _require_values(self, barrier: np.ndarray, x: Sequence[Any]) -> None:
-        """Raise NumericalError where a barrier (B, k) at states is not finite."""
-        bad = np.flatnonzero(~np.isfinite(barrier).all(axis=1))
-        if bad.size:
-            raise self.undefined("the barrier", [float(np.atleast_1d(c)[bad[0]]) for c in x])
+    def _defined(self, barrier: np.ndarray, x: Sequence[Any]) -> np.ndarray:
+        """Return barriers (B, k) at states, -inf where one has no value; raise on overflow."""
+        bad = ~np.isfinite(barrier)
+        lost = [i for i in range(bad.shape[1]) if i not in self.qp.partial and bad[:, i].any()]
+        if lost:
+            at = int(bad[:, lost[0]].argmax())
+            raise self.undefined("the barrier", [float(np.atleast_1d(c)[at]) for c in x], lost[:1])
+        return np.where(bad, -np.inf, barrier)

@@ -50,6 +50,7 @@ class CompiledQP:
         self._sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
         self._maxima = [i for i, c in enumerate(qp.constraints) if c.alternatives]
+        self._exact = second_order(qp)
         arrays = flavour == "arrays"
         self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
         self._symbols = (*qp.symbols, *(s for term in qp.terms for s in term.symbols))
@@ -57,7 +58,8 @@ class CompiledQP:
             (constants(qp.low), constants(qp.high)) if arrays else (qp.low, qp.high)
         )
         self.weights = qp.weights
-        self._choose: Any = np.where if arrays else _choose
+        self._choose: Any = np.where if arrays else choose
+        self._isfinite: Any = np.isfinite if arrays else math.isfinite
         self._larger: Any = np.maximum if arrays else max
         self._tolerance: Any = tolerances if arrays else tolerance
         self._project: Any = dispatch.project_arrays if arrays else dispatch.project_floats
@@ -124,23 +126,56 @@ class CompiledQP:
 
     def _split(
         self, values: Components
-    ) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
+    ) -> tuple[list[Any], list[Any], Sequence[Any], dict[int, Any], dict[int, Any], dict[int, Any]]:
         """Take values apart.
 
+        A constraint whose barrier has no value is 0, which every input meets.
+
         Returns:
-            a and b of each constraint, the goal's offset and coefficients, what is positive in the
-            domains of reciprocal conditions, and Q of uncertain constraints.
+            a and b of each constraint, the goal's offset and coefficients, whether each reciprocal
+            condition is inside its domain, Q of uncertain constraints, and whether each barrier and
+            its constraint have values that may have none, by their numbers.
         """
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
-        goal_end = forms_at - sum(map(len, self._domains))
+        levels_end = forms_at - len(self._qp.partial)
+        goal_end = levels_end - sum(map(len, self._domains))
         forms = {
             i: values[forms_at + k * entries : forms_at + (k + 1) * entries]
             for k, i in enumerate(self._uncertain)
         }
-        goal, levels = values[count * width : goal_end], values[goal_end:forms_at]
-        return [row[:-1] for row in rows], [row[-1] for row in rows], goal, levels, forms
+        goal, levels = values[count * width : goal_end], values[goal_end:levels_end]
+        inside = self._inside(levels)
+        heights = zip(self._qp.partial, values[levels_end:forms_at], strict=True)
+        # At the end of where it has a value, its derivatives may have none.
+        known = {i: self._isfinite(h + sum(rows[i])) for i, h in heights}
+        for i, has_value in known.items():
+            rows[i] = [self._choose(has_value, entry, 0.0) for entry in rows[i]]
+            if i in forms:
+                forms[i] = [self._choose(has_value, entry, 0.0) for entry in forms[i]]
+            if i in inside:
+                inside[i] = self._choose(has_value, inside[i], True)
+        a, b = [row[:-1] for row in rows], [row[-1] for row in rows]
+        return a, b, goal, inside, forms, known
+
+    def undefined_at(self, x: Sequence[float]) -> list[int]:
+        """Return the constraints that have no finite value at a state; all where that is unclear.
+
+        Args:
+            x: components of the state, followed by those of `FilterQP.runtime`.
+        """
+        at = self._with_terms([np.array([c]) for c in x])
+        with np.errstate(all="ignore"):
+            a, b, _, inside, forms, known = self._split(self._values(*at))
+            found = []
+            for i in range(self._count):
+                counts = inside.get(i, np.True_) & known.get(i, np.True_)
+                parts = [*a[i], b[i], *forms.get(i, ())]
+                parts += [self._demand(i, at, counts)] if i in self._reciprocal else []
+                parts += self._changes[i](*at) if i in self._sampled and np.all(counts) else []
+                found += [] if np.isfinite(sum(parts)).all() else [i]
+        return found or list(range(self._count))
 
     def _inside(self, levels: Sequence[Any]) -> dict[int, Any]:
         """Return whether each reciprocal condition is inside its domain, by its number."""
@@ -151,16 +186,19 @@ class CompiledQP:
             start += len(domain)
         return found
 
-    def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
+    def _demand(self, i: int, x: Sequence[Any], counts: Any) -> Any:
         """Return what a reciprocal condition demands; floats have no 1/h outside its domain."""
-        return 0.0 if inside is False else self._demands[i](*x)[0]
+        return 0.0 if counts is False else self._choose(counts, self._demands[i](*x)[0], 0.0)
 
-    def _loss(self, i: int, x: Sequence[Any], action: Sequence[Any], inside: Any) -> Any:
-        """Return the rate at which a constraint falls under an action, else 0."""
-        if inside is False:
-            return 0.0
-        loss = self._larger(-self._changes[i](*x, *action)[0], 0.0)
-        return loss if inside is None else self._choose(inside, loss, 0.0)
+    def _fall(self, i: int, x: Sequence[Any], counts: Any) -> Sequence[Any]:
+        """Return the coefficients of a constraint's change within a period, 0 where none counts."""
+        if counts is False:
+            return [0.0] * (self._m + 1 + self._m * (self._m + 1) // 2)
+        fall = [self._qp.dt * entry for entry in self._changes[i](*x)]
+        if counts is not True:
+            fall = [self._choose(counts, entry, 0.0) for entry in fall]
+        self._require_finite(fall)
+        return fall
 
     def nearest(self, values: Components, u: Sequence[Any], bounds: Bounds) -> Sequence[Any]:
         """Return a and b of the function of a maximum whose constraint is nearest to an input.
@@ -218,6 +256,7 @@ class CompiledQP:
             growth, along = p.clf.growth(p.model)
             expressions += [growth, *along]
         expressions += [level for domain in self._domains for level in domain]
+        expressions += [sp.Add(*p.constraints[i].functions) for i in p.partial]
         return [
             *expressions,
             *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ()),
@@ -229,20 +268,21 @@ class CompiledQP:
 
     @cached_property
     def _changes(self) -> dict[int, Any]:
-        return {
-            i: self._compiled([self._qp.constraints[i].change], self._qp.model.inputs)
-            for i in self._sampled
-        }
+        return {i: self._compiled(change_coefficients(self._qp, i)) for i in self._sampled}
 
     @cached_property
     def _functions(self) -> dict[int, Any]:
         return {i: self._compiled(functions_of(self._qp.constraints[i])) for i in self._maxima}
 
-    def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
-        model = self._qp.model
-        return compile_function(
-            (*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour
-        )
+    def _compiled(self, expressions: Sequence[Any]) -> Any:
+        numbers = [self._qp.model.numeric(e) for e in expressions]
+        return compile_function(self._symbols, numbers, self._flavour)
+
+
+def second_order(qp: FilterQP) -> bool:
+    """Return whether uncertain constraints are solved as they are, not by planes above them."""
+    uncertain = any(c.uncertainty is not None for c in qp.constraints)
+    return uncertain and qp.model.m == 1 and qp.clf is None
 
 
 def domain_of(constraint: AffineConstraint) -> tuple[sp.Expr, ...]:
@@ -278,5 +318,30 @@ def _size(expression: sp.Expr) -> sp.Expr:
     return sp.Abs(expression)
 
 
-def _choose(condition: bool, chosen: Any, other: Any) -> Any:
+def change_coefficients(qp: FilterQP, i: int) -> list[sp.Expr]:
+    """Return the coefficients of a constraint's change: of 1, of u_j, and of u_j u_n, j <= n.
+
+    Args:
+        qp: of the constraint.
+        i: its number.
+    """
+    change, inputs = sp.sympify(qp.constraints[i].change), qp.model.inputs
+    at_zero = dict.fromkeys(inputs, sp.Integer(0))
+    slopes = [sp.diff(change, u) for u in inputs]
+    bends = [
+        sp.diff(slope, other) / (2 if u == other else 1)
+        for j, (u, slope) in enumerate(zip(inputs, slopes, strict=True))
+        for other in inputs[j:]
+    ]
+    return [*(e.xreplace(at_zero) for e in (change, *slopes)), *bends]
+
+
+def choose(condition: bool, chosen: Any, other: Any) -> Any:
+    """Return one of two values, as `numpy.where` does.
+
+    Args:
+        condition: whether it is the first.
+        chosen: the first.
+        other: the second.
+    """
     return chosen if condition else other

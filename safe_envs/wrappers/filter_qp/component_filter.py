@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, filled
+from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.errors import NumericalError
 from safe_envs.wrappers.filter_qp.compiled import Bounds
 from safe_envs.wrappers.filter_qp.decision import FilterDecision, UndefinedConstraintError
@@ -15,9 +16,6 @@ from safe_envs.wrappers.filter_qp.per_barrier import PerBarrier
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
 from safe_envs.wrappers.qp import dispatch
-
-NO_VALUE = (ArithmeticError, ValueError, TypeError)
-"""Raised by formulas in plain floats: on overflow, outside a domain, comparing complex roots."""
 
 
 class ComponentFilter:
@@ -114,15 +112,19 @@ class ComponentFilter:
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, [float(c[error.index]) for c in x]) from error
 
-    def undefined(self, what: str, x: Sequence[float]) -> NumericalError:
+    def undefined(
+        self, what: str, x: Sequence[float], which: Sequence[int] | None = None
+    ) -> NumericalError:
         """Return the error of something without a finite value.
 
         Args:
             what: the constraint, the goal or the barrier.
             x: components of the state, followed by those of `FilterQP.runtime`.
+            which: of the barriers; None to find out.
         """
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.qp.symbols, x, strict=True))
-        names = "" if "goal" in what else f" on {', '.join(self._names)}"
+        which = self._arrays.undefined_at(x) if which is None and "goal" not in what else which
+        names = f" on {', '.join([self._names[i] for i in which])}" if which else ""
         return NumericalError(
             f"{what}{names} has no finite value at {at}; check it and the model there"
         )

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import sympy as sp
 
+from safe_envs.dynamics.defined import may_lack_value
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.clf import CLF
 from safe_envs.wrappers.conditions.constraint import AffineConstraint, Terms
@@ -30,6 +31,8 @@ class FilterQP:
             if it occurs.
         owners: number of the barrier that each constraint is of, not falling; () where each
             constraint is of a barrier of its own.
+        partial: the constraints whose barrier may have no value at some state. There it is not
+            safe: the input does not regard the constraint, which is violated by infinity.
     """
 
     model: ControlAffineSDE
@@ -42,8 +45,15 @@ class FilterQP:
     clf: CLF | None
     runtime: tuple[sp.Symbol, ...] = ()
     owners: tuple[int, ...] = ()
+    partial: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        partial = [
+            i
+            for i, c in enumerate(self.constraints)
+            if any(may_lack_value(self.model.numeric(sp.sympify(h))) for h in c.functions)
+        ]
+        object.__setattr__(self, "partial", tuple(partial))
         # What is compiled into solvers does not change from outside.
         for name in ("low", "high", "weights", "priorities"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
@@ -58,14 +68,18 @@ class FilterQP:
         """Whether the constraints at the proposed input are all there is.
 
         Then there is no demand of a reciprocal condition, no sampling margin of first order, no
-        maximum, no goal, and uncertainty only for one input.
+        maximum, no goal, no barrier that may have no value, and uncertainty only for one input.
         """
-        return self.clf is None and all(
-            c.demand is None
-            and c.change is None
-            and not c.alternatives
-            and (c.uncertainty is None or self.model.m == 1)
-            for c in self.constraints
+        return (
+            not self.partial
+            and self.clf is None
+            and all(
+                c.demand is None
+                and c.change is None
+                and not c.alternatives
+                and (c.uncertainty is None or self.model.m == 1)
+                for c in self.constraints
+            )
         )
 
     @property

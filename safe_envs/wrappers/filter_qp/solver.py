@@ -13,6 +13,8 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import Bounds, CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
 from safe_envs.wrappers.filter_qp.furthest import dot, furthest_active
+from safe_envs.wrappers.filter_qp.period_constraints import PeriodConstraints
+from safe_envs.wrappers.filter_qp.period_search import PeriodSearch, constraints_of_period
 from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.kernels.one_constraint import project_scalar
 
@@ -105,18 +107,22 @@ class FilterQPSolver(CompiledQP):
         """
         bounds = bounds or self.bounds
         x = self._with_terms(x)
-        a, b, goal, levels, forms = self._split(self._values(*x))
+        a, b, goal, inside, forms, known = self._split(self._values(*x))
         target = u
         if goal:
             target = [0.0 * uj for uj in u]
             u = self._best(goal, target, bounds)
         for i in self._maxima:
-            *a[i], b[i] = self.nearest(self._functions[i](*x), u, bounds)
-        inside = self._inside(levels)
+            functions = self._functions[i](*x)
+            if i in known:
+                known[i] = known[i] & self._isfinite(sum(functions))
+                functions = [self._choose(known[i], entry, 0.0) for entry in functions]
+            *a[i], b[i] = self.nearest(functions, u, bounds)
         self._require_finite([*b, *[aj for ai in a for aj in ai]])
+        counts = [inside.get(i, True) & known.get(i, True) for i in range(self._count)]
         asked = [
             (
-                self._choose(inside[i], b[i] - self._demand(i, x, inside[i]), 0.0)
+                self._choose(inside[i], b[i] - self._demand(i, x, counts[i]), 0.0)
                 if i in inside
                 else b[i]
             )
@@ -127,11 +133,21 @@ class FilterQPSolver(CompiledQP):
             for i in range(self._count)
         ]
         aim = self._outwards(a, inside, target, bounds)
-        action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
+        rows = self._on_the_safe_side(held, asked, forms, bounds)
+        exact = forms if self._exact else {}
+        action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
         if self._sampled:
-            for i in self._sampled:
-                asked[i] = asked[i] - self._qp.dt * self._loss(i, x, action, inside.get(i))
-            action, margin, active, feasible = self._minimise(held, asked, aim, bounds, goal, forms)
+            falls = {i: self._fall(i, x, counts[i]) for i in self._sampled}
+            period, owners = constraints_of_period(*rows, falls)
+            weights = [self._qp.priorities[i] for i in owners]
+            held = PeriodSearch(
+                PeriodConstraints(period, exact, weights, self._flavour, self._m),
+                owners,
+                self._project,
+                bounds,
+                self.weights,
+            )
+            action, margin, active, feasible = held.hold(action, active, margin)
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
@@ -139,6 +155,10 @@ class FilterQPSolver(CompiledQP):
         # A demand or a loss without a value shows here, and so does what overflows on the way to
         # the action.
         self._require_finite([*action, *margin])
+        for i, has_value in known.items():
+            margin[i] = self._choose(has_value, margin[i], -math.inf)
+            active[i] = self._choose(has_value, active[i], True)
+            feasible = feasible & has_value
         slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
         return FilterDecision(
             action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u
@@ -205,15 +225,11 @@ class FilterQPSolver(CompiledQP):
     ) -> tuple[Any, Any, Any, Any]:
         p, (low, high) = self._qp, bounds
         if forms:
-            for form in forms.values():
-                self._require_finite(form)
-            if self._m == 1 and not goal:
-                q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
-                action, margin, active, feasible = self._project_uncertain(
-                    [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
-                )
-                return [action], list(margin), list(active), feasible
-            a, b = self._on_the_safe_side(a, b, forms, bounds)
+            q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
+            action, margin, active, feasible = self._project_uncertain(
+                [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
+            )
+            return [action], list(margin), list(active), feasible
         if not goal:
             return self._project(a, b, u, low, high, self.weights, p.priorities)
         # The goal's slack is d = unit e, since the square of d would overflow before d does. Twice
@@ -241,9 +257,15 @@ class FilterQPSolver(CompiledQP):
     def _on_the_safe_side(
         self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components], bounds: Bounds
     ) -> tuple[list[Any], list[Any]]:
-        """Return affine constraints that are met only where the uncertain ones are."""
+        """Return affine constraints that are met only where the uncertain ones are.
+
+        Those that are solved as they are stay as they are.
+        """
         a, b = list(a), list(b)
         for i, form in forms.items():
+            self._require_finite(form)
+            if self._exact:
+                continue
             known = bounds is self.bounds and i in self.planes
             slopes, constant = self.planes[i] if known else self._plane(form, bounds)
             a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]

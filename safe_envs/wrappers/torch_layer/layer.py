@@ -165,6 +165,15 @@ class TorchFilter(torch.nn.Module):
         )
         everywhere = torch.ones(len(states), dtype=torch.bool)
         acting = np.flatnonzero(active.any(axis=1))
+        if self.safety_filter.qp.partial and acting.size:
+            # With a barrier without a value there is no formula.
+            with torch.no_grad():
+                parts = self._constraints(states[acting])
+            lost = ~torch.stack([p.isfinite().flatten(1).all(dim=1) for p in parts]).all(dim=0)
+            without = torch.from_numpy(acting)[lost]
+            result = result.index_copy(0, without, torch.from_numpy(action)[without])
+            everywhere[without] = False
+            acting = acting[~lost.numpy()]
         if not acting.size:
             return result, everywhere
         places = torch.from_numpy(acting)

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function
+from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 
@@ -101,7 +102,7 @@ def draw_starts(problem: SafetyProblem, count: int, seed: int) -> Components:
     accept = None
     if start.condition is not None:
         condition = (problem.model.numeric(start.condition),)
-        accept = compile_function(problem.model.states, condition, "arrays")
+        accept = BarrierFunction(problem.model.states, condition, "arrays")
     rng, found, missing = np.random.default_rng(seed), [], count
     for _ in range(_MOST_ROUNDS):
         uniforms = rng.random((len(start.uniforms), count))

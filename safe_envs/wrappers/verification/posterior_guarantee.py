@@ -16,7 +16,10 @@ from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
 from safe_envs.wrappers.verification.assumptions import amount, kinked, reaches, violated_by
-from safe_envs.wrappers.verification.posterior_proof import proved_numbers_of
+from safe_envs.wrappers.verification.posterior_proof import (
+    decision_at,
+    proved_numbers_of,
+)
 from safe_envs.wrappers.verification.results import RELATIVE, Extremum, Status
 from safe_envs.wrappers.verification.safe_set import (
     draw_starts,
@@ -135,11 +138,7 @@ def posterior_guarantee(
     rest = np.mean(problem.box, axis=1)
 
     def shortfall_at(x: np.ndarray) -> np.ndarray:
-        return np.where(
-            level(x) >= 0.0,
-            robust.filter(x, np.broadcast_to(rest, (len(x), len(rest)))).slack[:, 0],
-            -np.inf,
-        )
+        return np.where(level(x) >= 0.0, decision_at(robust, x, rest).slack[:, 0], -np.inf)
 
     _require_inside(level, region, problem, np.random.default_rng([seed, 0]))
     starts = draw_starts(problem, _STARTS)

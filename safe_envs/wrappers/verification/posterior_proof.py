@@ -11,6 +11,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification.branch_and_bound import Budget
 from safe_envs.wrappers.verification.input_terms import exact_number
@@ -33,6 +34,24 @@ class PosteriorNumbers(NamedTuple):
     supremum: float
     shortfall: float
     reason: str
+
+
+def decision_at(robust: SafetyFilter, x: np.ndarray, rest: np.ndarray) -> FilterDecision:
+    """Return what a filter of one barrier makes of an input.
+
+    Args:
+        robust: the filter.
+        x: states, shape (B, n).
+        rest: the input, shape (m,).
+
+    Raises:
+        NumericalError: The condition has no finite value at a state.
+    """
+    found = robust.filter(x, np.broadcast_to(rest, (len(x), len(rest))))
+    lost = np.isinf(found.slack[:, 0])
+    if lost.any():
+        raise robust.undefined("the constraint", x[lost.argmax()].tolist(), [0])
+    return found
 
 
 def proved_numbers_of(
@@ -72,7 +91,7 @@ def proved_numbers_of(
 
     def witness(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            chosen = robust.filter(x, np.broadcast_to(rest, (len(x), len(rest)))).action
+            chosen = decision_at(robust, x, rest).action
         return np.clip(np.nan_to_num(chosen), low, high)
 
     region = Statement("C", problem.plant.states, box, sp.Integer(1), positive=(barrier,))

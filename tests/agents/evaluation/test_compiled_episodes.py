@@ -52,7 +52,7 @@ def joined(batches):
     visited = batches[0].visited
     for batch in batches[1:]:
         visited = visited.joined(batch.visited)
-    return columns | vars(visited), sum(batch.touching for batch in batches)
+    return columns | vars(visited), sum(batch.slight.touching for batch in batches)
 
 
 def assert_alike(found, expected, relative=1e-9):

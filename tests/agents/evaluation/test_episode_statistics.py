@@ -12,6 +12,7 @@ from safe_envs.agents import make_problem
 from safe_envs.agents.evaluation import episode_statistics
 from safe_envs.agents.evaluation.episode_batch import PlayedBatch
 from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
+from safe_envs.agents.evaluation.rounding import SlightViolations
 from safe_envs.agents.evaluation.rows import EpisodeResults
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from tests.agents.evaluation.made_up import made_up
@@ -21,7 +22,8 @@ NOTHING = VisitedStates.nothing(PROBLEM)
 
 
 def played(results):
-    return PlayedBatch(results, np.zeros((len(results.length), 1)), 1, NOTHING)
+    slight = SlightViolations(1, 2, 1e-12 * (1 + results.length[0]))
+    return PlayedBatch(results, np.zeros((len(results.length), 1)), slight, NOTHING)
 
 
 def statistics_of(results, portion):
@@ -44,7 +46,8 @@ def test_statistics_are_those_of_the_episodes():
     safe = results.first_violation < 0
     assert 0 < np.count_nonzero(counted == 0) < np.count_nonzero(~safe)
     assert (row.episodes, row.safe, row.violations) == (333, safe.sum(), (~safe).sum())
-    assert row.touching == 1
+    assert (row.touching, row.below_rounding) == (1, 2)
+    assert row.worst_below_rounding == 1e-12 * (1 + results.length[0])
     assert row.safety_rate == safe.mean() == row.curve.rate[-1]
     assert row.min_h_median == np.median(results.min_h[:100])
     assert row.min_h_p05 == np.quantile(results.min_h[:100], 0.05)
@@ -62,8 +65,12 @@ def test_statistics_are_the_same_to_the_bit_in_any_batches(portion):
     results = made_up(333)
     whole, parts = (statistics_of(results, p) for p in (333, portion))
     wanted, found = (vars(each.summary(0.95)) for each in (whole, parts))
-    assert found.pop("touching") == -(-333 // portion)
-    assert wanted.pop("touching") == 1
+    batches = -(-333 // portion)
+    for count, name in enumerate(("touching", "below_rounding"), 1):
+        assert (wanted.pop(name), found.pop(name)) == (count, batches * count)
+    longest = max(results.length[::portion])
+    assert found.pop("worst_below_rounding") == 1e-12 * (1 + longest)
+    del wanted["worst_below_rounding"]
     assert found == wanted
     assert parts.safe.packed.tobytes() == whole.safe.packed.tobytes()
     assert parts.steps == whole.steps

@@ -86,7 +86,13 @@ def test_a_filter_that_never_acts_leaves_everything_as_it_is():
     )
     bare, filtered = answer.rows
     assert (bare.intervention_rate, filtered.intervention_rate) == (0.0, 0.0)
-    alike = {"filter": "", "kind": "filter", "continuous_note": "", "held_note": "", "outside_rate": None}
+    alike = {
+        "filter": "",
+        "kind": "filter",
+        "continuous_note": "",
+        "held_note": "",
+        "outside_rate": None,
+    }
     assert replace(bare, **alike) == replace(filtered, **alike)
     np.testing.assert_array_equal(
         answer.trajectories["none"].states, answer.trajectories["cbf:alpha=50"].states

@@ -43,7 +43,9 @@ def test_one_identification_is_left_as_it_is():
 
 
 def test_several_are_summed_and_averaged():
-    found = pooled([row(3, 10, effort_mean=None), row(5, 10, effort_mean=2.0)], 0.95)
+    one = row(3, 10, effort_mean=None, below_rounding=2, worst_below_rounding=1e-12)
+    found = pooled([one, row(5, 10, effort_mean=2.0)], 0.95)
+    assert (found.below_rounding, found.worst_below_rounding) == (2, 1e-12)
     assert (found.episodes, found.safe, found.violations, found.touching) == (20, 8, 12, 2)
     assert found.safety_rate == found.return_mean == pytest.approx(0.4)
     assert found.effort_mean == 2.0

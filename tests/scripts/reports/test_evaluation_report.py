@@ -157,6 +157,33 @@ def test_violations_that_are_no_more_than_rounding_are_told():
     assert (passed.rows[0].violations, passed.rows[0].touching) == (3, 0)
 
 
+def test_violations_of_a_filter_that_rides_the_edge_are_told():
+    options = {"noise": 0.0, "box": [-20, 20], "horizon": 10.0}
+
+    def told(spec):
+        answer = evaluate(
+            "DubinsDisk-v0",
+            filters=spec,
+            policy="zero",
+            knowledge="plant",
+            options=options,
+            episodes=4,
+            bounds=False,
+        )
+        return answer, answer.document()["rows"][0], printed(answer)
+
+    answer, stored, text = told("hocbf:p=10,10")
+    assert (stored["violations"], stored["touching"], stored["below_rounding"]) == (4, 0, 4)
+    worst = -answer.episode_columns()["min_h"].min()
+    assert stored["worst_below_rounding"] == worst < 1e-10
+    all_of_them = "all violations of hocbf:p=10,10 are below rounding"
+    assert f"{all_of_them}, worst violation {worst:.2g}: they settle on the edge" in text
+    answer, stored, text = told("none")
+    assert answer.rows[0].violations == 4
+    assert "below_rounding" not in stored
+    assert "below rounding" not in text
+
+
 @pytest.mark.parametrize(
     ("barrier", "x", "lowest", "touching"),
     [

@@ -173,6 +173,52 @@ def test_a_batch_is_what_its_envs_are(mode):
     assert batch.num_envs == 3
 
 
+class Parts(gym.ObservationWrapper):
+    """Pendulum-v1 with an observation in two parts: a dict, or a tuple."""
+
+    def __init__(self, kind: type) -> None:
+        super().__init__(gym.make("Pendulum-v1", max_episode_steps=3))
+        box = self.env.observation_space
+        parts = [gym.spaces.Box(box.low[cut], box.high[cut]) for cut in (np.s_[:2], np.s_[2:])]
+        self._kind = kind
+        self.observation_space = (
+            gym.spaces.Tuple(parts)
+            if kind is tuple
+            else gym.spaces.Dict(dict(zip("ab", parts, strict=True)))
+        )
+
+    def observation(self, observation: np.ndarray) -> dict[str, np.ndarray] | tuple:
+        parts = observation[:2], observation[2:]
+        return parts if self._kind is tuple else dict(zip("ab", parts, strict=True))
+
+
+@pytest.mark.filterwarnings("ignore::safe_envs.SystemDefinitionWarning")  # state_fn undoes it
+@pytest.mark.parametrize("kind", [dict, tuple])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_observations_may_be_of_several_parts(kind, mode):
+    def flat(o):
+        return np.concatenate(list(o.values()) if kind is dict else o, axis=-1)
+
+    made = [lambda: Parts(kind)] * 2, [lambda: gym.make("Pendulum-v1", max_episode_steps=3)] * 2
+    views = {**PENDULUM, "state_fn": lambda o: PENDULUM["state_fn"](flat(o))}, PENDULUM
+    parts, plain = (
+        SafetyFilterVectorWrapper(
+            gym.vector.SyncVectorEnv(fns, autoreset_mode=mode), FILTER, **view
+        )
+        for fns, view in zip(made, views, strict=True)
+    )
+    parts.reset(seed=3)
+    plain.reset(seed=3)
+    for _ in range(8):
+        action = np.full((2, 1), 1.5, dtype=np.float32)
+        (one, *_, infos), (other, *_, expected) = parts.step(action), plain.step(action)
+        np.testing.assert_array_equal(flat(one), other)
+        for key in ("barrier", "safe_action", "episode_cost"):
+            np.testing.assert_array_equal(infos[key], expected[key])
+            if "final_info" in expected:
+                np.testing.assert_array_equal(infos["final_info"][key], expected["final_info"][key])
+
+
 def test_a_batch_may_run_in_other_processes():
     batch = SafetyFilterVectorWrapper(
         gym.make_vec("Pendulum-v1", 2, "async"), FILTER, **PENDULUM, dt=0.05

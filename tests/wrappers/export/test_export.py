@@ -266,6 +266,19 @@ def test_states_without_a_finite_constraint(tmp_path: Path) -> None:
 
 
 @NEEDS_COMPILER
+def test_states_at_which_a_barrier_has_no_value(tmp_path: Path) -> None:
+    system = ControlAffineSDE.from_rate((x, y), (u,), [y, u])
+    barriers = [sp.sqrt(2 - x) - y, sp.log(4 - y)]
+    safety_filter = SafetyFilter(system, barriers, ["rcbf", "cbf:alpha=2"], (-5, 5))
+    options = ExportOptions(region=((-3.0, 5.0), (-3.0, 6.0)))
+    export_filter(safety_filter, tmp_path, options=options)
+    found = compare(tmp_path, safety_filter, options, states=1000)
+    assert_equal(found)
+    assert found.infeasible > 300
+    assert "0 differences" in run_selftest(tmp_path)
+
+
+@NEEDS_COMPILER
 def test_fast_math_is_refused_by_the_compiler(tmp_path: Path) -> None:
     assert COMPILER is not None
     export_filter(cart(), tmp_path)

@@ -1,4 +1,4 @@
-"""The kernel that solves a QP, by its size."""
+"""The kernel that projects the inputs of a decision."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from safe_envs.wrappers.qp.kernels.plane import project_plane, work_of_plane
 from safe_envs.wrappers.qp.kernels.second_order import project_second_order, work_of_second_order
 
 
-def kernel_for(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int]:
-    """Return the kernel for a QP, and the scratch entries that it needs.
+def projection_for(k: int, m: int, *, uncertain: bool = False) -> tuple[Callable[..., Any], int]:
+    """Return the kernel for k constraints on m inputs, and the scratch entries that it needs.
 
     Args:
         k: number of constraints.
         m: number of inputs.
-        uncertain: whether some constraints are cones.
+        uncertain: whether the constraints on one input are uncertain.
     """
     if uncertain:
         return project_second_order, work_of_second_order(k, m)
