@@ -284,7 +284,7 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         if not abs(sum(x) + sum(features) + reward) < LARGEST:
             with np.errstate(over="ignore"):
                 seen = np.array([features], dtype=np.float32)
-            require_sound([np.array([c]) for c in x], seen, np.array([reward]), self.problem)
+            require_sound(tuple(np.array([c]) for c in x), seen, np.array([reward]), self.problem)
         h = min(barriers)
         if left := outside > 0.0:
             features = np.clip(features, self._bounds.low, self._bounds.high)

@@ -54,7 +54,7 @@ class Simulation:
             values = self._measure(*x, *u, time)
             return values[:f], defined_arrays(values[f:b]), *values[b:]
         try:
-            values = self._measure(*x, *u, time)
+            values: Any = self._measure(*x, *u, time)
         except NO_VALUE:
             values = careful_floats(*self._read, (*x, *u, time))
         return values[:f], defined(values[f:b]), *values[b:]

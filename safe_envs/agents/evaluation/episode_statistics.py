@@ -92,7 +92,7 @@ class EpisodeStatistics:
             min_h_p05=p05,
             violations=episodes - safe,
             touching=self._slight.touching,
-            below_rounding=self._slight.count,
+            below_rounding=self._slight.below,
             worst_below_rounding=self._slight.worst,
             intervention_rate=share(self._interventions, self._counted),
             infeasible_rate=share(self._infeasible, self._counted),

@@ -55,7 +55,8 @@ def kept_attainable(place: Path | None) -> AttainableSafety | None:
         found = replace(
             found, coordinates=tuple(found.coordinates), cells=tuple(map(int, found.cells))
         )
-        if not 0.0 <= found.lower <= found.upper <= 1.0:
+        ends = [0.0, *(end for end in (found.lower, found.upper) if end is not None), 1.0]
+        if ends != sorted(ends):
             return None
     except (ConfigurationError, TypeError, ValueError):
         return None

@@ -248,18 +248,24 @@ def _row(
     word = verdict(*error[1:])
     if not steps[0] <= 0.0 <= steps[1]:
         word = "integration"
+    limit, limit_low, limit_high = (min(max(end, 0.0), 1.0) for end in limit)
     return RefinementRow(
-        name,
-        [row.safe for row in rows],
-        [p1, p2, p4],
-        [row.ci_low for row in rows],
-        [row.ci_high for row in rows],
-        p4 - p2,
-        *changes,
-        *(min(max(end, 0.0), 1.0) for end in limit),
-        *error,
-        "contradicted" if own.withheld else word,
-        own.withheld,
+        filter=name,
+        safe=[row.safe for row in rows],
+        safety_rate=[p1, p2, p4],
+        ci_low=[row.ci_low for row in rows],
+        ci_high=[row.ci_high for row in rows],
+        change=p4 - p2,
+        change_low=changes[0],
+        change_high=changes[1],
+        limit=limit,
+        limit_low=limit_low,
+        limit_high=limit_high,
+        error=error[0],
+        error_low=error[1],
+        error_high=error[2],
+        verdict="contradicted" if own.withheld else word,
+        withheld=own.withheld,
     )
 
 

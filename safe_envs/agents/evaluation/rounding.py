@@ -29,18 +29,18 @@ class SlightViolations(NamedTuple):
 
     Attributes:
         touching: how many only touch h = 0.
-        count: how many, these included, go no lower than a billionth of the episode's largest h.
+        below: how many, these included, go no lower than a billionth of the episode's largest h.
         worst: how low the lowest of them goes.
     """
 
     touching: int
-    count: int
+    below: int
     worst: float
 
     def joined(self, other: SlightViolations) -> SlightViolations:
         """Return those of both."""
         worst = max(self.worst, other.worst)
-        return SlightViolations(self.touching + other.touching, self.count + other.count, worst)
+        return SlightViolations(self.touching + other.touching, self.below + other.below, worst)
 
 
 def slight_violations(

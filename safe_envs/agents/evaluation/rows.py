@@ -263,7 +263,7 @@ class EvaluationRow(BoundSummary, EpisodeSummary):
         """Return the row as JSON-able data; h is null where it has no value."""
         head = {"filter": self.filter, "policy": self.policy, "kind": self.kind}
         bound = self.posterior_bound
-        found = head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
+        found: dict[str, Any] = head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}
         found |= {name: None for name in _HEIGHTS if not math.isfinite(found[name])}
         if self.estimation is None:
             del found["estimation"]

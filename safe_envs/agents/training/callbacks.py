@@ -71,7 +71,7 @@ class SafetyFigures(BaseCallback):
         """
         whole = [count for name, count in counts.items() if name != "episodes"]
         ended = [number for episode in counts["episodes"] for number in episode]
-        numbers = [n for place, n in enumerate(ended) if n is not None or place % 2 == 0]
+        numbers: list[Any] = [n for place, n in enumerate(ended) if n is not None or place % 2 == 0]
         known = (
             {"steps", "violations", "episodes"}
             <= set(counts)

@@ -139,7 +139,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
             else self.viewer.frames([np.asarray(picture) for picture in pictures])
         )
 
-    def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
+    def _of_same_step(self, observation: Any, ended: np.ndarray, info: Info) -> Info:
         """Return what is shown after a step that restarted the envs that ended.
 
         Their last step goes to `final_info`.
@@ -160,7 +160,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         self.episodes.restart(ended)
         return self._seen(observation, ended)
 
-    def _seen(self, observation: np.ndarray, counted: np.ndarray) -> Info:
+    def _seen(self, observation: Any, counted: np.ndarray) -> Info:
         """Read the states; `counted` are the envs whose observations are new."""
         self._x = _columns(self._spec.state(observation, (self.num_envs,)))
         barrier = stacked(self._barriers(*self._x), self.num_envs)

@@ -137,11 +137,11 @@ class CompiledQP:
             its constraint have values that may have none, by their numbers.
         """
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
-        rows = [values[i * width : (i + 1) * width] for i in range(count)]
+        rows: list[Any] = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
         levels_end = forms_at - len(self._qp.partial)
         goal_end = levels_end - sum(map(len, self._domains))
-        forms = {
+        forms: dict[int, Any] = {
             i: values[forms_at + k * entries : forms_at + (k + 1) * entries]
             for k, i in enumerate(self._uncertain)
         }
@@ -325,9 +325,10 @@ def change_coefficients(qp: FilterQP, i: int) -> list[sp.Expr]:
         qp: of the constraint.
         i: its number.
     """
-    change, inputs = sp.sympify(qp.constraints[i].change), qp.model.inputs
+    change: Any = sp.sympify(qp.constraints[i].change)
+    inputs = qp.model.inputs
     at_zero = dict.fromkeys(inputs, sp.Integer(0))
-    slopes = [sp.diff(change, u) for u in inputs]
+    slopes: list[Any] = [sp.diff(change, u) for u in inputs]
     bends = [
         sp.diff(slope, other) / (2 if u == other else 1)
         for j, (u, slope) in enumerate(zip(inputs, slopes, strict=True))

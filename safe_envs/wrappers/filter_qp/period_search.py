@@ -105,7 +105,7 @@ class PeriodSearch:
             elif n >= len(known):
                 margin.append(value)
             active[i] = self._constraints.choose(kept[n], active[i], True)
-        met = all(kept) if alone else functools.reduce(operator.and_, kept)
+        met: Any = all(kept) if alone else functools.reduce(operator.and_, kept)
         if not rounds or (met if alone else met.all()):
             return u, margin, active, met
         if alone:
