@@ -168,7 +168,6 @@ class Outcome:
         alternative_settings: the same with other settings, by a name that says which.
         printed_formula: the same numbers by the printed formula, where that is wrong.
         notes: what else a reader should know, computed where it holds numbers.
-        setting: what was simulated, and how much of it.
     """
 
     numbers: list[Number] = field(default_factory=list)
@@ -176,7 +175,6 @@ class Outcome:
     alternative_settings: dict[str, Outcome] = field(default_factory=dict)
     printed_formula: list[Number] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    setting: list[str] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:
         """Return all of it as JSON-able data."""
@@ -192,7 +190,6 @@ class Outcome:
             {name: cls.from_document(each) for name, each in other},
             [Number(**row) for row in document["printed_formula"]],
             list(map(str, document["notes"])),
-            list(map(str, document["setting"])),
         )
 
 
@@ -210,7 +207,8 @@ class Texts:
     Attributes:
         title: what it shows, in our words.
         file: module of its chapter that computes it.
-        setting: how it is simulated, where that does not depend on the sample.
+        settings: sections of the settings that it uses.
+        setting: how it is simulated.
         assumptions: what the thesis leaves open, and what we take.
         errata: errors of the thesis that are not in ours, with the equation.
         argument: why it cannot be reproduced, for a verdict that says so.
@@ -220,12 +218,18 @@ class Texts:
 
     title: str
     file: str
+    settings: tuple[str, ...] = ()
     setting: tuple[Any, ...] = ()
     assumptions: tuple[Any, ...] = ()
     errata: tuple[Any, ...] = ()
     argument: str = ""
     printed: dict[str, Any] = field(default_factory=dict)
     size: tuple[float, float] = (7.0, 4.2)
+
+
+def chapter_of(name: str) -> int:
+    """Return the chapter of an artefact, with which the number in its name begins."""
+    return int(name.partition("-")[2][0])
 
 
 def settings(chapter: int, section: str) -> SimpleNamespace:

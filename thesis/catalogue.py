@@ -13,15 +13,15 @@ from typing import Any
 from safe_envs.agents.jobs.fingerprint import package_versions, source_checksum
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.errors import ConfigurationError
-from thesis.artefact import Compute, Outcome, Sample, texts
+from thesis.artefact import Compute, Outcome, Sample, chapter_of, texts
 
 _SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def compute_of(name: str) -> Compute:
-    """Return what computes an artefact; the number in its name begins with that of its chapter."""
-    chapter = name.partition("-")[2][0]
-    return import_module(f"thesis.chapter_{chapter}.{texts()[name].file}").ARTEFACTS[name]
+    """Return what computes an artefact."""
+    place = f"thesis.chapter_{chapter_of(name)}.{texts()[name].file}"
+    return import_module(place).ARTEFACTS[name]
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from thesis import verdict
-from thesis.artefact import Number, Outcome, Sample, Texts, texts
+from thesis.artefact import DATA, Number, Outcome, Sample, Texts, chapter_of, texts
 from thesis.verdict import Judgement, judge
 
 _TITLES = ("thesis", "ours", "95 %")
@@ -35,6 +36,13 @@ class Entry:
     def texts(self) -> Texts:
         """What the data file says of the artefact."""
         return texts()[self.name]
+
+    @property
+    def settings(self) -> str:
+        """The settings as the data file has them, with units in comments."""
+        text = (DATA / f"chapter_{chapter_of(self.name)}.yaml").read_text(encoding="utf-8")
+        sections = dict(re.findall(r"^  (\w+):[^\n]*\n((?:    [^\n]*\n)+)", text, re.MULTILINE))
+        return "".join(sections[name] for name in self.texts.settings)
 
     @property
     def judgement(self) -> Judgement:

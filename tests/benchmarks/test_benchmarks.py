@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import gc
 import math
-import mmap
 import subprocess
 import sys
 from functools import partial
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +17,7 @@ from benchmarks.command_times import MISTAKES
 from benchmarks.figures import Part
 from benchmarks.hand_written_loop import step_by_hand
 from safe_envs.agents.training import vec_env_speed
-from safe_envs.scripts.reports.env_speeds import ENV_ID, Case
+from safe_envs.scripts.reports.env_speeds import ENV_ID
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.scripts.conftest import strictly
 
@@ -144,44 +141,6 @@ def test_decisions_that_are_timed_are_what_their_names_say(monkeypatch):
         constraints, inputs = found.slack.shape[1], found.action.shape[1]
         expected = (3, 4) if "Quadrotor" in name else (1 if "one" in name else 3, 2)
         assert (constraints, inputs) == expected
-
-
-def test_times_of_decisions_grow_from_the_middle_to_the_end(monkeypatch):
-    monkeypatch.setattr(latency, "_CALLS", 200)
-    monkeypatch.setattr(latency, "_DRAWN", 512)
-    chosen = {name: c for name, c in latency.cases().items() if "one constraint" in name}
-    monkeypatch.setattr(latency, "cases", lambda: chosen)
-    rows = latency.rows_of(latency.measure())
-    assert list(rows) == list(chosen)
-    for median, p99, p999, most, p999_off, most_off, collections in rows.values():
-        assert median <= p99 <= p999 <= most
-        assert p999_off <= most_off
-        assert collections >= 0
-
-
-def test_collections_are_counted_and_switched_off():
-    with latency._counted_collections() as counted:
-        gc.collect()
-        with latency._without_collections():
-            assert not gc.isenabled()
-        assert gc.isenabled()
-    found = counted[0]
-    gc.collect()
-    assert 2 <= found == counted[0]
-
-
-def test_page_faults_are_those_of_fresh_memory(monkeypatch):
-    resource = pytest.importorskip("resource")
-    fresh = Case(lambda: mmap.mmap(-1, 1 << 24).write(bytes(1 << 24)), calls=5)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    fresh.call()
-    if resource.getrusage(resource.RUSAGE_SELF).ru_minflt > before:
-        kept = np.zeros(1 << 20)
-        assert next(iter(figures._page_faults(Case(lambda: kept.fill(1.0), calls=50)).values())) < 1
-        # 16 MiB at a time, in pages of at most 2 MiB.
-        assert next(iter(figures._page_faults(fresh).values())) >= 8
-    monkeypatch.setattr(resource, "getrusage", lambda who: SimpleNamespace(ru_minflt=0))
-    assert figures._page_faults(Case(lambda: None)) == {}
 
 
 def test_processor_times_of_commands_are_measured(monkeypatch):

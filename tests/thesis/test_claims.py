@@ -145,10 +145,10 @@ def test_claims_on_rates_of_reciprocal_conditions():
 @pytest.mark.parametrize(
     ("counts", "expected", "words"),
     [
-        ((92, 80, 25, 70), [True, True, True], "SRCBF loses 67.0 points, SCBF loses 10.0 points"),
-        ((40, 100, 20, 100), [False, True, True], "SRCBF loses 20.0 points, SCBF loses nothing"),
-        ((92, 76, 90, 80), [True, False, True], "SRCBF loses 2.0 points, SCBF gains 4.0 points"),
-        ((92, 80, 85, 40), [True, False, False], "SCBF loses 40.0 points"),
+        ((92, 80, 25, 70), [True, True, True], "SRCBF 67.0 points, SCBF 10.0 points"),
+        ((40, 100, 20, 100), [False, True, True], "SRCBF 20.0 points, SCBF 0.0 points"),
+        ((92, 76, 90, 80), [True, False, True], "SRCBF 2.0 points, SCBF -4.0 points"),
+        ((92, 80, 85, 40), [True, False, False], "SCBF 40.0 points"),
         ((80, 80, 70, 70), [False, False, False], "+0.0 points [0.0, 0.0]"),
     ],
 )

@@ -42,7 +42,6 @@ def throw(sample):
         [Number.rate("heads", trials // 2, trials, 48.0, 50), Number("edge", 0.25, 0.2, 0.3)],
         [Claim("it lands", True, "1 of 1"), Claim("it rolls", False, "|v| = 0", printed=False)],
         notes=["a < b"],
-        setting=[f"thrown {trials} times"],
     )
     return outcome, lambda figure: figure.subplots().plot([0.0, 1.0])
 
@@ -54,12 +53,12 @@ def coin(monkeypatch):
 
     def compute_of(name):
         computed.append(name)
-        if name == "table-0.2":
+        if name == "table-6.9":
             raise ValueError("no luck")
         return throw
 
-    errata = ("Eq 0.1: a sign", ("a", "b"))
-    both = {name: Texts("A coin", "coin", errata=errata) for name in ("table-0.1", "table-0.2")}
+    coin_texts = Texts("A coin", "coin", ("car",), ("by hand",), errata=("a sign", ("b", "c")))
+    both = dict.fromkeys(("table-6.8", "table-6.9"), coin_texts)
     for module in (artefact, command, catalogue, "thesis.report"):
         module = module if isinstance(module, str) else module.__name__
         monkeypatch.setattr(f"{module}.texts", lambda: both)
@@ -67,7 +66,7 @@ def coin(monkeypatch):
     return computed
 
 
-ONE = ("table-0.1", "--episodes", 100, "--jobs", 1, "--out", "report")
+ONE = ("table-6.8", "--episodes", 100, "--jobs", 1, "--out", "report")
 
 
 def test_without_an_argument_it_lists_the_artefacts(run):
@@ -84,28 +83,28 @@ def test_numbers_and_verdict_are_printed_and_kept_and_shown_on_a_page(run, coin)
     assert re.search(r"it lands +yes", out)
     assert re.search(r"it rolls +no", out)
     (entry,) = strictly("out.json")["artefacts"]
-    assert (entry["name"], entry["verdict"]) == ("table-0.1", "reproduced")
-    assert entry["outcome"] == strictly("report/table-0.1.json")["outcome"]
+    assert (entry["name"], entry["verdict"]) == ("table-6.8", "reproduced")
+    assert entry["outcome"] == strictly("report/table-6.8.json")["outcome"]
     markdown, page = (Path(f"report/index.{kind}").read_text() for kind in ("md", "html"))
     assert "| heads | 48 % (of 50) | 50.0 % | [40.4, 59.6] |" in markdown
     assert "| it rolls | check of ours | no | \\|v\\| = 0 |" in markdown
-    for text in ("thrown 100 times", "Eq 0.1: a sign", "table-0.1.svg", "every printed number"):
+    for text in ("by hand", "a sign", "table-6.8.svg", "every printed number", "# N of DDSCBF"):
         assert text in markdown
         assert text in page
     assert "a &lt; b" in page
     assert "http" not in page
-    assert Path("report/table-0.1.svg").stat().st_size > 1000
+    assert Path("report/table-6.8.svg").stat().st_size > 1000
 
 
 def test_what_is_kept_is_not_computed_again(run, coin, monkeypatch):
     assert run(*ONE)[0] == 0
     assert run(*ONE)[0] == 0
-    assert coin == ["table-0.1"]
-    Path("report/table-0.1.pdf").unlink()  # a picture that is missing is drawn again
+    assert coin == ["table-6.8"]
+    Path("report/table-6.8.pdf").unlink()  # a picture that is missing is drawn again
     assert run(*ONE)[0] == 0
     monkeypatch.setattr(catalogue, "code_checksum", lambda: "another")
-    assert catalogue.read(Path("report"), "table-0.1", Sample(100)) is None
-    assert coin == ["table-0.1"] * 2
+    assert catalogue.read(Path("report"), "table-6.8", Sample(100)) is None
+    assert coin == ["table-6.8"] * 2
 
 
 @pytest.mark.parametrize("more", [("--episodes", 101), ("--quick",), ("--seed", 1)])
@@ -114,20 +113,20 @@ def test_results_of_other_options_are_not_written_over(run, coin, more):
     before = {path: path.read_bytes() for path in Path("report").iterdir()}
     status, _, err = run(*ONE, *more)
     assert status == 2
-    assert 'report holds table-0.1 by other options: {"episodes": 100' in err
+    assert 'report holds table-6.8 by other options: {"episodes": 100' in err
     assert {path: path.read_bytes() for path in Path("report").iterdir()} == before
 
 
 def test_an_artefact_that_fails_leaves_the_others(run, coin):
     status, out, err = run("all", *ONE[1:])
     assert status == 2
-    assert "table-0.2 failed: ValueError: no luck" in err
+    assert "table-6.9 failed: ValueError: no luck" in err
     assert "A coin" in out
-    assert not Path("report/table-0.2.json").exists()
+    assert not Path("report/table-6.9.json").exists()
 
 
 def test_a_quick_run_has_no_verdict(run, coin):
-    status, out, _ = run("table-0.1", "--quick", "--jobs", 1)
+    status, out, _ = run("table-6.8", "--quick", "--jobs", 1)
     assert status == 0
     assert "no verdict, for a quick run" in out
     assert not re.search(r"^reproduced", out, re.MULTILINE)
@@ -136,15 +135,15 @@ def test_a_quick_run_has_no_verdict(run, coin):
 @pytest.mark.parametrize("text", ["{", "[1]", '{"configuration": {}, "x": NaN}', ""])
 def test_a_damaged_result_is_told_before_the_work(run, coin, text):
     Path("report").mkdir()
-    Path("report/table-0.1.json").write_text(text)
+    Path("report/table-6.8.json").write_text(text)
     status, _, err = run(*ONE)
     assert status == 2
-    assert "report/table-0.1.json cannot be read" in err
+    assert "report/table-6.8.json cannot be read" in err
     assert not coin
 
 
 def test_code_that_changed_during_a_run_is_not_kept(tmp_path, coin):
-    job = catalogue.ArtefactJob("table-0.1", Sample(), tmp_path, "another checksum")
+    job = catalogue.ArtefactJob("table-6.8", Sample(), tmp_path, "another checksum")
     with pytest.raises(ConfigurationError, match="the code changed during the run"):
         job.compute()
     assert not coin
@@ -185,7 +184,7 @@ def checked(name, sample, folder):
     outcome, _ = catalogue.read(folder, name, sample) or pytest.fail("nothing is kept")
     assert outcome.document() == json.loads(json.dumps(outcome.document(), allow_nan=False))
     assert (folder / f"{name}.png").exists() == (not name.startswith("table"))
-    assert all((outcome.numbers, outcome.claims, outcome.setting))
+    assert all((outcome.numbers, outcome.claims))
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
     assert {number.name for number in outcome.printed_formula} <= set(names)

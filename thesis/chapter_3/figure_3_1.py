@@ -85,10 +85,6 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
             f" over states), so that the filter turns about {1 / share:.2g} times as much as the"
             " condition asks for",
         ],
-        setting=[
-            *learning.setting(world, sample),
-            f"|omega| <= {WIDE[1]:g} rad/s; start {DISK.start}, compared with {DISK.valid_start}",
-        ],
     )
     return outcome, partial(_draw, shown, shown_formula, shown_valid, nominal)
 

@@ -51,7 +51,6 @@ def compute_passage(sample: Sample) -> tuple[Outcome, Any]:
             *learning.rates_around(problem, sample, models, OBSTACLE.rates),
         ],
         claims=passage_claims(found, problem),
-        setting=_setting(problem, sample),
     )
     return outcome, partial(_draw_passage, learned[0], found["nominal"][0], problem.dt)
 
@@ -71,16 +70,8 @@ def compute_clearance(sample: Sample) -> tuple[Outcome, Any]:
             Number("smallest h, nominal", at_rest["nominal"][0].smallest, unit="m^2"),
             Number("smallest h, true", blind.smallest, unit="m^2"),
         ],
-        setting=_setting(problem, sample),
     )
     return outcome, partial(_draw_clearance, {**found, "printed": [blind]}, problem.dt)
-
-
-def _setting(problem: SafetyProblem, sample: Sample) -> list[str]:
-    return [
-        *learning.setting(problem, sample),
-        f"p_1, p_2 = {OBSTACLE.rates} 1/s; goal {OBSTACLE.goal}, radius {OBSTACLE.goal_radius:g} m",
-    ]
 
 
 def passage_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
@@ -118,7 +109,7 @@ def passage_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
 
 def clearance_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
     """Return the claims of the text about the barrier, and its reason for the number of steps."""
-    learned, nominal, none = found["learned"], found["nominal"][0], found["none"][0]
+    learned, nominal = found["learned"], found["nominal"][0]
     steps, lowest = [run.steps for run in learned], min(run.smallest for run in learned)
     return [
         Claim(
@@ -135,9 +126,8 @@ def clearance_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]
             "The run with the learned derivatives takes more time steps than that with the nominal"
             " ones",
             min(steps) > nominal.steps,
-            f"{min(steps)} to {max(steps)} steps, nominal {nominal.steps}, without a filter"
-            f" {none.steps}; they end up to {max(map(_miss, learned)):.3g}, {_miss(nominal):.3g}"
-            f" and {_miss(none):.3g} m from the goal's centre",
+            f"{min(steps)} to {max(steps)} steps, nominal {nominal.steps}; they end up to"
+            f" {max(map(_miss, learned)):.3g} and {_miss(nominal):.3g} m from the goal's centre",
         ),
         # An error of the thesis, and no result: it is among the errata.
         Claim(

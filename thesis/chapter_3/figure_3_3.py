@@ -72,10 +72,6 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
             time_in_workspace(printed["true"]),
         ],
         claims=altitude_claims(found),
-        setting=[
-            *learning.setting(problem, sample),
-            f"band {CENTER:g} +- {HALF_WIDTH:g} m, p_1, p_2 = {_GAINS} 1/s",
-        ],
     )
     return outcome, partial(_draw, {**found, "printed": [printed["true"]]}, problem.dt)
 

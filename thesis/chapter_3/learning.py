@@ -10,7 +10,6 @@ import numpy as np
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import evaluate, make_problem
-from safe_envs.agents.evaluation.setting_text import describe_system
 from safe_envs.scripts.figures.style import COLORS
 from safe_envs.wrappers import Condition
 from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual
@@ -64,17 +63,6 @@ def seeds(sample: Sample) -> list[int]:
     """Return a seed for each repetition of the learning."""
     count = _QUICK_LEARNINGS if sample.quick else LEARNING.repetitions
     return np.random.SeedSequence(sample.seed).generate_state(count).tolist()
-
-
-def setting(problem: SafetyProblem, sample: Sample) -> list[str]:
-    """Return what is simulated and what is learned from, in words."""
-    size = sizes(sample)
-    return [
-        f"{describe_system(problem)}; {len(seeds(sample))} learnings from {size['states']} states"
-        f" each, network 100-30 ReLU, Adam, up to {size['epochs']} epochs, steps of"
-        f" {LEARNING.label_step:g} s, margin of the held-out errors at the 95 % level; episodes of"
-        f" each rate: {sample.size(LEARNING.episodes)}"
-    ]
 
 
 @lru_cache(maxsize=8)

@@ -34,19 +34,3 @@ def problem_of(cruise: SimpleNamespace, limit: float, step: float = CAR.step) ->
 def filters_of(cruise: SimpleNamespace) -> dict[str, str]:
     """Return the texts of the two conditions."""
     return {"SRCBF": f"srcbf:gamma={cruise.gamma}", "SCBF": "scbf"}
-
-
-def text_of(cruise: SimpleNamespace) -> str:
-    """Return settings in words."""
-    return (
-        f"tau = {cruise.tau} s, weight {cruise.slack_weight} on d^2, AV + {cruise.rate:g} V <= d,"
-        f" gamma = {cruise.gamma:g}"
-    )
-
-
-def setting(episodes: int, step: float) -> list[str]:
-    """Return what is simulated, in words."""
-    return [
-        f"x_0 = {CAR.start}, sigma_1 = {CAR.noise:g} m/s/sqrt(s), control period {step} s,"
-        f" {CAR.horizon:g} s; {text_of(ASSUMED)}; episodes: {episodes}"
-    ]

@@ -85,14 +85,6 @@ def problem_of(noise: float, start: Any) -> SafetyProblem:
     )
 
 
-def text() -> str:
-    """Return what is simulated, in words."""
-    return (
-        f"v = 2 m/s, disk of radius {DUBINS.radius:g} m, control period {DUBINS.step} s, |omega| <="
-        f" {DUBINS.turn_rate:g} rad/s, T = {HORIZON:g} s"
-    )
-
-
 def simulate(
     filters: Mapping[str, str | Condition], noise: float, start: Any, episodes: int, seed: int
 ) -> dict[str, Violations]:

@@ -71,7 +71,6 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
             f" only below h = sqrt(tau sigma_1)/gamma^(1/4): {stricter_below(ASSUMED):.3g} m, and"
             f" {stricter_below(FITTED):.3g} m with what we fitted to Table 4.1"
         ],
-        setting=cruise.setting(episodes, CAR.step),
     )
     return outcome, partial(_draw, efforts, forces)
 
@@ -177,10 +176,9 @@ def claim_on_time(larger: np.ndarray, smaller: np.ndarray) -> Claim:
     return Claim(
         "SRCBF requires the higher control effort J = u^2 over time",
         ahead.is_above(),
-        "on average over the pairs with the same noise its J is the larger one in"
-        f" {100 * larger.mean():.1f} % of the time and the smaller one in"
-        f" {100 * smaller.mean():.1f} %; it is the larger one most of the time in"
-        f" {(larger > smaller).sum()} of {larger.size} pairs",
+        f"larger in {100 * larger.mean():.1f} % of the time, smaller in"
+        f" {100 * smaller.mean():.1f} %, on average over pairs with the same noise; larger most of"
+        f" the time in {(larger > smaller).sum()} of {larger.size}",
     )
 
 
@@ -253,7 +251,7 @@ def claim_on_growth(srcbf: Effort) -> Claim:
     ]
     return Claim(
         "SRCBF's effort grows as the edge is neared",
-        close.size and away.size and np.median(close) > np.median(away),
+        bool(close.size and away.size and np.median(close) > np.median(away)),
         f"where it acts: {', '.join(each)}",
         printed=False,
     )

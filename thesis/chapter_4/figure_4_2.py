@@ -52,9 +52,6 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
             "steps in which no turn rate in its bounds meets the condition, sigma ="
             f" {MOST:g}, {STARTS['uniform']}: {', '.join(infeasible)}"
         ],
-        setting=[
-            f"{dubins.text()}; random starts at each noise level, an episode from each: {size[0]}"
-        ],
     )
     return outcome, partial(_draw, runs, printed, {MOST: main[MOST], **beyond})
 
@@ -87,7 +84,7 @@ def claim_on_noises(runs: ByNoise, horizon: float) -> Claim:
     return Claim(
         "SCBF has a better safety probability than SZCBF for sigma within"
         f" [{min(NOISES):g}, {MOST:g}]",
-        ahead and all(ahead),
+        bool(ahead) and all(ahead),
         "; ".join(evidence),
     )
 

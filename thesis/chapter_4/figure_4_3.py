@@ -60,10 +60,6 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
             f"{STARTS[kind]}: {bound_note([each['SCBF'] for each in runs[STARTS[kind]]], x)}"
             for kind, x in starts.items()
         ],
-        setting=[
-            f"{dubins.text()}; sigma = {DUBINS.noise:g} m/sqrt(s), {DUBINS.points} random starts,"
-            f" episodes from each: {episodes}"
-        ],
     )
     return outcome, partial(_draw, starts["uniform"], main)
 
@@ -119,7 +115,7 @@ def bound_note(runs: Sequence[Violations], starts: np.ndarray) -> str:
     Only a start with A h > 0 has a bound that is positive.
     """
     product, union = bounds_at(starts)
-    inside = np.flatnonzero(product > 0.0)
+    inside = np.flatnonzero(product > 0.0).tolist()
     below = sum(runs[i].rate("", LONGEST).is_below(100 * product[i]) for i in inside)
     share = 100 * np.mean([run.infeasible for run in runs])
     return (

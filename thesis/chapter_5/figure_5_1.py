@@ -80,7 +80,6 @@ def compute(
             root_mean_square(labels, missed["printed"]),
         ],
         notes=[_why_printed_fails(problem, first, missed["printed"])],
-        setting=[f"{said}; {noise.setting(sample)}; errors at {LEARNING.validation} states"],
     )
     panels = (first.labels["martingale"], repaired[0]), (first.labels["printed"], printed[0])
     curve = grid, term(grid)[0]

@@ -105,11 +105,6 @@ def compute(letter: str, sample: Sample) -> tuple[Outcome, Any]:
             " without noise, unsafe with the CBF under noise, and safe with DDSCBF; it is the first"
             f" of {'these' if len(fitting) else 'all'}, number {shown}"
         ],
-        setting=[
-            f"CBF with alpha(h) = {CUBIC.alpha:g} h 1/s; {min(SHOWN, recorded)} trajectories up to"
-            f" {CUBIC.horizon:g} s; rates over {path.runs.episodes} episodes; DDSCBF of one"
-            " identification"
-        ],
     )
     order = [shown, *(i for i in range(recorded) if i != shown)][:SHOWN]
     return outcome, partial(_draw, _TITLES[letter], path.states[::STRIDE, order])

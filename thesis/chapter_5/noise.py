@@ -83,15 +83,6 @@ def models(
     return [each.learned[estimator] for each in learned]
 
 
-def setting(sample: Sample) -> str:
-    """Return how much is learned from, in words."""
-    count = 2 if sample.quick else LEARNING.identifications
-    return (
-        f"{count} identifications, each from {sample.work(LEARNING.points)} states with"
-        f" {sample.work(LEARNING.repetitions)} transitions from each"
-    )
-
-
 def rates_of(
     env_id: str,
     options: dict[str, Any],

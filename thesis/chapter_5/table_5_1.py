@@ -16,7 +16,7 @@ from safe_envs.wrappers import DDSCBF, SCBF
 from safe_envs.wrappers.verification.feasibility import verify
 from thesis.artefact import Claim, Outcome, Sample, settings, texts
 from thesis.chapter_5 import noise
-from thesis.chapter_5.noise import LEARNING, WITHOUT_RATE, Identification, Runs, rates_of
+from thesis.chapter_5.noise import WITHOUT_RATE, Identification, Runs, rates_of
 from thesis.rates import MeasuredFilter, safer
 
 PENDULUM = settings(5, "pendulum")
@@ -58,10 +58,6 @@ def compute(sample: Sample) -> tuple[Outcome, None]:
             noise.explain_gap(others, cbf_of(A), "in A"),
             _margin(learned[0], sample),
             *([] if sample.quick else [_bound(runs["scbf"])]),
-        ],
-        setting=[
-            f"B: {describe(B, sample)}; episodes of each rate: {sample.size(LEARNING.episodes)}",
-            noise.setting(sample),
         ],
     ), None
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from thesis.artefact import Claim, Number, Outcome, Sample, settings, texts
 from thesis.chapter_5 import noise
-from thesis.chapter_5.noise import LEARNING, WITHOUT_RATE, Runs, rates_of
+from thesis.chapter_5.noise import WITHOUT_RATE, Runs, rates_of
 from thesis.rates import safer
 
 CUBIC = settings(5, "cubic")
@@ -50,11 +50,6 @@ def compute(sample: Sample) -> tuple[Outcome, None]:
         notes=[
             *(noise.explain_gap(near[k], CBF, f"at k = {k:g}") for k in LEVELS),
             _falls(sample),
-        ],
-        setting=[
-            f"CBF with alpha(h) = {CUBIC.alpha:g} h 1/s; episodes of each rate:"
-            f" {sample.size(LEARNING.episodes)}",
-            noise.setting(sample),
         ],
     ), None
 

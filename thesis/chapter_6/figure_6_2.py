@@ -29,14 +29,15 @@ def compute(section: str, sample: Sample) -> tuple[Outcome, Any]:
     starts = sample.work(SETTINGS.noise_starts)
     data = collect(problem, starts, 1, bayes.AT_REST, steps=steps, seed=second)
     left = data.successors[:, 0] - data.x - rates(learned.system, data) * problem.dt
-    rng, count, prior = np.random.default_rng([sample.seed, 63]), len(left), SETTINGS.prior_of_sigma
+    rng, count = np.random.default_rng([sample.seed, 63]), len(left)
+    alpha, beta = SETTINGS.prior_of_sigma
     numbers, printed, draws = [], [], []
     for i, (square, unit) in enumerate(
         zip((left**2).sum(axis=0).tolist(), system.unit, strict=True)
     ):
-        draws.append(sigma_samples(square / problem.dt, count, *prior, SETTINGS.draws, rng))
+        draws.append(sigma_samples(square / problem.dt, count, alpha, beta, SETTINGS.draws, rng))
         # The printed formula: no dt, and one factor less.
-        wrong = sigma_samples(square, count - 1, *prior, SETTINGS.draws, rng)
+        wrong = sigma_samples(square, count - 1, alpha, beta, SETTINGS.draws, rng)
         numbers.append(credible(f"sigma_{i + 1}", draws[-1], unit))
         printed.append(credible(f"sigma_{i + 1}", wrong, unit))
     true = [problem.plant.parameter_values[name] for name in ("sigma_1", "sigma_2")]
@@ -44,7 +45,6 @@ def compute(section: str, sample: Sample) -> tuple[Outcome, Any]:
         numbers,
         [gathered(draws, true)],
         printed_formula=printed,
-        setting=[f"{starts} trajectories of {steps} steps, {SETTINGS.draws} draws"],
     )
     return outcome, partial(_draw, draws, true, system.unit)
 

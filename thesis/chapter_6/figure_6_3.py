@@ -14,7 +14,7 @@ from safe_envs.scripts.figures.style import add_legend
 from safe_envs.wrappers.learning.data.collection import draw_states
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
 from thesis.chapter_6 import bayes
-from thesis.chapter_6.bayes import MOST, SETTINGS
+from thesis.chapter_6.bayes import MOST
 
 CAR = settings(6, "car")
 _UNITS = ("m/s^2", "m/s")
@@ -45,10 +45,6 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
             doubt,
         ],
         claims=[validated(doubt), *(near(f, e / s) for f, e, s, _ in components)],
-        setting=[
-            f"{SETTINGS.starts} trajectories of {SETTINGS.steps} states, K = {MOST}; {len(seeds)}"
-            " identifications"
-        ],
     )
     order = x[:, 0].argsort()
     shown = [each[order] for each in (x[:, 0], truth, means[0], deviations[0])]

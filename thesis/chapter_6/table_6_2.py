@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import sympy as sp
 
@@ -85,7 +86,7 @@ def compute(sample: Sample) -> tuple[Outcome, None]:
     world, size = make_problem(CUBIC.env), (sample.size(CUBIC.episodes), sample.seed)
     chosen = bayes.seeds(sample, CUBIC.controllers)
     compared = () if sample.quick else chosen
-    amount = {
+    amount: dict[str, Any] = {
         "points": sample.work(CUBIC.generator_points),
         "repetitions": sample.work(CUBIC.generator_repetitions),
     }
@@ -144,18 +145,13 @@ def compute(sample: Sample) -> tuple[Outcome, None]:
                 for c in columns
                 if c.withheld
             ),
-            at_one_horizon(*(c.scbf for c in columns), PRINTED["SCBF"]),
+            at_one_horizon(columns[0].scbf, columns[1].scbf, PRINTED["SCBF"]),
             *(
                 f"{c.place}: with f and g known DDSCBF differs from the SCBF by"
                 f" {bayes.against(c.ddscbf, c.scbf)}; in the thesis by"
                 f" {c.printed['DDSCBF'] - c.printed['SCBF']:+g} points."
                 for c in columns
             ),
-        ],
-        setting=[
-            f"{size[0]} episodes; Bayesian: {len(systems)} identifications, K = {MOST}; DDSCBF:"
-            f" {len(generators)} identifications from {amount['points']} states,"
-            f" {amount['repetitions']} steps from each; for ever: {long} s, {late_size[0]} episodes"
         ],
     ), None
 

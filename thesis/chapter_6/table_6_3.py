@@ -36,7 +36,7 @@ def printed_second_generator(problem: SafetyProblem) -> sp.Expr:
     )
 
 
-def _size(sample: Sample) -> dict[str, int]:
+def _size(sample: Sample) -> dict[str, Any]:
     """Return the amount of data of DDSCBF, as `learn_generator` takes it."""
     return {
         "points": sample.work(CAR.generator_points),
@@ -47,12 +47,9 @@ def _size(sample: Sample) -> dict[str, int]:
 @cache
 def recursion(sample: Sample) -> GeneratorModel:
     """Return DDSCBF's networks by the printed estimate, learned once for both tables."""
-    how: dict[str, Any] = {
-        "way": "network",
-        "estimator": "printed",
-        "seed": bayes.seeds(sample, 1)[0],
-    }
-    return learn_generator(make_problem(CAR.env), **_size(sample), **how)
+    problem, seed = make_problem(CAR.env), bayes.seeds(sample, 1)[0]
+    size = _size(sample)
+    return learn_generator(problem, way="network", estimator="printed", seed=seed, **size)
 
 
 def compute_rates(sample: Sample) -> tuple[Outcome, None]:
@@ -102,11 +99,6 @@ def compute_rates(sample: Sample) -> tuple[Outcome, None]:
             "The noise is all that DDSCBF learns; an SCBF that assumes none is safe in"
             f" {blind.rate:.1f} %, compared with {scbf.rate:.1f} %.",
         ],
-        setting=[
-            f"{problem.horizon:g} s; {size[0]} episodes; Bayesian: {len(chosen)} identifications,"
-            f" K = {MOST}; DDSCBF: {len(generators)}, N = {_size(sample)['points']}, K ="
-            f" {_size(sample)['repetitions']}"
-        ],
     ), None
 
 
@@ -127,9 +119,9 @@ def sooner(ratio: float) -> list[Claim]:
 
 def compute_times(sample: Sample) -> tuple[Outcome, None]:
     """Compute Table 6.4."""
-    problem, how = make_problem(CAR.env), {"way": "direct", "seed": bayes.seeds(sample, 1)[0]}
+    problem, seed = make_problem(CAR.env), bayes.seeds(sample, 1)[0]
     recursive = recursion(sample).record.seconds
-    direct = learn_generator(problem, **_size(sample), **how).record.seconds
+    direct = learn_generator(problem, way="direct", seed=seed, **_size(sample)).record.seconds
     seconds = []
     for seed in bayes.seeds(sample, CAR.timed):
         begun = time.perf_counter()
@@ -143,10 +135,6 @@ def compute_times(sample: Sample) -> tuple[Outcome, None]:
             Number("DDSCBF, covariance of the noise learned once", direct, unit="s"),
         ],
         claims=sooner(recursive / quick.ours),
-        setting=[
-            f"DDSCBF: N = {_size(sample)['points']}, K = {_size(sample)['repetitions']}; Bayesian:"
-            f" K = {MOST}, {len(seconds)} runs"
-        ],
     ), None
 
 
