@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -41,8 +42,10 @@ class Entry:
     def settings(self) -> str:
         """The settings as the data file has them, with units in comments."""
         text = (DATA / f"chapter_{chapter_of(self.name)}.yaml").read_text(encoding="utf-8")
-        sections = dict(re.findall(r"^  (\w+):[^\n]*\n((?:    [^\n]*\n)+)", text, re.MULTILINE))
-        return "".join(sections[name] for name in self.texts.settings)
+        sections = re.findall(
+            r"^(  (\w+):.*\n(?:    .*\n)+)", text.partition("\ncommon:")[0], re.MULTILINE
+        )
+        return dedent("".join(body for body, name in sections if name in self.texts.settings))
 
     @property
     def judgement(self) -> Judgement:

@@ -10,10 +10,7 @@ import numpy as np
 
 from safe_envs import SafetyFilter
 from safe_envs.agents import make_problem
-from safe_envs.agents.evaluation.bound_check import starts_of
-from safe_envs.agents.evaluation.contradiction import by_rate
-from safe_envs.wrappers import DDSCBF, SCBF
-from safe_envs.wrappers.verification.feasibility import verify
+from safe_envs.wrappers import DDSCBF
 from thesis.artefact import Claim, Outcome, Sample, settings, texts
 from thesis.chapter_5 import noise
 from thesis.chapter_5.noise import WITHOUT_RATE, Identification, Runs, rates_of
@@ -57,7 +54,6 @@ def compute(sample: Sample) -> tuple[Outcome, None]:
             noise.explain_gap(runs, cbf_of(B), "in B"),
             noise.explain_gap(others, cbf_of(A), "in A"),
             _margin(learned[0], sample),
-            *([] if sample.quick else [_bound(runs["scbf"])]),
         ],
     ), None
 
@@ -117,16 +113,6 @@ def _margin(first: Identification, sample: Sample) -> str:
         "Prop. 5.2.2 asks for a positive margin on all of C: at the origin, where h is largest,"
         f" with the median error of the network, {margin:.2g} 1/s, for it the best torque {met}"
     )
-
-
-def _bound(scbf: MeasuredFilter) -> str:
-    """Return what Prop. 4.2.8 gives in B, in words."""
-    problem = make_problem(PENDULUM.env, start=B.start, horizon=B.horizon)
-    guarantee = verify(problem, (SCBF(),)).guarantee
-    bound = guarantee.applicable_bounds(starts_of(problem), problem.duration)[0]
-    bound = bound.without(by_rate(bound.value, scbf.row.ci_high))
-    value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
-    return f"SCBF knows the noise and needs no margin: {bound.name} = {value} ({bound.status})"
 
 
 ARTEFACTS = {"table-5.1": compute}
