@@ -7,6 +7,8 @@
 # make golden      compare the output of commands and envs with stored results, when refactoring
 # make lint        check style, formatting, types and the layers of imports
 # make wheel-test  build the wheel, install it without extras, and use it outside the checkout
+# make thesis      list the artefacts of the thesis; ARGS="all --out report" computes them
+# make benchmark   measure the speed of filters, envs and commands
 # make docs        build the documentation in site/
 # make docs-test   build it, and open every page in a browser
 # Every target first creates the virtual environment .venv.
@@ -16,7 +18,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test check oracle clusters mutants golden lint wheel-test docs docs-test clean
+.PHONY: demo test check oracle clusters mutants golden lint wheel-test thesis benchmark docs docs-test clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -47,6 +49,12 @@ lint: $(READY)
 
 wheel-test: $(READY)
 	sh tests/wheel_smoke.sh $(BIN)/python
+
+thesis: $(READY)
+	$(BIN)/python -m thesis $(ARGS)
+
+benchmark: $(READY)
+	$(BIN)/python -m benchmarks $(ARGS)
 
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

@@ -427,7 +427,7 @@ def test_docstrings_of_functions_begin_with_a_verb():
 def definitions() -> set[str]:
     """Return the names of classes, functions and annotated fields, in classes too."""
     found = set()
-    for path in sources("safe_envs"):
+    for path in sources("safe_envs", "thesis"):
         for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.ClassDef | ast.FunctionDef):
                 found.add(node.name)

@@ -14,7 +14,7 @@ except KeyboardInterrupt:  # Whoever presses it at once waits for no traceback e
 
 _EVALUATE = "Evaluate and train"
 _PROVE = "Prove and bound"
-_SHOW = "Use, show and reproduce"
+_SHOW = "Use and show"
 _TOOLS = "Tools"
 
 COMMANDS = tuple(
@@ -110,12 +110,6 @@ COMMANDS = tuple(
             " actions.",
         ),
         (
-            "reproduce",
-            _SHOW,
-            "reproduce.command:reproduce",
-            "Compute the tables and figures of the thesis, and compare them with the printed ones.",
-        ),
-        (
             "demo",
             _SHOW,
             "demo:demo",
@@ -129,12 +123,17 @@ COMMANDS = tuple(
             "cache:cache",
             "Print what is kept in the user's cache, or clear it.",
         ),
-        ("benchmark", _TOOLS, "benchmark:benchmark", "Measure the speed of filters and envs."),
     )
 )
 """All commands, in the order of the help."""
 
-app = make_app(COMMANDS)
+MOVED = {
+    "reproduce": "`python -m thesis` or `make thesis` in a checkout",
+    "benchmark": "`python -m benchmarks` or `make benchmark` in a checkout",
+}
+"""What to run in place of commands that there were."""
+
+app = make_app(COMMANDS, MOVED)
 
 
 def main() -> None:

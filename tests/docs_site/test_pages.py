@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from safe_envs.scripts.cli import app
 from tests.docs_site.chromium import Browser, Page
+from thesis.__main__ import app
 
 pytestmark = pytest.mark.docs
 
@@ -133,9 +133,7 @@ def test_search_finds_nothing_where_there_is_nothing(browser: Browser, address: 
 
 def test_the_page_of_a_reproduction(browser: Browser, serve: Serve, tmp_path: Path):
     names = ["table-5.1", "figure-3.3"]
-    done = CliRunner().invoke(
-        app, ["reproduce", *names, "--quick", "--jobs", "1", "--out", str(tmp_path)]
-    )
+    done = CliRunner().invoke(app, [*names, "--quick", "--jobs", "1", "--out", str(tmp_path)])
     assert done.exit_code == 0, done.output
     base = serve(tmp_path)
     for dark in (False, True):

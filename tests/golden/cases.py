@@ -1,5 +1,5 @@
-"""The golden cases: command lines of `safe-envs` by case, small enough that all of them take about
-two minutes of one processor.
+"""The golden cases: command lines of `safe-envs` and `python -m thesis` by case, small enough that
+all of them take about two minutes of one processor.
 
 `{root}` stands for the folder of the project. Each case runs in a temporary folder of its own, its
 lines in order.
@@ -37,7 +37,7 @@ class Case:
     """Command lines that run one after another.
 
     Attributes:
-        lines: `COMMAND ARGUMENTS`, without --json.
+        lines: `COMMAND ARGUMENTS` of safe-envs, or `thesis ARGUMENTS`; without --json.
         files: texts by name, written first.
     """
 
@@ -186,8 +186,8 @@ def cases() -> dict[str, Case]:
             )
         )
     for name in _ARTEFACTS:
-        found[f"reproduce/{name}"] = Case(
-            (f"reproduce {name} --quick --episodes 5 --jobs 1 --out report",)
+        found[f"thesis/{name}"] = Case(
+            (f"thesis {name} --quick --episodes 5 --jobs 1 --out report",)
         )
     return found
 

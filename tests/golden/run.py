@@ -38,6 +38,7 @@ from environments import rows  # noqa: E402
 
 from safe_envs.scripts.cli import main as safe_envs_main  # noqa: E402
 from safe_envs.user_cache import VARIABLE  # noqa: E402
+from thesis.__main__ import main as thesis_main  # noqa: E402
 
 ROWS = Path(__file__).parent / "rows"
 _TOLERANCE = 1e-9
@@ -97,14 +98,16 @@ def _document(arguments: list[str]) -> Any:
         RuntimeError: it refused.
     """
     out, err = io.StringIO(), io.StringIO()
-    argv = ["safe-envs", *arguments, "--quiet", "--json", "golden.json"]
+    of_thesis = arguments[0] == "thesis"
+    words = arguments if of_thesis else ["safe-envs", *arguments]
+    argv = [*words, "--quiet", "--json", "golden.json"]
     with (
         mock.patch.object(sys, "argv", argv),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
     ):
         try:
-            safe_envs_main()
+            thesis_main() if of_thesis else safe_envs_main()
             status: Any = 0
         except SystemExit as ended:
             status = ended.code

@@ -41,9 +41,9 @@ def test_list_shows_every_id(safe_envs_command):
 def test_help_names_the_commands(safe_envs_command):
     status, out, _ = safe_envs_command("--help")
     assert status == 0
-    for command in ("list", "evaluate", "verify", "demo", "benchmark"):
+    for command in ("list", "evaluate", "verify", "demo"):
         assert command in out
-    for command in ("evaluate", "verify", "demo", "benchmark"):
+    for command in ("evaluate", "verify", "demo"):
         assert safe_envs_command(command, "--help")[0] == 0
 
 
@@ -64,14 +64,21 @@ def test_usage_errors_end_with_status_2_too(safe_envs_command, arguments):
     assert "Traceback" not in err
 
 
-@pytest.mark.parametrize("command", ["benchmark", "demo"])
-def test_other_commands_check_their_paths_before_they_begin(safe_envs_command, command):
+@pytest.mark.parametrize("command", cli.MOVED)
+@pytest.mark.parametrize("more", [(), ("--help",), ("all", "--quick")])
+def test_a_command_that_has_moved_says_where_to(safe_envs_command, command, more):
+    status, out, err = safe_envs_command(command, *more)
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    assert cli.MOVED[command] in err
+    assert f"\n  {command} " not in safe_envs_command("--help")[1]
+
+
+def test_demo_checks_its_path_before_it_begins(safe_envs_command):
     Path("file").touch()
-    arguments = {"benchmark": ["--json", "nowhere/out.json"], "demo": ["--folder", "file"]}[command]
-    status, _, err = safe_envs_command(command, *arguments)
+    status, _, err = safe_envs_command("demo", "--folder", "file")
     assert status == 2
     assert err.startswith("Error:")
-    assert arguments[1] in err
+    assert "file" in err
 
 
 def run_at_a_terminal(*command):

@@ -64,8 +64,6 @@ LONG = "x" * 100_000
         (("evaluate", "Pendulum-v1", "--filter-spec", "pipe.py:spec"), "it is a pipe or a device"),
         (("sweep", "pipe", "--out", "found"), "it is a pipe or a device"),
         (("sweep-report", "."), "holds no sweep"),
-        (("benchmark", "--compare", "pipe"), "it is a pipe or a device"),
-        (("benchmark", "--compare", "deep.json"), "is no JSON"),
         (("leaderboard", "Scalar-v0", "--out", "."), "holds a leaderboard of an earlier version"),
         (("leaderboard", "Scalar-v0", "--out", "b", "--page", "deep.json"), "needs the line"),
         (("leaderboard", "Scalar-v0", "--out", "b", "--page", "pipe"), "cannot be read"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -73,12 +73,18 @@ class _Commands(MutableMapping[str, Any]):
 class _Group(TyperGroup):
     """A group whose help lists the commands in groups, without importing them."""
 
+    moved: Mapping[str, str] = {}
+
     def list_commands(self, ctx: Any) -> list[str]:
         """See `typer.core.TyperGroup.list_commands`."""
         return list(self.commands)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """See `typer.core.TyperGroup.resolve_command`; the error of a command that there is not."""
+        if args[0] in self.moved and not ctx.resilient_parsing:
+            raise ConfigurationError(
+                f"the command {shown(args[0])} has moved; run {self.moved[args[0]]}"
+            )
         known = args[0].startswith("-") or args[0] in self.commands
         # Completion, which is resilient, prints no error into the line that is being written.
         if not known and not ctx.resilient_parsing:
@@ -104,17 +110,20 @@ class _Group(TyperGroup):
             formatter.write_text("`safe-envs COMMAND --help` lists the options of a command.")
 
 
-def make_app(entries: Sequence[CommandEntry]) -> typer.Typer:
+def make_app(
+    entries: Sequence[CommandEntry], moved: Mapping[str, str] | None = None
+) -> typer.Typer:
     """Return the app of commands, which imports a command when it is used.
 
     Args:
         entries: in the order of the help.
+        moved: what to run in place of commands that there were, by their names.
     """
 
     class OfEntries(_Group):
         def __init__(self, **attributes: Any) -> None:
             super().__init__(**attributes)
-            self.commands = _Commands(entries)
+            self.commands, self.moved = _Commands(entries), moved or {}
 
     app = _bare_app(OfEntries)
 

@@ -45,17 +45,3 @@ def algorithms(incomplete: str) -> list[str]:
     from safe_envs.agents.training.hyperparameters import ALGORITHMS
 
     return words(ALGORITHMS)(incomplete)
-
-
-def artefacts(incomplete: str) -> list[str]:
-    """Return the tables and figures of the thesis that begin so."""
-    return words(("all", *ARTEFACTS))(incomplete)
-
-
-_NUMBERS = {
-    "figure": "3.1 3.2a 3.2b 3.3 4.1 4.2 4.3 5.1 5.2 5.3a 5.3b 5.3c 5.3d 6.1 6.2 6.3 6.4",
-    "table": "4.1 5.1 5.2 6.1 6.2 6.3 6.4",
-    "example": "4.2.2",
-}
-ARTEFACTS = tuple(f"{kind}-{n}" for kind, found in _NUMBERS.items() for n in found.split())
-"""As `safe_envs.scripts.reproduce.catalogue` has them."""

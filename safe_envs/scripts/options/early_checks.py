@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown, unknown
-from safe_envs.scripts.options import completion
 
 _UNFILTERED = "none"
 
@@ -140,19 +139,6 @@ def known_method(name: str) -> str:
     if name not in SETTINGS:
         raise unknown("method", name, SETTINGS)
     return name
-
-
-def known_artefacts(names: list[str] | None) -> list[str] | None:
-    """Return the names of tables and figures of the thesis if there are all of them.
-
-    Raises:
-        ConfigurationError: There is no such one.
-    """
-    allowed = ("all", *completion.ARTEFACTS)
-    for name in names or ():
-        if name not in allowed:
-            raise unknown("artefact", name, allowed)
-    return names
 
 
 def one_of(option: str, allowed: Sequence[str]) -> Callable[[Any], Any]:

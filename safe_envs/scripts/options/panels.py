@@ -81,20 +81,12 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "safe-envs render DubinsDisk-v0 --out episode.gif",
         "safe-envs render StochasticDubins-v0 --compare none,hocbf,scbf --out three.mp4",
     ),
-    "reproduce": (
-        "safe-envs reproduce table-4.1 figure-3.3 --quick",
-        "safe-envs reproduce all --jobs 4 --out report",
-    ),
     "sweep": ("safe-envs sweep sweep.yaml --out found --jobs 4",),
     "sweep-report": ("safe-envs sweep-report found --x noise --lines filter",),
     "list": ("safe-envs list", "safe-envs list --json -"),
     "doctor": ("safe-envs doctor",),
     "cache": ("safe-envs cache", "safe-envs cache --clear"),
     "demo": ("safe-envs demo --folder demo-results",),
-    "benchmark": (
-        "safe-envs benchmark --json today.json",
-        "safe-envs benchmark --compare today.json",
-    ),
 }
 """Command lines at the end of the help of each command, of at most 78 characters."""
 

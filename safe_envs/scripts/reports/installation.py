@@ -161,7 +161,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]], advice: str) -> Chec
 
 def speeds() -> dict[str, float]:
     """Return the steps per second of single envs on this machine, by what is stepped."""
-    from safe_envs.scripts.reports.benchmark_cases import NUM_ENVS, scalar_steps, vector_steps
+    from safe_envs.scripts.reports.env_speeds import NUM_ENVS, scalar_steps, vector_steps
 
     vector, filtered = f"vector env of {NUM_ENVS}", "with scbf"
     names = ("env", f"env {filtered}", vector, f"{vector} {filtered}")

@@ -12,7 +12,7 @@ import pytest
 import sympy as sp
 from scipy.stats import t as student
 
-from safe_envs import ConfigurationError
+from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.agents import NominalController, ZeroController, evaluate
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.policies.base import BlockPolicy
@@ -21,7 +21,6 @@ from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling
 from safe_envs.agents.rare_events.splitting import Splitting
 from safe_envs.problem.barrier import Barrier
-from safe_envs.scripts.reproduce.chapter_4.martingale import attaining_problem
 from tests.agents.rare_events.conftest import paths_of
 from tests.oracles.laws import (
     X,
@@ -99,7 +98,10 @@ def test_first_passage_of_probability_1e_8_with_continuous_monitoring(engine):
 @pytest.mark.slow
 @both_engines
 def test_geometric_martingale_of_probability_1e_8(engine):
-    problem = replace(attaining_problem(1e-4), dt=0.1, horizon=14.0)
+    # Under the SCBF, h = 1 - x^2 is a martingale of dx = u dt + x dW.
+    x, u = sp.symbols("x u", real=True)
+    system = ControlAffineSDE((x,), (u,), [0], [1], [x])
+    problem = state_problem(system, 1 - x**2, box=(-50.0, 50.0), start=[1e-4], dt=0.1, horizon=14.0)
     exact = martingale_passage(1e-4, 140, 0.1)
     row = row_of(problem, "scbf", seed=1, engine=engine)
     assert_holds(row, exact, 3.0)

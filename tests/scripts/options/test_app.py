@@ -85,7 +85,7 @@ def test_the_examples_of_the_help_can_be_read(name, line):
     parser = commands_of(cli.app)[name]
     known = {word for each in parser.params for word in (*each.opts, *each.secondary_opts)}
     assert {word for word in words if word.startswith("--")} <= known
-    reads_files = ("check", "sweep", "sweep-report", "benchmark")
+    reads_files = ("check", "sweep", "sweep-report")
     if name in reads_files or "my_policy.py:Policy" in words:
         # The files of these examples are not there, so that their values are not read.
         assert parser.make_context(name, [*words], resilient_parsing=True).args == []

@@ -12,8 +12,6 @@ import safe_envs
 from safe_envs.agents.policies import registry
 from safe_envs.agents.policies.names import POLICIES
 from safe_envs.scripts import cli
-from safe_envs.scripts.options import completion
-from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 from safe_envs.wrappers import CONDITIONS
 from safe_envs.wrappers.conditions import LEARNED, Certified, names
 
@@ -25,7 +23,6 @@ def test_the_names_that_are_known_early_are_those_of_the_classes():
     assert tuple(LEARNED) == names.OF_DATA
     assert Certified.name == names.CERTIFIED
     assert tuple(registry._NAMED) == POLICIES
-    assert sorted(completion.ARTEFACTS) == sorted(artefact.name for artefact in ARTEFACTS)
 
 
 def offered(monkeypatch, *words):
@@ -52,7 +49,6 @@ def offered(monkeypatch, *words):
         (("safe-envs", "train", "--algo", "t"), ["td3"]),
         (("safe-envs", "leaderboard", "ACC-"), ["ACC-v0"]),
         (("safe-envs", "identify", "--method", "b"), ["bayesian"]),
-        (("safe-envs", "reproduce", "example"), ["example-4.2.2"]),
         (("safe-envs", "doctor", "--q"), ["--quiet"]),
     ],
 )

@@ -24,7 +24,7 @@ from tests.wrappers.verification.verified import verify_once
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[3]
-SCRIPTS = {"list": "listing.py", "reproduce": "reproduce/command.py"}
+SCRIPTS = {"list": "listing.py"}
 QUICK = (
     "evaluate",
     "Scalar-v0",
@@ -172,8 +172,6 @@ def test_every_command_has_both_options(safe_envs_command):
         "identify",
         "train",
         "leaderboard",
-        "reproduce",
-        "benchmark",
     } <= set(commands)
     for name, command in commands.items():
         options = {option for parameter in command.params for option in parameter.opts}
@@ -247,7 +245,6 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
             ("identify", "Scalar-v0", "--method", "bayesian", "--out", "x.npz", "--set", "start=1"),
             "did you mean 'starts'",
         ),
-        (("reproduce", "table-9.1"), "did you mean 'table-"),
         (("leaderboard", "Scaler-v0"), "did you mean 'safe_envs/Scalar-v0'"),
     ],
 )

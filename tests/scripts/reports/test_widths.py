@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from safe_envs.scripts import benchmark
 from safe_envs.scripts.options import result_console, wrapping
-from safe_envs.scripts.reports import benchmark_figures, tables
+from safe_envs.scripts.reports import tables
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
 from safe_envs.scripts.reports.sweep_cells import print_cells
 from safe_envs.scripts.reports.training_report import print_evaluations
@@ -150,15 +149,6 @@ def test_train(told):
     console = Console(file=io.StringIO(), width=told.width)
     print_evaluations(console, LONG_NAME, [row, row | {"constraint": judgement}])
     assert "NOT MET" in told(console.file.getvalue())
-
-
-def test_benchmark(told, monkeypatch, capsys, tmp_path):
-    figures = {benchmark_figures.FUSED: 1.5, f"a case of {LONG_WORD}": 123456.0}
-    figures |= {f"latency, {LONG_WORD}: {i}": 1e5 for i in range(3)}
-    part = benchmark_figures.Part("all", lambda: figures)
-    monkeypatch.setattr(benchmark_figures, "parts", lambda: [part])
-    benchmark.benchmark()
-    told(capsys.readouterr().out)
 
 
 COMMANDS = {

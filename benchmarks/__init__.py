@@ -1,0 +1,1 @@
+"""The speed of filters, envs, learning and commands: `python -m benchmarks`."""

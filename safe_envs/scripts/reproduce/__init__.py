@@ -1,1 +1,0 @@
-"""`safe-envs reproduce`: the thesis' tables and figures, reproduced."""

@@ -1,1 +1,0 @@
-"""Artefacts of chapter 3 of the thesis."""

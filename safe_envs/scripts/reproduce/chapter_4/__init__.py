@@ -1,1 +1,0 @@
-"""Artefacts of chapter 4 of the thesis."""

@@ -1,1 +1,0 @@
-"""Artefacts of chapter 5 of the thesis."""

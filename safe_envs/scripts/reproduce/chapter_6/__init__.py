@@ -1,1 +1,0 @@
-"""Artefacts of chapter 6 of the thesis."""

@@ -1,1 +1,0 @@
-"""What an artefact of the thesis is, how its results are stored, judged and shown."""
