@@ -186,7 +186,7 @@ def test_observations_are_clipped_and_samples_are_not():
     env = SafeEnv(problem_of(PENDULUM, measurement=far))
     observation, info = env.reset(seed=0)
     assert observation.tolist() == [1e6]
-    assert env.measured.values == [pytest.approx(1e9 * info["state"][0] + 5e9)]
+    assert env.measured.values == pytest.approx((1e9 * info["state"][0] + 5e9,))
 
 
 def test_angles_are_known_modulo_a_turn():

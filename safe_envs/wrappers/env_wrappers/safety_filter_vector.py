@@ -183,7 +183,8 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def _with_bounds(self, info: Info) -> Info:
         """Add what is always the same to an info of the compiled function."""
         if self._bounds is not None:
-            info["input_bounds"], info["_input_bounds"] = self._bounds.copy(), info["_cost"]
+            info["input_bounds"] = self._bounds.copy()
+            info["_input_bounds"] = info["_cost"].copy()
         return info
 
     def _observe_last(self, info: Info, ended: np.ndarray) -> None:

@@ -30,7 +30,7 @@ class FilterProgram(NamedTuple):
         source: the functions `decide` and `barrier_values`.
         data: their numbers.
         proposes: whether the filter pursues a goal of its own, in place of the proposed input.
-        partial: the constraints whose barrier may have no value.
+        partial: numbers of the barriers that may have no value.
     """
 
     source: Source
@@ -53,7 +53,7 @@ def filter_program(safety_filter: SafetyFilter) -> FilterProgram:
     barriers = [model.numeric(barrier.expression) for barrier, _ in safety_filter.pairs]
     source = _Decision(qp, data).source()
     source += formulas("barrier_values", {"x": qp.symbols}, barriers, data)
-    return FilterProgram(source, data, qp.clf is not None, qp.partial)
+    return FilterProgram(source, data, qp.clf is not None, qp.partial_barriers)
 
 
 class _Decision(ArrayDecision):

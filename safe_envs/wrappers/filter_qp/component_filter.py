@@ -123,7 +123,9 @@ class ComponentFilter:
             which: of the barriers; None to find out.
         """
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.qp.symbols, x, strict=True))
-        which = self._arrays.undefined_at(x) if which is None and "goal" not in what else which
+        if which is None and "goal" not in what:
+            owners = self.qp.owner_of_each
+            which = list(dict.fromkeys(owners[i] for i in self._arrays.undefined_at(x)))
         names = f" on {', '.join([self._names[i] for i in which])}" if which else ""
         return NumericalError(
             f"{what}{names} has no finite value at {at}; check it and the model there"

@@ -83,9 +83,19 @@ class FilterQP:
         )
 
     @property
+    def owner_of_each(self) -> Sequence[int]:
+        """Number of the barrier that each constraint is of."""
+        return self.owners or range(len(self.constraints))
+
+    @property
+    def partial_barriers(self) -> tuple[int, ...]:
+        """Numbers of the barriers that may have no value at some state."""
+        return tuple(dict.fromkeys(self.owner_of_each[i] for i in self.partial))
+
+    @property
     def members(self) -> list[list[int]]:
         """Numbers of the constraints of each barrier."""
-        owners = self.owners or range(len(self.constraints))
+        owners = self.owner_of_each
         return [[i for i, o in enumerate(owners) if o == owner] for owner in dict.fromkeys(owners)]
 
     @property

@@ -40,12 +40,12 @@ BOUNDS = np.stack([LOW, LOW + np.random.default_rng(5).uniform(0.0, 4.0, (30, 2)
 EARLY = {"sampling_margin": "first-order"}
 
 
-def chased() -> ControlAffineSDE:
+def chased(drift: sp.Expr = wind) -> ControlAffineSDE:
     """Two integrators in a wind, chased by something that moves along p at the speed q."""
     return ControlAffineSDE(
         (x, y),
         (u, w),
-        [wind, 0],
+        [drift, 0],
         [[gain, 0], [0, 1]],
         [[0.2], [0.1]],
         parameters={gain: 1.0, wind: 0.5},
@@ -247,8 +247,11 @@ def test_bounds_are_finite_where_the_filter_may_go_to_their_ends():
         goal.filter([0, 0], [0, 0], bounds=(-math.inf, 1), parameters=POINT)
 
 
-def test_a_state_without_a_value_is_told_with_what_was_given():
-    singular = SafetyFilter(chased(), 1 - x + sp.log(p), "cbf", (-2, 2))
+def test_constraints_without_a_value_are_told_with_what_was_given():
+    without = SafetyFilter(chased(), 1 - x + sp.log(p), "cbf", (-2, 2))
+    found = without.filter([0.0, 0.0], [0.0, 0.0], parameters={"p": -1.0, "q": 1.0})
+    assert not found.feasible and found.slack == [np.inf]
+    singular = SafetyFilter(chased(sp.log(p)), 1 - x, "cbf", (-2, 2))
     with pytest.raises(NumericalError, match="p = -1, q = 1"):
         singular.filter([0.0, 0.0], [0.0, 0.0], parameters={"p": -1.0, "q": 1.0})
     with pytest.raises(NumericalError, match="p = -1, q = 1"):
