@@ -6,7 +6,7 @@ import itertools
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
-from safe_envs.wrappers.filter_qp.compiled import domain_of, functions_of, second_order
+from safe_envs.wrappers.filter_qp.compiled import domain_of, functions_of, solved_as_cones
 from safe_envs.wrappers.filter_qp.decision_kernel import (
     aim_outwards,
     furthest_constraint,
@@ -50,7 +50,7 @@ class ArrayDecision:
         self._sampled = [i for i, c in constraints if c.change is not None]
         self._maxima = [i for i, c in constraints if c.alternatives]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
-        self._second_order = second_order(qp)
+        self._second_order = solved_as_cones(qp)
         self._method, self._room = projection_for(
             self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )

@@ -74,9 +74,8 @@ class BarrierValues:
     def _defined(self, barrier: np.ndarray, x: Sequence[Any]) -> np.ndarray:
         """Return barriers (B, k) at states, -inf where one has no value; raise on overflow."""
         bad = ~np.isfinite(barrier)
-        lost = [
-            i for i in range(bad.shape[1]) if i not in self.qp.partial_barriers and bad[:, i].any()
-        ]
+        partial = self.qp.partial_barriers
+        lost = [i for i in range(bad.shape[1]) if i not in partial and bad[:, i].any()]
         if lost:
             at = int(bad[:, lost[0]].argmax())
             raise self.undefined("the barrier", [float(np.atleast_1d(c)[at]) for c in x], lost[:1])

@@ -50,7 +50,7 @@ class CompiledQP:
         self._sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
         self._maxima = [i for i, c in enumerate(qp.constraints) if c.alternatives]
-        self._exact = second_order(qp)
+        self._exact = solved_as_cones(qp)
         arrays = flavour == "arrays"
         self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
         self._symbols = (*qp.symbols, *(s for term in qp.terms for s in term.symbols))
@@ -279,7 +279,7 @@ class CompiledQP:
         return compile_function(self._symbols, numbers, self._flavour)
 
 
-def second_order(qp: FilterQP) -> bool:
+def solved_as_cones(qp: FilterQP) -> bool:
     """Return whether uncertain constraints are solved as they are, not by planes above them."""
     uncertain = any(c.uncertainty is not None for c in qp.constraints)
     return uncertain and qp.model.m == 1 and qp.clf is None

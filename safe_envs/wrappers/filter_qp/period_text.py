@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from safe_envs.wrappers.filter_qp.compiled import change_coefficients, second_order
+from safe_envs.wrappers.filter_qp.compiled import change_coefficients, solved_as_cones
 from safe_envs.wrappers.filter_qp.decision_text import Body, Values
 from safe_envs.wrappers.filter_qp.period_kernel import (
     COEFFICIENTS,
@@ -53,7 +53,7 @@ def write_period(
             lines = [f"if {counts[i]}:", *(f"    {line}" for line in lines)]
         body.add(*lines)
         finite.append(" + ".join(f"held[{place}, {e}]" for e in range(1 + m + bends)))
-    form = [[f"form[{i}, {e}]" for e in range(3)] for i in range(k)] if second_order(qp) else []
+    form = [[f"form[{i}, {e}]" for e in range(3)] for i in range(k)] if solved_as_cones(qp) else []
     body.table("held_form", form + [["0.0"] * 3] * (size - len(form)))
     body.table("slopes", [["0.0"] * m] * size)
     body.table("line", [["0.0"] * COEFFICIENTS] * size)

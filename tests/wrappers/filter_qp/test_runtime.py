@@ -250,7 +250,8 @@ def test_bounds_are_finite_where_the_filter_may_go_to_their_ends():
 def test_constraints_without_a_value_are_told_with_what_was_given():
     without = SafetyFilter(chased(), 1 - x + sp.log(p), "cbf", (-2, 2))
     found = without.filter([0.0, 0.0], [0.0, 0.0], parameters={"p": -1.0, "q": 1.0})
-    assert not found.feasible and found.slack == [np.inf]
+    assert not found.feasible
+    assert found.slack == [np.inf]
     singular = SafetyFilter(chased(sp.log(p)), 1 - x, "cbf", (-2, 2))
     with pytest.raises(NumericalError, match="p = -1, q = 1"):
         singular.filter([0.0, 0.0], [0.0, 0.0], parameters={"p": -1.0, "q": 1.0})
