@@ -284,15 +284,6 @@ def test_a_class_name_has_one_meaning():
     fail_with(found, "classes of the same name")
 
 
-def test_modules_have_at_most_300_lines():
-    found = [
-        f"{path.relative_to(ROOT)}: {lines}"
-        for path in sources("safe_envs")
-        if (lines := path.read_text().count("\n")) > 300
-    ]
-    fail_with(found, "modules of more than 300 lines")
-
-
 def test_agents_has_at_most_eight_parts():
     parts = [
         path.name

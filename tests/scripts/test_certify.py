@@ -98,7 +98,7 @@ def test_too_many_states_are_refused_before_the_search(safe_envs_command):
         (("--degree", 6, "--rate", -1), "does not hold for a negative one"),
         (("--degree", 6, "--policy", "nobody"), "nobody"),
         (("--held", "--policy", "nominal"), "leave --policy"),
-        (("--held", "--rate", 0), "--rate and"),
+        (("--held", "--rate", 0), "--rate"),
         (("--held", "--substeps", 2), "substeps = 2"),
         (("--degree", 6, "--policy", "random"), "has no formula"),
         (("--degree", 6, "--out", "a.json", "--json", "a.json"), "give two files"),

@@ -182,8 +182,17 @@ def test_inputs_that_are_none_are_errors(state, nominal):
 
 
 @pytest.mark.parametrize("h", [sp.log(x), 1 / x, sp.sqrt(x) + 1])
-def test_states_where_the_constraint_has_no_value_are_errors(h):
+def test_states_where_the_barrier_or_its_rate_has_no_value_are_not_safe(h):
     safety_filter = SafetyFilter(integrator(), [(Barrier(h), CBF(1.0))], bounds=[(-1.0, 1.0)])
+    found = safety_filter.filter(np.array([0.0]), np.array([3.0]))
+    assert (found.feasible, found.slack, found.action.tolist()) == (False, [np.inf], [1.0])
+    found = safety_filter.filter(np.array([[1.0], [0.0]]), np.zeros((2, 1)))
+    assert found.feasible.tolist() == [True, False]
+
+
+def test_states_where_the_dynamics_have_no_value_are_errors():
+    system = ControlAffineSDE((x,), (u,), [sp.log(x)], [1])
+    safety_filter = SafetyFilter(system, [(Barrier(1 - x), CBF(1.0))], bounds=[(-1.0, 1.0)])
     with pytest.raises(NumericalError, match="no finite value at x = 0"):
         safety_filter.filter(np.array([0.0]), np.array([0.0]))
     with pytest.raises(NumericalError, match="no finite value at x = 0"):

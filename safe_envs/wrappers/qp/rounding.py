@@ -41,8 +41,8 @@ ArrayAnswer = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.nda
 def added(terms: Iterable[Any]) -> Any:
     """Return the sum of floats or arrays, added in order.
 
-    From Python 3.12 on `sum` corrects the rounding of floats, which NumPy and compiled programs do
-    not: a state by itself would have another result than in a batch.
+    From Python 3.12 on `sum` corrects the rounding of floats, which NumPy and compiled code do not:
+    a state by itself would have another result than in a batch.
 
     Args:
         terms: the floats or arrays.
