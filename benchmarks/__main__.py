@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
+from safe_envs.files import read_json
 from safe_envs.scripts.options.console import (
     STDOUT,
     Json,
@@ -50,8 +50,8 @@ def benchmark(
 def _measure(console: Console, earlier: Mapping[str, float]) -> dict[str, float]:
     from benchmarks.figures import parts, side_by_side
     from safe_envs import __version__
-    from safe_envs.scripts.reports.env_speeds import ENV_ID
-    from safe_envs.user_cache import own_cache
+    from safe_envs.files import own_cache
+    from safe_envs.scripts.reports.installation import ENV_ID
 
     figures: dict[str, float] = {}
     cores = f"one of {os.cpu_count()} cores"
@@ -96,7 +96,7 @@ def _print(console: Console, figures: Mapping[str, float], earlier: Mapping[str,
     Tails of single decisions have a table of their own, and are in this one only to be compared.
     """
     from benchmarks import latency
-    from safe_envs.scripts.reports.env_speeds import NUM_ENVS
+    from safe_envs.scripts.reports.installation import NUM_ENVS
 
     shown = {
         name: value

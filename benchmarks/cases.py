@@ -7,17 +7,17 @@ import numpy as np
 import sympy as sp
 
 from benchmarks.hand_written_loop import LIMIT, step_by_hand
-from safe_envs.compiled.formulas import Source
-from safe_envs.compiled.program import Program
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.sample import Sample
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.program import Program
+from safe_envs.envs.sensor import Sample
 from safe_envs.envs.vector_env import SafeVectorEnv
-from safe_envs.problem.barrier import Barrier
+from safe_envs.filters.estimation import BeliefTracker, ExtendedKalmanFilter, InitialBelief
 from safe_envs.problem.measurement import Channel, Measurement
+from safe_envs.problem.problem import Barrier
 from safe_envs.registry import make_problem
-from safe_envs.scripts.reports.env_speeds import ENV_ID, NUM_ENVS, Case
+from safe_envs.scripts.reports.installation import ENV_ID, NUM_ENVS, Case
 from safe_envs.wrappers import CBF, HOCBF, SafetyFilter
-from safe_envs.wrappers.estimation import BeliefTracker, ExtendedKalmanFilter, InitialBelief
 
 _BATCHES = (1, 32, 1024, 10_000)
 

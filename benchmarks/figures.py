@@ -18,9 +18,11 @@ from benchmarks.cases import (
     hand_written_loop,
     several_constraints,
 )
-from safe_envs.compiled.program import is_available
+from safe_envs.engine.program import is_available
+from safe_envs.filters.learning import LearnedModel, learner_of
+from safe_envs.filters.learning.collection import draw_states
 from safe_envs.registry import make_problem
-from safe_envs.scripts.reports.env_speeds import (
+from safe_envs.scripts.reports.installation import (
     ENV_ID,
     NUM_ENVS,
     Case,
@@ -28,8 +30,6 @@ from safe_envs.scripts.reports.env_speeds import (
     vector_steps,
 )
 from safe_envs.wrappers import DDSCBF, BayesianSCBF, LearnedHOCBF, SafetyFilter
-from safe_envs.wrappers.learning import LearnedModel, learner_of
-from safe_envs.wrappers.learning.data.collection import draw_states
 
 Figures = dict[str, float]
 """Numbers by name; times of cases are in microseconds for each state, or for each call."""
@@ -229,7 +229,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
 
 def _vec_envs(engine: str) -> Figures:
     """Return the speed of the native VecEnv over that of DummyVecEnv, with 64 envs each."""
-    from safe_envs.agents.training.vec_env_speed import speeds
+    from safe_envs.agents.training.vec_env import speeds
 
     found = {}
     for name, text in (("unfiltered", None), ("filtered", "scbf")):

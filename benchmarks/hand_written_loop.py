@@ -11,9 +11,9 @@ from math import cos, inf, pi, sin, sqrt
 
 import numpy as np
 
-from safe_envs.compiled.plain_natives import philox_block, uniform_of
+from safe_envs.dynamics.noise import NOISE, START
 from safe_envs.dynamics.normal_kernel import standard_normal
-from safe_envs.dynamics.philox import NOISE, START
+from safe_envs.engine.plain_natives import philox_block, uniform_of
 
 SPEED = 2.0
 SIGMA = 0.2

@@ -16,7 +16,7 @@ noise of the plant.
 from __future__ import annotations
 
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.evaluate import Evaluation
 
 RADAR = [
     "x:noise=0.1",

@@ -16,22 +16,20 @@ from safe_envs.errors import (
     SystemDefinitionWarning,
 )
 from safe_envs.gymnasium_ids import register_with_gymnasium
-from safe_envs.lazy_attributes import lazy_attributes
-from safe_envs.package_version import package_version
+from safe_envs.lazy_attributes import lazy_attributes, package_version
 from safe_envs.systems import ENV_IDS
 
 if TYPE_CHECKING:
     from safe_envs.dynamics.sde import ControlAffineSDE
-    from safe_envs.envs.custom import register
     from safe_envs.envs.env import SafeEnv
+    from safe_envs.envs.registered import register
     from safe_envs.envs.vector_env import SafeVectorEnv
-    from safe_envs.problem.barrier import Barrier
+    from safe_envs.filters.decision_log import DecisionLog
+    from safe_envs.filters.safety_filter import SafetyFilter
     from safe_envs.problem.builder import state_problem
     from safe_envs.problem.clf import CLF
-    from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.scripts.figures.log_figure import plot_log
-    from safe_envs.wrappers.decision_log import DecisionLog
-    from safe_envs.wrappers.safety_filter import SafetyFilter
+    from safe_envs.problem.problem import Barrier, SafetyProblem
+    from safe_envs.scripts.figures.log import plot_log
 
     __version__: str
 
@@ -58,16 +56,16 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Barrier": "safe_envs.problem.barrier",
+    "Barrier": "safe_envs.problem.problem",
     "CLF": "safe_envs.problem.clf",
     "ControlAffineSDE": "safe_envs.dynamics.sde",
-    "DecisionLog": "safe_envs.wrappers.decision_log",
+    "DecisionLog": "safe_envs.filters.decision_log",
     "SafeEnv": "safe_envs.envs.env",
     "SafeVectorEnv": "safe_envs.envs.vector_env",
-    "SafetyFilter": "safe_envs.wrappers.safety_filter",
+    "SafetyFilter": "safe_envs.filters.safety_filter",
     "SafetyProblem": "safe_envs.problem.problem",
-    "plot_log": "safe_envs.scripts.figures.log_figure",
-    "register": "safe_envs.envs.custom",
+    "plot_log": "safe_envs.scripts.figures.log",
+    "register": "safe_envs.envs.registered",
     "state_problem": "safe_envs.problem.builder",
 }
 

@@ -5,11 +5,11 @@ commands draw with the same functions. Importing this module imports Matplotlib;
 does not.
 """
 
-from safe_envs.scripts.figures.best_figure import plot_attainable
-from safe_envs.scripts.figures.evaluation_figure import plot_evaluation
-from safe_envs.scripts.figures.frontier_figure import plot_frontier
-from safe_envs.scripts.figures.log_figure import plot_log
-from safe_envs.scripts.figures.verify_figure import plot_verification
+from safe_envs.scripts.figures.best import plot_attainable
+from safe_envs.scripts.figures.evaluation import plot_evaluation
+from safe_envs.scripts.figures.frontier import plot_frontier
+from safe_envs.scripts.figures.log import plot_log
+from safe_envs.scripts.figures.verify import plot_verification
 
 __all__ = [
     "plot_attainable",

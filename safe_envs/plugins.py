@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import functools
+import importlib
+import importlib.util
+import inspect
+import os
 import sys
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+import cloudpickle
+
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
+from safe_envs.files import MOST_BYTES_OF_TEXT, open_regular
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoints
+
 
 CONDITIONS = "safe_envs.conditions"
 POLICIES = "safe_envs.policies"
@@ -86,3 +100,181 @@ def load_plugin(group: str, name: str) -> Any:
             f"{group}: {name!r} ({point.value}) cannot be imported"
             f" ({type(error).__name__}: {shortened(error)}); repair or uninstall its package"
         ) from error
+
+
+_ADVICE = "give the path of a Python file, as in my_system.py:problem"
+
+
+def load_object(place: str) -> Any:
+    """Import an object by its place, which runs the code there.
+
+    A file is read again when it has changed, together with the modules of its folder that it
+    imports.
+
+    Args:
+        place: FILE.py:NAME or MODULE:NAME.
+
+    Raises:
+        ConfigurationError: there is no such place, or the code there ends with an error.
+    """
+    source, colon, name = place.rpartition(":")
+    if not (colon and source and name):
+        raise ConfigurationError(
+            f"{shown(place)} is not a place; give FILE.py:NAME or MODULE:NAME, like"
+            " my_system.py:problem"
+        )
+    module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
+    if not hasattr(module, name):
+        raise ConfigurationError(
+            f"{shortened(source)} has no {shown(name)}; {nearest(name, _stated_in(module))}"
+        )
+    return getattr(module, name)
+
+
+def resolved(place: str) -> str:
+    """Return a place with the full path of its file, so that it holds in any folder."""
+    source, _, name = place.rpartition(":")
+    return f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else place
+
+
+def place_of(stated: type) -> str:
+    """Return the place from which `load_object` imports a class.
+
+    It is FILE.py:NAME for one of a script or of a file that was loaded by its place, MODULE:NAME
+    for others.
+    """
+    name, place = stated.__module__, f"{stated.__module__}:{stated.__qualname__}"
+    path = Path(getattr(sys.modules.get(name), "__file__", None) or "/")
+    of_file = name in ("__main__", _module_name(path)) and path.suffix == ".py"
+    return f"{path.resolve()}:{stated.__qualname__}" if of_file else place
+
+
+def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
+    """Call a function that was imported from a place, and return its value.
+
+    Args:
+        function: what was imported.
+        place: FILE.py:NAME or MODULE:NAME of it, for errors.
+        arguments: keyword arguments.
+
+    Returns:
+        What the function returns.
+
+    Raises:
+        ConfigurationError: an argument is missing or unknown, or the code there ends with an error.
+    """
+    try:
+        inspect.signature(function).bind(**arguments)
+    except TypeError as error:
+        raise ConfigurationError(
+            f"{place}: {error}; give its arguments by --barrier NAME=VALUE (in Python:"
+            " barrier={...})"
+        ) from error
+    source = place.rpartition(":")[0]
+    with _running(Path(source).resolve() if source.endswith(".py") else None, place):
+        return function(**arguments)
+
+
+def _stated_in(module: ModuleType) -> list[str]:
+    """List what a module defines itself: no modules, classes or symbols."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and not inspect.ismodule(value)
+        and getattr(value, "__module__", module.__name__)
+        in (
+            module.__name__,
+            "safe_envs.problem.problem",
+            "safe_envs.wrappers.external_env",
+        )
+    ]
+
+
+def _of_file(path: Path) -> ModuleType:
+    try:
+        with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
+            changed = os.fstat(stream.fileno()).st_mtime_ns
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"there is no file {shortened(path)}; {_ADVICE}") from error
+    except OSError as error:
+        raise ConfigurationError(
+            f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}"
+        ) from error
+    main = sys.modules["__main__"]
+    # The script that runs is there already; a second run would state its classes again.
+    if Path(getattr(main, "__file__", None) or "/").resolve() == path.resolve():
+        return main
+    return _loaded(path.resolve(), changed)
+
+
+def _module_name(path: Path) -> str:
+    return f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
+
+
+@lru_cache(maxsize=32)
+def _loaded(path: Path, _changed: int) -> ModuleType:
+    """Import a file, once until it changes, so that its symbols are compiled once."""
+    name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigurationError(f"{path} cannot be read as Python")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    # Another process does not have this module: what is sent there takes its functions along.
+    cloudpickle.register_pickle_by_value(module)
+    try:
+        with _running(path, str(path)):
+            spec.loader.exec_module(module)
+    except SafeEnvsError:
+        cloudpickle.unregister_pickle_by_value(module)
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _of_module(name: str) -> ModuleType:
+    if name in sys.modules:
+        return sys.modules[name]
+    with _running(None, f"module {shortened(name)} (a file is named with .py)"):
+        return importlib.import_module(name)
+
+
+@contextmanager
+def _running(path: Path | None, what: str) -> Iterator[None]:
+    """Run a user's code: its errors become ours, with the line.
+
+    Modules in its folder can be imported, as when Python runs it.
+    """
+    folder = None if path is None else str(path.parent)
+    known = set(sys.modules)
+    if folder is not None:
+        sys.path.insert(0, folder)
+    try:
+        yield
+    except SafeEnvsError as error:
+        raise type(error)(f"{what}{_line(error, path)}: {error}") from error
+    except (Exception, SystemExit) as error:
+        reason = f"{type(error).__name__}: {shortened(error, 400)}"
+        raise ConfigurationError(
+            f"{what} ended with an error{_line(error, path)}: {reason}"
+        ) from error
+    finally:
+        if folder is not None:
+            sys.path.remove(folder)
+            # Another file may have a neighbour of the same name.
+            for name in set(sys.modules) - known:
+                if (
+                    Path(getattr(sys.modules[name], "__file__", None) or "/").parent == Path(folder)
+                    and sys.modules[name].__name__ == name
+                ):
+                    del sys.modules[name]
+
+
+def _line(error: BaseException, path: Path | None) -> str:
+    """Return the last line of the file that led to an error."""
+    lines, trace = [], error.__traceback__
+    while trace is not None:
+        if path is not None and trace.tb_frame.f_code.co_filename == str(path):
+            lines.append(trace.tb_lineno)
+        trace = trace.tb_next
+    return f" in line {lines[-1]}" if lines else ""

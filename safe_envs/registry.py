@@ -10,7 +10,7 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
 
 if TYPE_CHECKING:
-    from safe_envs.envs.system_env import SystemEnv
+    from safe_envs.envs.registered import SystemEnv
     from safe_envs.problem.problem import SafetyProblem
 
 
@@ -77,7 +77,7 @@ def env_class(env_id: str) -> type[SystemEnv]:
     import gymnasium as gym
     from gymnasium.envs.registration import load_env_creator
 
-    from safe_envs.envs.system_env import SystemEnv
+    from safe_envs.envs.registered import SystemEnv
 
     entry_point = gym.spec(full_id(env_id)).entry_point
     creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point

@@ -14,9 +14,8 @@ import hypothesis
 import hypothesis.strategies as st
 import pytest
 
-from safe_envs.atomic_io import require_writable, write_json
-from safe_envs.bounded_reading import open_archive, read_bytes, read_json
 from safe_envs.errors import ConfigurationError
+from safe_envs.files import open_archive, read_bytes, read_json, require_writable, write_json
 
 
 @pytest.fixture

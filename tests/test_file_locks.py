@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs import ConfigurationError, file_locks
-from safe_envs.file_locks import locked
+from safe_envs import ConfigurationError, files
+from safe_envs.files import locked
 
 
 def test_one_at_a_time(tmp_path):
@@ -30,7 +30,7 @@ def test_an_error_releases_it(tmp_path):
 def test_a_file_that_the_holder_removed_meanwhile_locks_nobody_out(tmp_path, monkeypatch):
     """Between the opening of the file and its lock, who had it may end, and a third may make
     another file."""
-    path, lock, calls = tmp_path / ".lock", file_locks._lock, []
+    path, lock, calls = tmp_path / ".lock", files._lock, []
 
     def late(file):
         if not calls:
@@ -38,7 +38,7 @@ def test_a_file_that_the_holder_removed_meanwhile_locks_nobody_out(tmp_path, mon
         calls.append(file)
         lock(file)
 
-    monkeypatch.setattr(file_locks, "_lock", late)
+    monkeypatch.setattr(files, "_lock", late)
     with locked(path, "taken"):
         assert len(calls) == 2
         with pytest.raises(ConfigurationError, match="taken"), locked(path, "taken"):
@@ -63,7 +63,7 @@ def test_who_waits_gets_the_lock_in_the_end(tmp_path, monkeypatch):
         events.append("slept")
         holder.__exit__(None, None, None)
 
-    monkeypatch.setattr(file_locks.time, "sleep", released)
+    monkeypatch.setattr(files.time, "sleep", released)
     with locked(path, "taken", lambda: events.append("told")):
         assert events == ["told", "slept"]
         with pytest.raises(ConfigurationError, match="taken"), locked(path, "taken"):

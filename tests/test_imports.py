@@ -34,7 +34,7 @@ import safe_envs.agents
 HEAVY = ("torch", "stable_baselines3", "matplotlib", "proxsuite", "pygame")
 assert not loaded(*HEAVY), "the packages"
 
-from safe_envs.wrappers.qp import dispatch
+from safe_envs.engine.qp import dispatch
 
 box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
 assert dispatch.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.9], *box)[3]
@@ -75,7 +75,7 @@ def test_nothing_is_imported_before_it_is_needed():
 def test_what_a_package_has_can_be_used_as_its_attribute():
     code = """
 import safe_envs, safe_envs.wrappers
-safe_envs.envs, safe_envs.agents, safe_envs.wrappers.conditions
+safe_envs.envs, safe_envs.agents, safe_envs.filters.conditions
 for name in ("no_such", "__wrapped__"):
     assert not hasattr(safe_envs, name)
 """

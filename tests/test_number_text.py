@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import pytest
 
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
-from safe_envs.number_text import finite_number, real, real_or_complex, whole_or_real
+from safe_envs.text import finite_number, real, real_or_complex, whole_or_real
 from tests.conftest import problem_of
 
 

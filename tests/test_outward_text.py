@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_envs.outward_text import (
+from safe_envs.text import (
     number_at_least,
     number_at_most,
     percent_at_least,

@@ -10,10 +10,12 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.attainable import attainable_safety
-from safe_envs.plotting import plot_attainable, plot_evaluation, plot_verification
+from safe_envs.proofs.feasibility import verify
+from safe_envs.scripts.figures.best import plot_attainable
+from safe_envs.scripts.figures.evaluation import plot_evaluation
+from safe_envs.scripts.figures.verify import plot_verification
+from safe_envs.values.tables import ValueSettings
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.verification.feasibility import verify
 from tests.readable import figure_texts, unreadable
 
 SCALAR = "safe_envs/Scalar-v0"

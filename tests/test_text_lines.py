@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.text_lines import folded, text_width, visible, wrapped
+from safe_envs.text import folded, text_width, visible, wrapped
 
 COMPARED = (
     "  promise:p=0.9 - scbf: +21.0 points [15.6, 27.2], McNemar p < 1e-10 (safe with one only:"

@@ -7,14 +7,14 @@ import random
 
 import pytest
 
-from safe_envs.text_lines import text_width
-from safe_envs.text_tables import (
+from safe_envs.text import (
     SOFT_HYPHEN,
     Column,
     arranged,
     columns_of,
     markdown_of,
     text_of,
+    text_width,
     without_empty,
 )
 

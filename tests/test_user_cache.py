@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from safe_envs import user_cache
-from safe_envs.user_cache import CONTENTS, VARIABLE, cache_folder, entries, make_room, own_cache
+from safe_envs import files
+from safe_envs.files import CONTENTS, VARIABLE, cache_folder, entries, make_room, own_cache
 
 
 def test_places_of_the_cache(tmp_path, monkeypatch):
@@ -22,7 +22,7 @@ def test_places_of_the_cache(tmp_path, monkeypatch):
     assert cache_folder("values") == tmp_path / "given" / "values"
     monkeypatch.delenv(VARIABLE)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(user_cache.sys, "platform", "linux")
+    monkeypatch.setattr(files.sys, "platform", "linux")
     assert cache_folder("compiled") == tmp_path / "safe-envs" / "compiled"
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from safe_envs import InvalidInputError
-from safe_envs.validators import real_array
+from safe_envs.errors import real_array
 from safe_envs.wrappers import (
     FilterSpec,
     SafetyFilter,
@@ -18,7 +18,7 @@ from safe_envs.wrappers import (
     SafetyFilterWrapper,
     SafetyMonitor,
 )
-from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
+from safe_envs.wrappers.monitor import SafetyMonitorVector
 from tests.conftest import problem_of
 
 NO_NUMBERS = {

@@ -66,7 +66,7 @@ def thesis(
 def _compute(chosen: list[str], sample: Sample, out: Path, jobs: int, json: Path | None) -> None:
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.store import ResultStore
-    from safe_envs.scripts.options.job_progress import run_jobs
+    from safe_envs.scripts.options.console import run_jobs
     from thesis.catalogue import ArtefactJob, code_checksum, read
     from thesis.report import Entry, document, print_entry, write_page
 

@@ -10,8 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.jobs.fingerprint import package_versions, source_checksum
-from safe_envs.agents.jobs.store import ResultStore, reading
+from safe_envs.agents.jobs.store import ResultStore, package_versions, reading, source_checksum
 from safe_envs.errors import ConfigurationError
 from thesis.artefact import Compute, Outcome, Sample, chapter_of, texts
 
@@ -100,9 +99,8 @@ class ArtefactJob:
         import matplotlib as mpl
         from matplotlib.figure import Figure
 
-        from safe_envs.scripts.figures.saving import save
-        from safe_envs.scripts.figures.style import STYLE
-        from safe_envs.scripts.options.figure_options import WIDTHS
+        from safe_envs.scripts.figures.style import STYLE, save
+        from safe_envs.scripts.options.evaluation_options import WIDTHS
 
         width, height = texts()[self.key].size
         wide = WIDTHS["double"]

@@ -10,12 +10,11 @@ import numpy as np
 
 from safe_envs import Barrier, ControlAffineSDE, RelativeDegreeError, SafetyProblem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.comparison import compare_all
-from safe_envs.agents.evaluation.repeats import pooled
+from safe_envs.agents.evaluation.identification import pooled
 from safe_envs.agents.evaluation.rows import EpisodeSummary
-from safe_envs.agents.evaluation.safe_flags import SafeFlags
+from safe_envs.agents.evaluation.statistics import SafeFlags, compare_all
+from safe_envs.filters.learning import LearnedModel
 from safe_envs.wrappers import AffineConstraint, Condition
-from safe_envs.wrappers.learning import LearnedModel
 from thesis.artefact import Claim, Number
 
 PRINTED_EPISODES = 1000

@@ -13,8 +13,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markdown_it import MarkdownIt
 from rich.console import Console
 
-from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.atomic_io import write_atomically
+from safe_envs.agents.jobs.store import package_versions
+from safe_envs.files import write_atomically
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from thesis import verdict

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from safe_envs.outward_text import percents_between
+from safe_envs.text import percents_between
 
 KEPT = Path(__file__).resolve().parents[1] / "assets" / "attainable.json"
 

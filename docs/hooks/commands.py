@@ -8,8 +8,7 @@ from typing import Any
 import typer
 
 from safe_envs.scripts.cli import COMMANDS, app
-from safe_envs.scripts.options.help_text import default_of, sections_of, written
-from safe_envs.scripts.options.panels import EXAMPLES
+from safe_envs.scripts.options.app import EXAMPLES, default_of, sections_of, written
 
 _INTRODUCTION = """# Command line
 

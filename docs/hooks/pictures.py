@@ -18,13 +18,13 @@ from runs import ROOT
 import safe_envs  # noqa: F401  (registers the ids)
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, plot_log
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.bound_check import starts_of
+from safe_envs.agents.evaluation.safety_chain import starts_of
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.object_import import load_object
+from safe_envs.plugins import load_object
+from safe_envs.proofs.feasibility import verify
 from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE
 from safe_envs.scripts.figures.style import SCREEN as STYLE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
-from safe_envs.wrappers.verification.feasibility import verify
 
 WIDE, NARROW = (1, 2), (2, 1)
 """Parts of a picture from top to bottom and from left to right, on a desktop and on a phone."""

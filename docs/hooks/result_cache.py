@@ -19,8 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from safe_envs.atomic_io import write_atomically
-from safe_envs.user_cache import own_cache
+from safe_envs.files import own_cache, write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / ".docs_cache"

@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING
 from safe_envs.lazy_attributes import lazy_attributes
 
 if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate, run_evaluation
-    from safe_envs.agents.evaluation.refinement import Refinement, refine
+    from safe_envs.agents.evaluation.evaluate import (
+        Evaluation,
+        Refinement,
+        evaluate,
+        refine,
+        run_evaluation,
+    )
     from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
     from safe_envs.agents.evaluation.statistics import (
         mcnemar_p,
@@ -19,9 +24,13 @@ if TYPE_CHECKING:
         wilson_interval,
     )
     from safe_envs.agents.policies.base import Policy
-    from safe_envs.agents.policies.clf import CLFController
     from safe_envs.agents.policies.names import POLICIES
-    from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
+    from safe_envs.agents.policies.nominal import (
+        CLFController,
+        NominalController,
+        RandomPolicy,
+        ZeroController,
+    )
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.agents.training.replay_buffer import FilteredReplayBuffer
     from safe_envs.agents.training.vec_env import make_sb3_env
@@ -52,7 +61,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "CLFController": "safe_envs.agents.policies.clf",
+    "CLFController": "safe_envs.agents.policies.nominal",
     "Evaluation": "safe_envs.agents.evaluation.evaluate",
     "EvaluationSpec": "safe_envs.agents.evaluation.spec",
     "FilteredReplayBuffer": "safe_envs.agents.training.replay_buffer",
@@ -60,7 +69,7 @@ _MODULES = {
     "POLICIES": "safe_envs.agents.policies.names",
     "Policy": "safe_envs.agents.policies.base",
     "RandomPolicy": "safe_envs.agents.policies.nominal",
-    "Refinement": "safe_envs.agents.evaluation.refinement",
+    "Refinement": "safe_envs.agents.evaluation.evaluate",
     "RunSettings": "safe_envs.agents.evaluation.spec",
     "ZeroController": "safe_envs.agents.policies.nominal",
     "evaluate": "safe_envs.agents.evaluation.evaluate",
@@ -70,7 +79,7 @@ _MODULES = {
     "mcnemar_p": "safe_envs.agents.evaluation.statistics",
     "paired_difference_interval": "safe_envs.agents.evaluation.statistics",
     "rate_interval": "safe_envs.agents.evaluation.statistics",
-    "refine": "safe_envs.agents.evaluation.refinement",
+    "refine": "safe_envs.agents.evaluation.evaluate",
     "run_evaluation": "safe_envs.agents.evaluation.evaluate",
     "wilson_interval": "safe_envs.agents.evaluation.statistics",
 }

@@ -13,10 +13,10 @@ from typing import Any
 import sympy as sp
 from sympy.simplify.fu import TR5
 
-from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.min_max import pieces
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.symbols import TIME
 from safe_envs.errors import RelativeDegreeError
 
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]

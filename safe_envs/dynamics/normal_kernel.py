@@ -1,7 +1,7 @@
 """Standard normal and exponential numbers of uniforms, one by one: a kernel module.
 
 The normal distribution function is inverted by rational functions whose relative error is about
-1e-16. The arrays of `safe_envs.dynamics.normal` get the same bits, but for the logarithm.
+1e-16. The arrays of `safe_envs.dynamics.noise` get the same bits, but for the logarithm.
 
 Source: Wichura: Algorithm AS 241, the percentage points of the normal distribution. Applied
 Statistics 37 (1988), routine PPND16.

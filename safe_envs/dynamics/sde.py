@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NoReturn, TypeVar
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import (
+from safe_envs.dynamics.identities import is_zero
+from safe_envs.dynamics.symbols import (
     TIME,
     advice_on_unknown,
     doubt_shared_noise,
@@ -19,9 +20,29 @@ from safe_envs.dynamics.declarations import (
     require_real,
     signal_rate,
 )
-from safe_envs.dynamics.fixed_dict import FixedDict
-from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, unknown
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class FixedDict(dict[K, V]):
+    """A dict whose entries stay as they are: for what is hashed, or compiled into formulas.
+
+    It is equal to a dict with these entries, and can be pickled and copied.
+    """
+
+    def _refuse(self, *given: Any, **named: Any) -> NoReturn:
+        raise TypeError(f"{dict(self)} does not change; make another system, of a changed copy")
+
+    __setitem__ = __delitem__ = __ior__ = _refuse  # pyright: ignore
+    update = setdefault = pop = popitem = clear = _refuse  # pyright: ignore
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (dict(self),)
+
+    def __copy__(self) -> FixedDict[K, V]:
+        return self
 
 
 @dataclass(frozen=True)

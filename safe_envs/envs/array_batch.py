@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
-from safe_envs.envs.delay_line import Actuators
-from safe_envs.envs.episode import Episodes
+from safe_envs.envs.episode import Actuators, Episodes
 from safe_envs.envs.info import VectorStep
 from safe_envs.envs.noise import NoiseStreams
-from safe_envs.envs.reset_options import StartingPoints
-from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.sensor import batch_sensor_of
 from safe_envs.envs.simulation import Simulation, require_sound
 from safe_envs.envs.spaces import BatchActions, observation_box
+from safe_envs.envs.starts import EpisodeStreams, StartingPoints
 from safe_envs.problem.problem import SafetyProblem
 
 

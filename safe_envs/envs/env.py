@@ -9,22 +9,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.dynamics.philox import Key, StreamReader, key_of
-from safe_envs.envs.delay_line import Actuators
-from safe_envs.envs.episode import Episode
+from safe_envs.dynamics.noise import Key, StreamReader, key_of
+from safe_envs.envs.episode import Actuators, Episode
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream
-from safe_envs.envs.reset_options import RequestedStart, ResetOptions
-from safe_envs.envs.sample import Sample
-from safe_envs.envs.sensor import sensor_of
+from safe_envs.envs.sensor import Sample, sensor_of
 from safe_envs.envs.simulation import LARGEST, Simulation, require_sound, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import OwnSpec
-from safe_envs.errors import InvalidInputError, NumericalError, flag
-from safe_envs.independent_copies import IndependentCopies
+from safe_envs.envs.starts import RequestedStart, ResetOptions
+from safe_envs.errors import IndependentCopies, InvalidInputError, NumericalError, flag, real_array
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
-from safe_envs.validators import real_array
 
 _UNKNOWN = -1
 """Gymnasium's seed of a generator that was set."""

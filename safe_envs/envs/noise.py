@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.normal import standard_normals
-from safe_envs.dynamics.philox import NOISE, Key, StreamReader
-from safe_envs.envs.seeding import EpisodeStreams
+from safe_envs.dynamics.noise import NOISE, Key, StreamReader, standard_normals
+from safe_envs.envs.starts import EpisodeStreams
 
 _CHUNK = 256
 _FIRST_CHUNK = 64
@@ -26,7 +25,7 @@ class NoiseStream:
     Args:
         channels: numbers in a control period.
         periods: of an episode; nothing is drawn ahead for more.
-        purpose: of the stream, see `safe_envs.dynamics.philox`.
+        purpose: of the stream, see `safe_envs.dynamics.noise`.
     """
 
     def __init__(self, channels: int, periods: int, purpose: int = NOISE) -> None:
@@ -75,7 +74,7 @@ class NoiseStreams:
         streams: of the envs.
         channels: numbers in a control period.
         periods: of an episode; nothing is drawn ahead for more.
-        purpose: of the streams, see `safe_envs.dynamics.philox`.
+        purpose: of the streams, see `safe_envs.dynamics.noise`.
     """
 
     def __init__(

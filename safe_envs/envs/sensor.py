@@ -4,26 +4,103 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from statistics import NormalDist
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function, filled, stacked
-from safe_envs.dynamics.philox import SENSOR, Key
+from safe_envs.dynamics.noise import SENSOR, Key
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream, NoiseStreams
-from safe_envs.envs.sample import Sample, merged
-from safe_envs.envs.seeding import EpisodeStreams
-from safe_envs.envs.sensor_arithmetic import (
-    loss_quantile,
-    value_or_nan,
-    wrapped,
-    wrapped_batch,
-)
 from safe_envs.envs.spaces import observation_box
-from safe_envs.problem.measurement import Measurement
+from safe_envs.envs.starts import EpisodeStreams
+from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.problem.problem import SafetyProblem
+
+
+def wrapped(channel: Channel, value: float) -> float:
+    """Return a value in (-period/2, period/2], if its channel has a period.
+
+    Args:
+        channel: of a sensor.
+        value: that it measures.
+    """
+    period = channel.period
+    if not period or not math.isfinite(value):
+        return value
+    return value - period * math.ceil(value / period - 0.5)
+
+
+def wrapped_batch(channel: Channel, values: np.ndarray) -> np.ndarray:
+    """Return the values (num_envs,) of a batch as `wrapped` does.
+
+    Args:
+        channel: of a sensor.
+        values: that it measures.
+    """
+    period = channel.period
+    return values - period * np.ceil(values / period - 0.5) if period else values
+
+
+def loss_quantile(channel: Channel) -> float:
+    """Return the number below which a standard normal one is with the probability of a loss."""
+    return NormalDist().inv_cdf(channel.dropout) if channel.dropout else -math.inf
+
+
+def value_or_nan(measure: Callable[..., Sequence[float]], x: Sequence[float]) -> float:
+    """Return what is measured of a state, NaN where it has no value.
+
+    Args:
+        measure: one number of the components of a state.
+        x: those components.
+    """
+    try:
+        return measure(*x)[0]
+    except (ArithmeticError, ValueError):
+        return math.nan
+
+
+class Sample(NamedTuple):
+    """What has arrived from a sensor up to a control instant.
+
+    Attributes:
+        values: k components: floats of one env, or arrays (num_envs,) of a batch. Where nothing
+            arrived at this instant, the last value that did.
+        received: which arrived at this instant, bools or arrays of them.
+    """
+
+    values: Sequence[Any]
+    received: Sequence[Any]
+
+
+def read_only(components: Sequence[Any]) -> tuple[Any, ...]:
+    """Return components that others may read, and not write to.
+
+    Args:
+        components: arrays.
+    """
+    found = tuple([np.asarray(component).view() for component in components])
+    for component in found:
+        component.flags.writeable = False
+    return found
+
+
+def merged(where: np.ndarray, one: Sample, other: Sample) -> Sample:
+    """Return samples of a batch that are one in some envs and another elsewhere.
+
+    Args:
+        where: bool (num_envs,).
+        one: of the envs where it is True.
+        other: of the others.
+    """
+    return Sample(
+        *(
+            [np.where(where, a, b) for a, b in zip(*pair, strict=True)]
+            for pair in zip(one, other, strict=True)
+        )
+    )
 
 
 class _Sensor:

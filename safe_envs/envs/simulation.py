@@ -12,9 +12,9 @@ from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.defined import NO_VALUE, careful_floats, defined, defined_arrays
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import NumericalError, require_whole
-from safe_envs.problem.initial_distribution import StartSampler
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
+from safe_envs.problem.starts import StartSampler
 
 LARGEST = 3e38
 """Below it single precision has all numbers."""

@@ -10,10 +10,9 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, constants, finite
-from safe_envs.errors import InvalidInputError
+from safe_envs.errors import InvalidInputError, real_array
 from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.validators import real_array
 
 _FAR = 1e6
 """Bound of what is measured, in its unit, where its range is not known."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.integrators import euler_maruyama_step, rate
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.engine.formulas import Source, formulas
+from safe_envs.engine.slots import Data
 from safe_envs.envs.simulation import LARGEST, readings
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NotCompilableError
@@ -14,7 +14,7 @@ from safe_envs.problem.signals import TIME
 
 
 def world_source(problem: SafetyProblem, data: Data) -> Source:
-    """Return the functions of `safe_envs.compiled.slots` that describe a problem's world.
+    """Return the functions of `safe_envs.engine.slots` that describe a problem's world.
 
     Args:
         problem: what to simulate.

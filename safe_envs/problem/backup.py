@@ -8,10 +8,10 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.symbols import formula
 from safe_envs.errors import ConfigurationError, SafeEnvsError, SystemDefinitionError, shown
-from safe_envs.number_text import finite_number
+from safe_envs.text import finite_number
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class BackupLaw:
     bounds and held for one period. Its terminal set is a part of the safe set from which this leads
     back into it. It is either stated, as an expression that is >= 0 there; who states it answers
     for its invariance. Or it is derived from an equilibrium of the law, with a proof, see
-    `safe_envs.wrappers.backup_sets`.
+    `safe_envs.proofs.backup_sets`.
 
     Attributes:
         name: of the law.

@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.symbols import formula
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
-from safe_envs.number_text import finite_number
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Variable, input_bounds
+from safe_envs.problem.starts import Start
 from safe_envs.problem.validation import degree_of, require_sound
+from safe_envs.text import finite_number
 
 _UNBOUNDED = (-math.inf, math.inf)
 
@@ -76,7 +75,7 @@ def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
             parameters for each input; where `features` are given, of their symbols in place of the
             states'.
         reward: of a step, an expression of the state that it reaches, of the input and of
-            `safe_envs.problem.problem.TIME`.
+            `safe_envs.problem.signals.TIME`.
         workspace: (low, high) of states; an episode ends when one leaves it. The others are
             unbounded.
         units: of states and inputs, by symbol: labels, which nothing checks, for numbers and

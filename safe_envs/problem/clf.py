@@ -8,11 +8,11 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.lie import generator, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.symbols import formula
 from safe_envs.errors import ConfigurationError
-from safe_envs.number_text import finite_number
+from safe_envs.text import finite_number
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from functools import lru_cache, wraps
 from typing import Any
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.object_import import called, load_object
-from safe_envs.plugins import SYSTEMS, load_plugin, plugin_names
+from safe_envs.plugins import SYSTEMS, called, load_object, load_plugin, plugin_names
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.validation import require_sound

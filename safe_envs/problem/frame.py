@@ -8,8 +8,8 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import formula, require_real
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.symbols import formula, require_real
 from safe_envs.errors import SystemDefinitionError, shown
 from safe_envs.problem.signals import Variable
 

@@ -11,9 +11,9 @@ from functools import partial
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown, unexpected_argument
-from safe_envs.number_text import finite_number, named_values, numbers
-from safe_envs.problem.measurement_text import read_items
+from safe_envs.problem.measurement import read_items
 from safe_envs.problem.option_errors import refused_noise
+from safe_envs.text import finite_number, named_values, numbers
 
 SENSOR_OPTIONS = ("measurement", "sensor_noise")
 """Names of the options that put a sensor between the state and the observation."""
@@ -90,9 +90,9 @@ class ProblemOptions:
             that is sent, in its unit per s, for all inputs or one such pair for each. Filters are
             unaware of them.
         rate_limit: the same as part of the system, whose inputs become states, and their rates
-            the inputs: see `safe_envs.problem.rate_limits`.
+            the inputs: see `safe_envs.problem.actuators`.
         measurement: what is measured of the state, and becomes the observation: "default" for the
-            problem's own sensor, other texts of `safe_envs.problem.measurement_text`, a list of
+            problem's own sensor, other texts of `safe_envs.problem.measurement`, a list of
             them, standard deviations by name or expression, or a `Measurement`. None for the
             features without any error.
         sensor_noise: factor of the standard deviations of all that is measured.
@@ -223,7 +223,7 @@ def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[st
     # Not imported before it is needed: a command reads the options first.
     import numpy as np
 
-    from safe_envs.validators import numbers_in
+    from safe_envs.errors import numbers_in
 
     names = problem.noise
     if not names:

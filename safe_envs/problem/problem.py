@@ -11,25 +11,50 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import (
-    ConfigurationError,
-    SystemDefinitionError,
-    require_whole,
+from safe_envs.dynamics.symbols import formula
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_whole
+from safe_envs.problem.actuators import (
+    Limits,
+    rate_limits,
+    require_apart,
+    require_delay,
+    with_rates,
+    with_resting_inputs,
 )
-from safe_envs.problem.actuators import Limits, rate_limits, require_delay
 from safe_envs.problem.backup import BackupSource, require_backup
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.frame import Frame
-from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.measurement import Channel, Measurement, require_autonomous
-from safe_envs.problem.measurement_text import measurement_of
+from safe_envs.problem.measurement import Channel, Measurement, measurement_of, require_autonomous
 from safe_envs.problem.option_errors import require_bounds, require_period, unknown_start
 from safe_envs.problem.options import ProblemOptions, noise_levels
-from safe_envs.problem.rate_limits import require_apart, with_rates, with_resting_inputs
 from safe_envs.problem.regions import sound_regions
-from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
+from safe_envs.problem.starts import SamplingDomain, Start
+
+
+@dataclass(frozen=True)
+class Barrier:
+    """h, with the safe set C = {x : h(x) >= 0}; a violation is h < 0.
+
+    It is a function of the states, with numbers for its constants: plant and model may differ, what
+    is safe is the same for both. A filter in a control loop of the user's takes functions of the
+    system's signals and of `safe_envs.problem.signals.TIME` too; in an env, what moves is a state.
+
+    Attributes:
+        expression: h(x), or h(x, s, t) with signals s.
+        name: how it is called in tables and plots.
+
+    Raises:
+        SystemDefinitionError: h is no expression.
+
+    Source: thesis Eq. (3.3), (4.8).
+    """
+
+    expression: sp.Expr
+    name: str = "h"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "expression", formula("a barrier", self.expression))
 
 
 @dataclass(frozen=True)
@@ -71,7 +96,7 @@ class SafetyProblem:
         model_delay: the delay that filters believe; that of the plant by default.
         slew_limit: bounds of the rates of the plant's actuators, see `ProblemOptions`; () without.
         rates: bounds of the rates of inputs that have become states, see
-            `safe_envs.problem.rate_limits`; () without.
+            `safe_envs.problem.actuators`; () without.
         backup: laws that bring the system to a set that is safe for good, if any; see `Backup`.
         sensors: channels of a realistic sensor; () for one derived from the features.
         measurement: what is measured of the state, which is the observation then; None for an

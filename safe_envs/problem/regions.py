@@ -8,8 +8,8 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.declarations import formula
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.symbols import formula
 from safe_envs.errors import SystemDefinitionError, shown
 
 SAFE, GOAL = "safe", "goal"

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics import declarations
+from safe_envs.dynamics import symbols
+from safe_envs.errors import numbers_in
 from safe_envs.problem.option_errors import refused_box
-from safe_envs.validators import numbers_in
 
-TIME = declarations.TIME
+TIME = symbols.TIME
 """Time since the start of the episode, in s: references and rewards may depend on it. No state or
 input, which may have any sign, is the same symbol, even if its name is t."""
 

@@ -2,18 +2,194 @@
 
 from __future__ import annotations
 
+import importlib.util
+import itertools
 import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pygame
 
-from safe_envs.rendering.curves import BRUSHES, apart, dash_ends
-from safe_envs.rendering.fonts import HALO, cut, haloed_surface, text_surface
 from safe_envs.rendering.style import INK, NORMAL, PAPER, SMALL, Color
+
+HALO = 2
+"""Pixels of a halo around the letters."""
+
+
+def _font(size: int, bold: bool) -> pygame.font.Font:
+    """Return DejaVu Sans, which comes with matplotlib: pictures are the same on every machine."""
+    font = _loaded_font(size, bold)
+    try:
+        font.get_height()
+    except pygame.error:
+        # Gymnasium's own envs quit pygame when they close: fonts loaded before become unusable.
+        _loaded_font.cache_clear()
+        font = _loaded_font(size, bold)
+    return font
+
+
+@lru_cache(maxsize=16)
+def _loaded_font(size: int, bold: bool) -> pygame.font.Font:
+    pygame.font.init()
+    spec = importlib.util.find_spec("matplotlib")
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    path = Path(spec.origin or "").parent / "mpl-data" / "fonts" / "ttf" / name if spec else Path()
+    return pygame.font.Font(str(path) if path.is_file() else None, size)
+
+
+@lru_cache(maxsize=1024)
+def text_surface(text: str, size: int, bold: bool, color: Color, turned: bool) -> pygame.Surface:
+    """Return a text as a surface with a transparent background.
+
+    Args:
+        text: a line.
+        size: of the letters.
+        bold: whether they are bold.
+        color: of the letters.
+        turned: whether it runs upwards.
+
+    Returns:
+        A surface of the size of the text.
+    """
+    surface = _font(size, bold).render(text, True, color)
+    return pygame.transform.rotate(surface, 90) if turned else surface
+
+
+@lru_cache(maxsize=256)
+def haloed_surface(text: str, size: int, color: Color, halo: Color) -> pygame.Surface:
+    """Return a text with a halo around its letters.
+
+    Args:
+        text: a line.
+        size: of the letters.
+        color: of the letters.
+        halo: colour around them.
+
+    Returns:
+        A surface of the size of the text, with room for the halo on all sides.
+    """
+    letters, around = (text_surface(text, size, False, each, False) for each in (color, halo))
+    width, height = letters.get_size()
+    surface = pygame.Surface((width + 2 * HALO, height + 2 * HALO), pygame.SRCALPHA, 32)
+    for x, y in itertools.product(range(2 * HALO + 1), repeat=2):
+        if math.hypot(x - HALO, y - HALO) <= HALO + 0.5:
+            surface.blit(around, (x, y))
+    surface.blit(letters, (HALO, HALO))
+    return surface
+
+
+def text_size(text: str, size: int) -> tuple[int, int]:
+    """Return the width and height in pixels of a line of text.
+
+    Args:
+        text: the line.
+        size: of the letters.
+    """
+    return _font(size, False).size(text)
+
+
+def cut(text: str, size: int, bold: bool, widest: int) -> str:
+    """Return a text with its end cut off where it is too wide.
+
+    Args:
+        text: a line.
+        size: of the letters.
+        bold: whether they are bold.
+        widest: most pixels.
+
+    Returns:
+        The text itself, or its beginning with an ellipsis.
+    """
+    font = _font(size, bold)
+    if font.size(text)[0] <= widest:
+        return text
+    while text and font.size(text + "…")[0] > widest:
+        text = text[:-1]
+    return text + "…"
+
+
+_APART = 1.5
+_MOST_POINTS = 1000
+_MOST_IN_CHART = 400
+
+BRUSHES = {
+    1: ((0.0, 0.0),),
+    2: ((0.0, -0.5), (0.43, 0.25), (-0.43, 0.25)),
+    3: ((0.0, -0.9), (0.9, 0.0), (0.0, 0.9), (-0.9, 0.0), (0.0, 0.0)),
+}
+"""Offsets of the thin lines that make a line of 1, 2 or 3 pixels."""
+
+
+def apart(points: np.ndarray) -> np.ndarray:
+    """Return indices of points about 1.5 pixels apart along a path, with the first and the last."""
+    steps = np.floor(_lengths(points) / _APART)
+    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps)) + 1, [len(points) - 1]]))
+
+
+def dash_ends(points: np.ndarray, period: float) -> list[tuple[list[float], list[float]]]:
+    """Return the ends of each dash of a dashed path.
+
+    Args:
+        points: of the path, shape (k, 2).
+        period: length of a dash and a gap.
+
+    Returns:
+        Pairs of points (x, y).
+    """
+    along = _lengths(points)
+    stops = np.arange(0.0, along[-1], period / 2)
+    places = np.stack([np.interp(stops, along, points[:, i]) for i in range(2)], axis=1).tolist()
+    return list(zip(places[::2], places[1::2], strict=False))
+
+
+def _lengths(points: np.ndarray) -> np.ndarray:
+    """Return the length of a path up to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+
+
+def thinned(count: int, most: int = _MOST_POINTS) -> np.ndarray:
+    """Return indices of the points of a trail to draw, with the last one.
+
+    Args:
+        count: of the points of the trail.
+        most: indices.
+
+    Returns:
+        Ascending indices.
+    """
+    # A power of two: points once drawn stay as the trail grows.
+    stride = 1 << max(0, (count - 1) // most).bit_length()
+    kept = np.arange(0, count, stride)
+    return kept if kept[-1] == count - 1 else np.append(kept, count - 1)
+
+
+def runs(flags: np.ndarray) -> list[slice]:
+    """Return where flags are set, each run with the point before it, to be drawn as a line."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [slice(max(int(a) - 1, 0), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def thinned_minima(times: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return fewer points of a curve, with the smallest value of each group of points.
+
+    Args:
+        times: shape (k,).
+        h: values, shape (k,).
+
+    Returns:
+        Times and values of at most about two points for each pixel of a chart.
+    """
+    stride = 1 + len(h) // _MOST_IN_CHART
+    if stride == 1:
+        return times, h
+    starts = np.arange(0, len(h), stride)
+    return times[np.minimum(starts + stride - 1, len(h) - 1)], np.minimum.reduceat(h, starts)
+
 
 Point = Sequence[float]
 Box = tuple[int, int, int, int]

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from safe_envs.atomic_io import require_writable
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import figure_options, text_options, value_options
+from safe_envs.files import require_writable
+from safe_envs.scripts.options import evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
@@ -18,7 +18,7 @@ from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 @with_env_at_state
 def best(
     env: EnvOptions,
-    leaving: value_options.Leaving = "violation",
+    leaving: evaluation_options.Leaving = "violation",
     knowledge: Annotated[
         str,
         typer.Option(
@@ -27,9 +27,9 @@ def best(
             help="In whose world: the env's, or the model's.",
         ),
     ] = "plant",
-    cells: value_options.Cells = None,
-    inputs: value_options.Inputs = None,
-    table: value_options.Table = None,
+    cells: evaluation_options.Cells = None,
+    inputs: evaluation_options.Inputs = None,
+    table: evaluation_options.Table = None,
     spec: Annotated[
         str,
         typer.Option(
@@ -59,7 +59,7 @@ def best(
             help=f"Draw the value over the coordinates of the grid: {text_options.FORMATS}",
         ),
     ] = None,
-    size: figure_options.Size = None,
+    size: evaluation_options.Size = None,
 ) -> None:
     """Print how safe any policy can be from the env's starts, and how safe a greedy policy is.
 
@@ -74,21 +74,21 @@ def best(
     """
     from safe_envs.agents.evaluation.attainable import attainable_safety, certified
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.best_report import BestAnswer, print_best
-    from safe_envs.wrappers.value.settings import ValueSettings
+    from safe_envs.scripts.reports.best import BestAnswer, print_best
+    from safe_envs.values.tables import ValueSettings
 
     require_whole("episodes", episodes, 0)
     require_whole("seed", seed, 0)
     reads = [*text_options.inputs_of(env.system), *([("--table", table)] if table else [])]
     text_options.require_outputs(json, plot, inputs=reads)
-    size = figure_options.size_of(size, plot)
+    size = evaluation_options.size_of(size, plot)
     if table is not None:
         require_writable(table)
     settings = ValueSettings(
         knowledge=knowledge,
         leaving=leaving,
         specification=spec,
-        cells=value_options.cells_of(cells),
+        cells=evaluation_options.cells_of(cells),
         inputs=inputs,
     )
     known, arguments = env.full_id, env.arguments
@@ -105,7 +105,7 @@ def best(
     print_best(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:
-        from safe_envs.scripts.figures.best_figure import plot_attainable
+        from safe_envs.scripts.figures.best import plot_attainable
 
         plot_attainable(found, policy, plot, title=answer.title, size=size)
 

@@ -8,8 +8,7 @@ import typer
 
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
-from safe_envs.scripts.reports.quantities import size_text
-from safe_envs.scripts.reports.tables import print_rows
+from safe_envs.scripts.reports.tables import print_rows, size_text
 
 
 def cache(
@@ -24,20 +23,20 @@ def cache(
     used for longest is removed where all of it takes more than 2 GB. The environment variable
     SAFE_ENVS_CACHE names another folder; empty, nothing is kept.
     """
-    from safe_envs import user_cache
+    from safe_envs import files
 
     require_result(json)
-    folder = user_cache.cache_folder(next(iter(user_cache.CONTENTS)))
-    removed = user_cache.clear() if clear else None
+    folder = files.cache_folder(next(iter(files.CONTENTS)))
+    removed = files.clear() if clear else None
     contents = []
-    for name, about in user_cache.CONTENTS.items():
-        sizes = [entry.size for entry in user_cache.entries(name)]
+    for name, about in files.CONTENTS.items():
+        sizes = [entry.size for entry in files.entries(name)]
         contents.append({"name": name, "about": about, "entries": len(sizes), "bytes": sum(sizes)})
     total = sum(each["bytes"] for each in contents)
     if folder is None:
         say(
             stdout(),
-            f"Nothing is kept: {user_cache.VARIABLE} is empty, or there is no folder to which"
+            f"Nothing is kept: {files.VARIABLE} is empty, or there is no folder to which"
             " nobody but you can write.",
         )
     else:
@@ -53,14 +52,14 @@ def cache(
             say(stdout(), f"Removed: {size_text(removed)}.")
         say(
             stdout(),
-            f"In all {size_text(total)} of at most {size_text(user_cache.MOST_BYTES)}; what was not"
-            " used for longest is removed first.",
+            f"In all {size_text(total)} of at most {size_text(files.MOST_CACHE_BYTES)}; what was"
+            " not used for longest is removed first.",
         )
     document = {
         "folder": None if folder is None else str(folder.parent),
         "contents": contents,
         "bytes": total,
-        "most_bytes": user_cache.MOST_BYTES,
+        "most_bytes": files.MOST_CACHE_BYTES,
         "removed_bytes": removed,
     }
     write_result(json, lambda: document)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.files import require_writable
 from safe_envs.scripts.options import completion, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
@@ -18,8 +18,7 @@ from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.wrappers.synthesis.certify import Named
-    from safe_envs.wrappers.synthesis.settings import SynthesisSettings
+    from safe_envs.proofs.certify import Named, SynthesisSettings
 
 
 @with_env_at_state
@@ -79,15 +78,11 @@ def certify(
 
     The exit status is 1 where no bound above 0 is proved.
     """
+    from safe_envs.filters.certificates.files import save_certificate
+    from safe_envs.proofs.certify import Named, SynthesisSettings
+    from safe_envs.proofs.certify import certify as find
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.certify_report import (
-        CertifyAnswer,
-        print_certification,
-    )
-    from safe_envs.wrappers.certificates.files import save_certificate
-    from safe_envs.wrappers.synthesis.certify import Named
-    from safe_envs.wrappers.synthesis.certify import certify as find
-    from safe_envs.wrappers.synthesis.settings import SynthesisSettings
+    from safe_envs.scripts.reports.certify import CertifyAnswer, print_certification
 
     if held and (policy or rates or best):
         raise ConfigurationError(
@@ -149,9 +144,9 @@ class _HeldOutput:
 
 def _certify_held(named: Named, settings: SynthesisSettings, output: _HeldOutput) -> None:
     """Look for a certificate of held input, prove it, print and write it."""
-    from safe_envs.scripts.reports.held_certify_report import HeldCertifyAnswer
-    from safe_envs.wrappers.certificates.files import save_certificate
-    from safe_envs.wrappers.synthesis.held_synthesis import certify_held
+    from safe_envs.filters.certificates.files import save_certificate
+    from safe_envs.proofs.held_synthesis import certify_held
+    from safe_envs.scripts.reports.certify import HeldCertifyAnswer
 
     with progress_bar("Searching") as tell:
         found = certify_held(named, settings, tell)

@@ -51,15 +51,14 @@ def check(
     The exit status is 0 where everything is checked, 1 where something is refuted or undecided, and
     2 where the file cannot be read. No code in the file is run.
     """
-    from safe_envs.number_text import numbers
-    from safe_envs.scripts.reports.check_report import CheckAnswer, print_check
-    from safe_envs.wrappers.certificates.ball_checker import check_with_balls
-    from safe_envs.wrappers.certificates.balls import require_flint
-    from safe_envs.wrappers.certificates.certificate import HeldCertificate
-    from safe_envs.wrappers.certificates.checker import check as check_certificate
-    from safe_envs.wrappers.certificates.files import load_certificate
-    from safe_envs.wrappers.certificates.statements import env_difference
-    from safe_envs.wrappers.verification.held_check import check_held
+    from safe_envs.filters.certificates.balls import check_with_balls, require_flint
+    from safe_envs.filters.certificates.certificate import HeldCertificate
+    from safe_envs.filters.certificates.checker import check as check_certificate
+    from safe_envs.filters.certificates.files import load_certificate
+    from safe_envs.filters.certificates.matching import env_difference
+    from safe_envs.proofs.held import check_held
+    from safe_envs.scripts.reports.certify import CheckAnswer, print_check
+    from safe_envs.text import numbers
 
     if not 0 < seconds < float("inf"):
         raise ConfigurationError(f"seconds = {seconds}; give a number above 0")

@@ -37,8 +37,8 @@ def demo(
     The safety of both is shown unfiltered and filtered.
     """
     from safe_envs.agents.evaluation.evaluate import evaluate
-    from safe_envs.scripts.figures.evaluation_figure import plot_evaluation
-    from safe_envs.scripts.reports.evaluation_report import print_evaluation
+    from safe_envs.scripts.figures.evaluation import plot_evaluation
+    from safe_envs.scripts.reports.evaluation import print_evaluation
 
     require_result(json)
     try:

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.options import evaluation_options, text_options
 from safe_envs.scripts.options import evaluation_options as of
-from safe_envs.scripts.options import figure_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import progress_bar, stdout, write_result, write_text_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
-from safe_envs.scripts.options.text_results import write_text_result
 
 if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.results import Evaluation
+    from safe_envs.agents.evaluation.evaluate import Evaluation
 
 
 @with_env
@@ -51,7 +50,7 @@ def evaluate(
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
     timing: of.Timing = False,
-    size: figure_options.Size = None,
+    size: evaluation_options.Size = None,
 ) -> None:
     """Print the safety rate of a policy under each filter, and compare the filters in pairs.
 
@@ -66,7 +65,7 @@ def evaluate(
     """
     reads = text_options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec)
     text_options.require_outputs(json, plot, episodes_out=episodes_out, latex=latex, inputs=reads)
-    size = figure_options.size_of(size, plot)
+    size = evaluation_options.size_of(size, plot)
     common: dict[str, Any] = {
         "filters": list(dict.fromkeys(filters)) if filters else None,
         "trust": trust,
@@ -114,7 +113,7 @@ def evaluate(
     found = _evaluate(problem, policy, refine, (json, timing), common)
     write_text_result(latex, found.to_latex)
     if plot is not None:
-        from safe_envs.scripts.figures.evaluation_figure import plot_evaluation
+        from safe_envs.scripts.figures.evaluation import plot_evaluation
 
         plot_evaluation(found, plot, size=size)
 
@@ -127,13 +126,13 @@ def _evaluate(
     arguments: dict[str, Any],
 ) -> Evaluation:
     """Evaluate, print and write, and return what was found with the control period as given."""
-    from safe_envs.agents.evaluation import evaluate, refinement
-    from safe_envs.scripts.reports.evaluation_report import print_evaluation, print_refinement
+    from safe_envs.agents.evaluation import evaluate
+    from safe_envs.scripts.reports.evaluation import print_evaluation, print_refinement
 
     json, timing = outputs
     found: Any
     with progress_bar("Evaluating") as progress:
-        run: Any = refinement.refine if refine else evaluate.evaluate
+        run: Any = evaluate.refine if refine else evaluate.evaluate
         found = run(problem, policy, progress=progress, **arguments)
     first = found.given if refine else found
     print_evaluation(stdout(), first, timing)
@@ -156,7 +155,7 @@ def _evaluate_rare(
         ConfigurationError: one of the refused options was given.
     """
     from safe_envs.agents.rare_events.estimate import estimate_rare
-    from safe_envs.scripts.reports.rare_report import print_rare
+    from safe_envs.scripts.reports.evaluation import print_rare
 
     given = [name for name, value in refused.items() if value]
     if given:

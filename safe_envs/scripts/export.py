@@ -14,11 +14,13 @@ from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
+    from safe_envs.export.c_files import Interface
+    from safe_envs.export.comparison import CComparison
+    from safe_envs.export.export import ExportOptions
+    from safe_envs.export.promise_comparison import PromiseComparison
+    from safe_envs.filters.safety_filter import SafetyFilter
     from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.wrappers import SafetyFilter
-    from safe_envs.wrappers.export import CComparison, ExportOptions, PromiseComparison
-    from safe_envs.wrappers.export.interface import Interface
-    from safe_envs.wrappers.value.promise_text import PromiseSettings
+    from safe_envs.values.promise_filter import PromiseSettings
 
 
 @with_env_at_state
@@ -76,11 +78,11 @@ def export(
     units and order of what goes in and comes out. Files of the same names that no export has
     written are not overwritten.
     """
+    from safe_envs.export.export import ExportOptions
+    from safe_envs.filters.conditions.text import names_backup, names_promise
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.export_report import ExportAnswer, print_export
-    from safe_envs.wrappers.conditions.text_parts import names_backup, names_promise
-    from safe_envs.wrappers.export import ExportOptions
-    from safe_envs.wrappers.value.promise_text import PromiseSettings
+    from safe_envs.scripts.reports.export import ExportAnswer, print_export
+    from safe_envs.values.promise_filter import PromiseSettings
 
     require_whole("states", states, 1)
     require_whole("seed", seed, 0)
@@ -110,7 +112,8 @@ def export(
 
 
 def _conditions(problem: SafetyProblem, text: str, knowledge: str, objective: str) -> SafetyFilter:
-    from safe_envs.wrappers import SafetyFilter, parse_conditions
+    from safe_envs.filters.conditions.text import parse_conditions
+    from safe_envs.filters.safety_filter import SafetyFilter
 
     conditions = parse_conditions(text, problem)
     return SafetyFilter.for_problem(problem, conditions, knowledge, objective)
@@ -124,7 +127,8 @@ def _closed_form(
     tried: tuple[int, int] | None,
 ) -> tuple[Interface, CComparison | None]:
     """Export conditions in closed form, and compare at a number of states with a seed."""
-    from safe_envs.wrappers.export import compare, export_filter
+    from safe_envs.export.comparison import compare
+    from safe_envs.export.export import export_filter
 
     interface = export_filter(safety_filter, out, float32, options)
     if tried is None:
@@ -142,8 +146,9 @@ def _promise(
     tried: tuple[int, int] | None,
 ) -> tuple[Interface, PromiseComparison | None]:
     """Export a promise filter, and compare at a number of states with a seed."""
-    from safe_envs.wrappers.export import compare_promise, export_promise
-    from safe_envs.wrappers.value.promise_tables import promise_filter_for
+    from safe_envs.export.promise_comparison import compare_promise
+    from safe_envs.export.promise_export import export_promise
+    from safe_envs.values.promise_filter import promise_filter_for
 
     with progress_bar("Computing the table") as tell:
         promise_filter = promise_filter_for(problem, settings, knowledge, tell)

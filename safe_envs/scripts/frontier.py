@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import (
-    completion,
-    early_checks,
-    figure_options,
-    text_options,
-    value_options,
-)
+from safe_envs.scripts.options import completion, early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
@@ -64,7 +58,7 @@ def frontier(
     ] = 0,
     trust: text_options.Trust = False,
     knowledge: text_options.Knowledge = "model",
-    leaving: value_options.Leaving = "violation",
+    leaving: evaluation_options.Leaving = "violation",
     prices: Annotated[
         int, typer.Option(help="Prices of a violation for which returns are computed.")
     ] = 12,
@@ -90,7 +84,7 @@ def frontier(
         Path | None,
         typer.Option(metavar="FILE", help=f"Draw the curve and the points: {text_options.FORMATS}"),
     ] = None,
-    size: figure_options.Size = None,
+    size: evaluation_options.Size = None,
 ) -> None:
     """Print the largest returns that can be had at each risk, next to those of filters.
 
@@ -101,9 +95,8 @@ def frontier(
     from safe_envs.agents.evaluation.frontier import FrontierSpec
     from safe_envs.agents.evaluation.frontier import frontier as compute
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.frontier_report import document, print_report
-    from safe_envs.wrappers.value.priced_values import FrontierSettings
-    from safe_envs.wrappers.value.rewarded import rewarded
+    from safe_envs.scripts.reports.frontier import document, print_report
+    from safe_envs.values.frontier import FrontierSettings, rewarded
 
     for name, value, least in (("episodes", episodes, 1), ("attained", attained, 0)):
         require_whole(name, value, least)
@@ -112,13 +105,13 @@ def frontier(
     files = [file for policy in named for file in text_options.inputs_of(None, policy)]
     files += text_options.inputs_of(env.system, filters=given)
     text_options.require_outputs(json, plot, inputs=files)
-    size = figure_options.size_of(size, plot)
+    size = evaluation_options.size_of(size, plot)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     settings = FrontierSettings(
         prices=prices,
         policies=6 if attained else 0,
-        cells=value_options.cells_of(cells, "120x80"),
+        cells=evaluation_options.cells_of(cells, "120x80"),
         leaving=leaving,
     )
     rewarded(problem)  # Raises where there is no curve, before an agent is trained.
@@ -143,7 +136,7 @@ def frontier(
     config = {"env_id": known, "options": arguments, "seed": seed, "knowledge": knowledge}
     write_result(json, lambda: document(found, config))
     if plot is not None:
-        from safe_envs.scripts.figures.frontier_figure import plot_frontier
+        from safe_envs.scripts.figures.frontier import plot_frontier
 
         plot_frontier(found, plot, title=title, size=size)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.scripts.options import completion, early_checks, figure_options, text_options
+from safe_envs.scripts.options import completion, early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
@@ -24,7 +24,7 @@ from safe_envs.scripts.options.method_settings import (
 )
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.learning.data.transitions import Transitions
+    from safe_envs.filters.learning.data import Transitions
 
 
 @functools.partial(with_env, without=("horizon", "start"))
@@ -73,7 +73,7 @@ def identify(
             metavar="FILE", help=f"Draw the truth against the estimate: {text_options.FORMATS}"
         ),
     ] = None,
-    size: figure_options.Size = None,
+    size: evaluation_options.Size = None,
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
@@ -81,16 +81,15 @@ def identify(
     of what is collected are refused. The truth, with which the estimates are compared at fresh
     states of the sampling domain, is that of the plant, with its --noise.
     """
+    from safe_envs.filters.learning import learner_of
+    from safe_envs.filters.learning.bayesian import IdentifiabilityWarning
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.identify_answer import DataFile, IdentifyAnswer, compare
-    from safe_envs.scripts.reports.identify_report import print_report
-    from safe_envs.wrappers.learning import learner_of
-    from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning
+    from safe_envs.scripts.reports.identify import DataFile, IdentifyAnswer, compare, print_report
 
     require_whole("seed", seed, 0)
     inputs = [*text_options.inputs_of(env.system), *([] if data is None else [("--data", data)])]
     text_options.require_outputs(json, plot, out=out, inputs=inputs)
-    size = figure_options.size_of(size, plot)
+    size = evaluation_options.size_of(size, plot)
     arguments = env.arguments
     learner = learner_of(method)
     chosen = read_settings(method, learner, settings or ())
@@ -123,7 +122,7 @@ def identify(
     print_report(stdout(), found)
     write_result(json, found.document)
     if plot is not None:
-        from safe_envs.scripts.figures.identify_figure import draw
+        from safe_envs.scripts.figures.identify import draw
 
         draw(found, plot, size)
 
@@ -134,7 +133,7 @@ def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Transiti
     Raises:
         ConfigurationError: the method cannot, or the file holds none.
     """
-    from safe_envs.wrappers.learning.data.transitions import Transitions
+    from safe_envs.filters.learning.data import Transitions
 
     if "data" not in inspect.signature(learner).parameters:
         raise ConfigurationError(
@@ -146,7 +145,7 @@ def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Transiti
 
 def _filter_of(method: str) -> str:
     """Return the name of the filter that uses what a method learns."""
-    from safe_envs.wrappers.conditions import LEARNED
+    from safe_envs.filters.conditions.registry import LEARNED
 
     (name,) = [condition.name for condition in LEARNED.values() if condition.method == method]
     return name

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from safe_envs import ENV_IDS
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import completion, early_checks
 from safe_envs.scripts.options.app import run_alone
@@ -21,9 +20,10 @@ from safe_envs.scripts.options.console import (
     stdout,
     write_result,
 )
+from safe_envs.systems import ENV_IDS
 
 if TYPE_CHECKING:
-    from safe_envs.scripts.reports.leaderboard_report import LeaderboardReport
+    from safe_envs.scripts.reports.leaderboard import LeaderboardReport
 
 FEW = ("safe_envs/Pendulum-v0", "safe_envs/StochasticDubins-v0", "safe_envs/QuadrotorLimits-v0")
 """The envs of a leaderboard for which none is named: noise, noise and turns, several limits."""
@@ -120,15 +120,14 @@ def leaderboard(
     algorithm and the env have them. All filters know the plant.
     """
     from safe_envs.agents.jobs.executor import Backend
-    from safe_envs.agents.jobs.fingerprint import package_versions
-    from safe_envs.agents.jobs.store import make_folder
+    from safe_envs.agents.jobs.store import make_folder, package_versions
     from safe_envs.agents.training.leaderboard import board, require_no_older
     from safe_envs.agents.training.study import run_study
-    from safe_envs.scripts.reports.leaderboard_page import put_into
-    from safe_envs.scripts.reports.leaderboard_report import (
+    from safe_envs.scripts.reports.leaderboard import (
         leaderboard_markdown,
         leaderboard_notes,
         leaderboard_tables,
+        put_into,
     )
     from safe_envs.scripts.reports.tables import print_columns
 
@@ -187,7 +186,7 @@ def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
         frontiers_of,
         safety_over_envs,
     )
-    from safe_envs.scripts.reports.leaderboard_report import LeaderboardReport
+    from safe_envs.scripts.reports.leaderboard import LeaderboardReport
 
     study = found.study
     entries = [
@@ -208,8 +207,8 @@ def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
 
 def _draw(report: LeaderboardReport, folder: Path) -> None:
     """Draw a picture for each env that has agents."""
-    from safe_envs.scripts.figures.leaderboard_figure import draw
-    from safe_envs.scripts.reports.leaderboard_report import short_name
+    from safe_envs.scripts.figures.leaderboard import draw
+    from safe_envs.scripts.reports.leaderboard import short_name
 
     study = report.found.study
     variants = [variant.name for variant in study.variants]
@@ -222,7 +221,7 @@ def _draw(report: LeaderboardReport, folder: Path) -> None:
 
 
 def _picture(folder: Path, env_id: str) -> Path:
-    from safe_envs.scripts.reports.leaderboard_report import short_name
+    from safe_envs.scripts.reports.leaderboard import short_name
 
     # Envs of other packages keep their namespace in their names.
     return folder / f"{short_name(env_id).replace('/', '-')}.png"
@@ -230,7 +229,7 @@ def _picture(folder: Path, env_id: str) -> Path:
 
 def _links(report: LeaderboardReport, folder: Path | None, page: Path | None) -> dict[str, str]:
     """Return links to the pictures, as they are written in a page."""
-    from safe_envs.scripts.reports.leaderboard_page import link_from
+    from safe_envs.scripts.reports.leaderboard import link_from
 
     if folder is None:
         return {}

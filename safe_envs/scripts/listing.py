@@ -17,7 +17,7 @@ def list_envs(json: Json = None) -> None:
 
     from safe_envs.scripts.reports.tables import print_columns
     from safe_envs.systems.summary import summaries
-    from safe_envs.text_tables import Column
+    from safe_envs.text import Column
 
     require_result(json)
     rows = []

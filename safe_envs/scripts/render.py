@@ -19,7 +19,7 @@ from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, w
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
-    from safe_envs.agents.evaluation.resolved import FilterParts
+    from safe_envs.agents.evaluation.resolve import FilterParts
     from safe_envs.problem.problem import SafetyProblem
 
 
@@ -119,7 +119,7 @@ def split_filters(text: str) -> list[str]:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.spec import UNFILTERED
-    from safe_envs.wrappers.conditions.text_parts import head_pattern
+    from safe_envs.filters.conditions.text import head_pattern
 
     found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(UNFILTERED)})", text)]
     if not all(found):
@@ -151,9 +151,9 @@ class Run:
         seed: int,
         knowledge: str,
     ) -> None:
-        from safe_envs import SafeEnv
         from safe_envs.agents.policies.base import Policy
-        from safe_envs.wrappers import SafetyFilterWrapper
+        from safe_envs.envs.env import SafeEnv
+        from safe_envs.wrappers.safety_filter import SafetyFilterWrapper
 
         self.name, self._actor = name, actor
         self._world = SafeEnv(problem, render_mode="rgb_array")
@@ -237,10 +237,10 @@ def make_runs(
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+    from safe_envs.agents.evaluation.resolve import ResolvedEvaluation
     from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.wrappers.conditions.text_parts import require_known
+    from safe_envs.filters.conditions.text import require_known
 
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.

@@ -82,11 +82,9 @@ def study(
     command.
     """
     from safe_envs.agents.jobs.executor import Backend
-    from safe_envs.agents.jobs.fingerprint import package_versions
-    from safe_envs.agents.training.study import Study, run_study
-    from safe_envs.agents.training.study_file import read_study
-    from safe_envs.agents.training.study_summary import differences, summaries
-    from safe_envs.scripts.reports.study_report import study_columns, study_markdown, study_notes
+    from safe_envs.agents.jobs.store import package_versions
+    from safe_envs.agents.training.study import Study, differences, read_study, run_study, summaries
+    from safe_envs.scripts.reports.leaderboard import study_columns, study_markdown, study_notes
 
     require_result(json_file)
     read = read_study(what)

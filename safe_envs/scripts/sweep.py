@@ -10,8 +10,14 @@ import typer
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
-from safe_envs.scripts.options.job_progress import run_jobs
+from safe_envs.scripts.options.console import (
+    Json,
+    require_result,
+    run_jobs,
+    say,
+    stdout,
+    write_result,
+)
 
 
 def sweep(
@@ -64,7 +70,7 @@ def sweep(
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.sweeps.spec import read_sweep
     from safe_envs.agents.sweeps.store import Store
-    from safe_envs.scripts.reports.sweep_cells import failures_text, sweep_document
+    from safe_envs.scripts.reports.sweep import failures_text, sweep_document
 
     require_result(json)
     if jobs is not None and backend != "local":

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest
-from safe_envs.scripts.options import early_checks, figure_options, text_options
+from safe_envs.scripts.options import early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, say, stdout, write_result
 
@@ -55,7 +55,7 @@ def sweep_report(
             show_default=False,
         ),
     ] = None,
-    size: figure_options.Size = None,
+    size: evaluation_options.Size = None,
     json: Json = None,
 ) -> None:
     """Draw the safety rates of a sweep with 95 % bands, and list its worst and its failed cells.
@@ -65,13 +65,13 @@ def sweep_report(
     over what was learned too.
     """
     from safe_envs.agents.sweeps.store import read, read_index
-    from safe_envs.scripts.figures.sweep_figure import Layout, draw
-    from safe_envs.scripts.reports.sweep_cells import print_cells, report_document
+    from safe_envs.scripts.figures.sweep import Layout, draw
+    from safe_envs.scripts.reports.sweep import print_cells, report_document
 
     path = plot or folder / _PICTURE
     index, rows = read_index(folder), read(folder).to_pylist()
     text_options.require_outputs(json, path)
-    size = figure_options.size_of(size, path)
+    size = evaluation_options.size_of(size, path)
     swept = index["swept"]
     for option, name in (("--x", x), ("--lines", lines)):
         if name is not None and name not in swept:

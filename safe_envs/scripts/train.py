@@ -16,7 +16,7 @@ from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
-from safe_envs.text_lines import visible
+from safe_envs.text import visible
 
 
 @with_env
@@ -156,7 +156,7 @@ def train(
     training so far. `safe-envs evaluate --policy DIR` reads the folder.
     """
     from safe_envs.agents.training.config import Training
-    from safe_envs.scripts.reports.training_report import print_evaluations
+    from safe_envs.scripts.reports.sweep import print_evaluations
 
     text_options.require_outputs(
         json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ())

@@ -8,13 +8,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.scripts.options import (
-    completion,
-    early_checks,
-    evaluation_options,
-    figure_options,
-    text_options,
-)
+from safe_envs.scripts.options import completion, early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
@@ -73,7 +67,7 @@ def verify(
             ),
         ),
     ] = None,
-    size: figure_options.Size = None,
+    size: evaluation_options.Size = None,
 ) -> None:
     """Print where a filter's conditions cannot be met, and its bounds next to a simulation.
 
@@ -84,23 +78,26 @@ def verify(
     contradicts is withheld. At the end the rate stands between a bound for the env's own steps and
     what any policy can attain, with --closed-loop and --best.
     """
-    from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
-    from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
-    from safe_envs.agents.evaluation.safety_chain import safety_chain
+    from safe_envs.agents.evaluation.bounds import FilteredPolicy
+    from safe_envs.agents.evaluation.safety_chain import (
+        measure,
+        safety_chain,
+        starts_of,
+        withhold_contradicted,
+    )
     from safe_envs.agents.evaluation.yardstick import best_for
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.compiled.engine import require_engine
+    from safe_envs.engine.choice import require_engine
+    from safe_envs.filters.conditions.text import parse_conditions
+    from safe_envs.proofs import feasibility
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.verify_answer import VerifyAnswer
-    from safe_envs.scripts.reports.verify_report import print_report
-    from safe_envs.wrappers import parse_conditions
-    from safe_envs.wrappers.verification import feasibility
+    from safe_envs.scripts.reports.verify import VerifyAnswer, print_report
 
     require_whole("episodes", episodes, 1)
     require_engine(engine)
     inputs = text_options.inputs_of(env.system, policy, [filter_name or ""])
     text_options.require_outputs(json, plot, inputs=inputs)
-    size = figure_options.size_of(size, plot)
+    size = evaluation_options.size_of(size, plot)
     known, arguments = env.full_id, env.arguments
     problem = make_problem(known, **arguments)
     # An unknown policy is an error before the search, and without a simulation too.
@@ -114,7 +111,7 @@ def verify(
             measurements = measure(
                 found, actor, episodes=episodes, seed=seed, engine=engine, progress=tell
             )
-        bounds, measurements = judged(bounds, measurements, found)
+        bounds, measurements = withhold_contradicted(bounds, measurements, found)
     attainable = None
     if best:
         with progress_bar("Best attainable safety") as tell:
@@ -129,7 +126,7 @@ def verify(
     print_report(stdout(), answer)
     write_result(json, answer.document)
     if plot is not None:
-        from safe_envs.scripts.figures.verify_figure import plot_verification
+        from safe_envs.scripts.figures.verify import plot_verification
 
         plot_verification(found, plot, starts=starts, title=title, size=size)
 

@@ -24,14 +24,16 @@ ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in MODULES)
 """Every registered id."""
 
 CUSTOM_ID = "safe_envs/Custom-v0"
-"""The id that takes any system, as its argument `system`; see `safe_envs.envs.custom`."""
+"""The id that takes any system, as its argument `system`; see `safe_envs.envs.registered`."""
 
 
 def register_all() -> None:
     """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
     from safe_envs.envs.spec import register_system
 
-    register_system(CUSTOM_ID, "safe_envs.envs.custom:Custom", "safe_envs.envs.custom:CustomVector")
+    register_system(
+        CUSTOM_ID, "safe_envs.envs.registered:Custom", "safe_envs.envs.registered:CustomVector"
+    )
     for name, module in MODULES.items():
         register_system(
             f"safe_envs/{name}-v0",

@@ -5,17 +5,13 @@ from __future__ import annotations
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.system_env import SystemEnv
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.backup import BackupFunction
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.measurement import Channel
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._braking import braking_backup
-from safe_envs.systems._common import positive
+from safe_envs.problem.starts import SamplingDomain, Start
 from safe_envs.systems.acc import (
     CAR,
     LEAD_SPEED,
@@ -27,6 +23,8 @@ from safe_envs.systems.acc import (
     sigma_1,
     u,
 )
+from safe_envs.systems.backup_laws import braking_backup
+from safe_envs.systems.common import positive
 
 v, z, v_f, sigma_2 = sp.symbols("v z v_f sigma_2", real=True)
 

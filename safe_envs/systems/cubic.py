@@ -8,15 +8,13 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.problem.clf import CLF
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.measurement import Channel
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import in_disk, positive, uniform_box, uniforms
+from safe_envs.problem.starts import SamplingDomain, Start
+from safe_envs.systems.common import in_disk, positive, uniform_box, uniforms
 
 x_1, x_2, u = sp.symbols("x_1 x_2 u", real=True)
 a, k, sigma_1, sigma_2 = sp.symbols("a k sigma_1 sigma_2", real=True)

@@ -10,17 +10,15 @@ import sympy as sp
 
 from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.system_env import SystemEnv
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.problem.backup import BackupFunction
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.frame import Frame
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.measurement import Channel
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._common import in_disk, positive, uniforms
-from safe_envs.systems._turning import turning_backup
+from safe_envs.problem.starts import SamplingDomain, Start
+from safe_envs.systems.backup_laws import turning_backup
+from safe_envs.systems.common import in_disk, positive, uniforms
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
 v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)

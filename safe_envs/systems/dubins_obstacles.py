@@ -6,14 +6,13 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.system_env import SystemEnv
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.measurement import Channel
-from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.problem.starts import Start
+from safe_envs.systems.common import around, positive, uniforms
 from safe_envs.systems.dubins import HEADING, POSE_SENSORS, SHOWN, omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import (
     separation,

@@ -6,13 +6,11 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.envs.registered import SystemEnv
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._common import positive, uniform_box
+from safe_envs.problem.starts import SamplingDomain, Start
+from safe_envs.systems.common import positive, uniform_box
 from safe_envs.systems.dubins import HEADING, POSE_SENSORS, SHOWN, omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import (
     obstacle_sensors,

@@ -9,14 +9,13 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.initial_distribution import Start
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
+from safe_envs.problem.starts import SamplingDomain, Start
 from safe_envs.systems import quadrotor_altitude as vertical
-from safe_envs.systems._common import around, uniforms
+from safe_envs.systems.common import around, uniforms
 from safe_envs.systems.quadrotor_altitude import g, m, phi, sigma_z, theta, z, zdot
 
 x, y, psi = sp.symbols("x y psi", real=True)

@@ -7,16 +7,14 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.system_env import SystemEnv
-from safe_envs.number_text import finite_number
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.problem.backup import Backup, BackupFunction, BackupLaw
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.measurement import Channel
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import TIME, Feature, Variable
-from safe_envs.systems._common import positive, uniform_box
+from safe_envs.problem.starts import SamplingDomain, Start
+from safe_envs.systems.common import positive, uniform_box
+from safe_envs.text import finite_number
 
 z, zdot, phi, theta = sp.symbols("z zdot phi theta", real=True)
 U_1 = sp.Symbol("U_1", real=True)

@@ -6,27 +6,32 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.system_env import SystemEnv
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.errors import ConfigurationError
-from safe_envs.number_text import finite_number
 from safe_envs.problem.backup import BackupFunction
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import TIME, Feature
-from safe_envs.systems._common import around, uniforms
-from safe_envs.systems._levelling import levelling_backup
+from safe_envs.systems.backup_laws import levelling_backup
+from safe_envs.systems.common import around, uniforms
 from safe_envs.systems.quadrotor import (
     LARGEST_TILT,
-    phi,
     psi,
     quadrotor,
     rotor_laws,
     rotor_problem,
     start_at,
-    theta,
     x,
 )
-from safe_envs.systems.quadrotor_altitude import ALTITUDE_REWARD, HEIGHT, PLANT_MASS, z, zdot
+from safe_envs.systems.quadrotor_altitude import (
+    ALTITUDE_REWARD,
+    HEIGHT,
+    PLANT_MASS,
+    phi,
+    theta,
+    z,
+    zdot,
+)
+from safe_envs.text import finite_number
 
 x_ref, x_ref_rate = sp.symbols("x_ref x_ref_rate", real=True)
 

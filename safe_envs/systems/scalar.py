@@ -5,13 +5,12 @@ from __future__ import annotations
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.problem.measurement import Channel
-from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import positive, uniform_box
+from safe_envs.problem.starts import Start
+from safe_envs.systems.common import positive, uniform_box
 
 x, u, sigma = sp.symbols("x u sigma", real=True)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from safe_envs.dynamics.lie import generator
-from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.initial_distribution import Start
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import positive
+from safe_envs.problem.starts import Start
+from safe_envs.systems.common import positive
 from safe_envs.systems.dubins import UNIFORMS, anywhere, disk_problem, omega, vehicle, x, y
 
 

@@ -18,8 +18,7 @@ from pkgutil import get_data
 from typing import Any
 
 from safe_envs.errors import unknown
-from safe_envs.number_text import finite_number
-from safe_envs.problem.measurement_text import require_names
+from safe_envs.problem.measurement import require_names
 from safe_envs.problem.option_errors import (
     refused_box,
     refused_noise,
@@ -30,6 +29,7 @@ from safe_envs.problem.option_errors import (
 )
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.systems import ENV_IDS, MODULES
+from safe_envs.text import finite_number
 
 _FILE = Path(__file__).with_name("summaries.json")
 
@@ -160,7 +160,7 @@ def summary_of(env_id: str) -> SystemSummary:
 
 def write_summaries() -> None:
     """Write the file that `summaries` reads."""
-    from safe_envs.atomic_io import write_json
+    from safe_envs.files import write_json
 
     write_json(_FILE, {env_id: asdict(summary_of(env_id)) for env_id in ENV_IDS})
 

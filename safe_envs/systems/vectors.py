@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from safe_envs.envs.system_env import SystemVectorEnv
+from safe_envs.envs.registered import SystemVectorEnv
 from safe_envs.systems import MODULES
 
 

@@ -15,11 +15,12 @@ from safe_envs.errors import (
     SafeEnvsError,
     SystemDefinitionError,
 )
+from safe_envs.filters.conditions.base import AffineConstraint, Condition
+from safe_envs.filters.conditions.text import parse_conditions, spec_of
+from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.proofs.safe_set import draw_starts
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.conditions import AffineConstraint, Condition, parse_conditions, spec_of
-from safe_envs.wrappers.safety_filter import SafetyFilter
-from safe_envs.wrappers.verification.safe_set import draw_starts
 
 _STEP = 1e-3
 """Of the finite differences, relative to the state."""

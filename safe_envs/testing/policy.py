@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.rollout import episode_seed
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.policies.base import Policy
-from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import make_policy
+from safe_envs.agents.policies.registry import make_policy, policy_name
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import make_problem

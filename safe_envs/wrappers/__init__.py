@@ -5,34 +5,27 @@ What is named here is imported when it is first used.
 
 from typing import TYPE_CHECKING
 
+from safe_envs.filters import conditions
 from safe_envs.lazy_attributes import lazy_attributes
-from safe_envs.wrappers import conditions
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.conditions import *  # noqa: F403
-    from safe_envs.wrappers.delayed_filter import DelayedFilter
-    from safe_envs.wrappers.env_wrappers.cost_return import (
+    from safe_envs.filters import FilterDecision
+    from safe_envs.filters.conditions import *  # noqa: F403
+    from safe_envs.filters.delayed_filter import DelayedFilter
+    from safe_envs.filters.safety_filter import SafetyFilter
+    from safe_envs.wrappers.estimator import StateEstimatorVectorWrapper, StateEstimatorWrapper
+    from safe_envs.wrappers.external_env import ActionMap, FilterSpec
+    from safe_envs.wrappers.monitor import SafetyMonitor, SafetyMonitorVector
+    from safe_envs.wrappers.safety_filter import SafetyFilterVectorWrapper, SafetyFilterWrapper
+    from safe_envs.wrappers.specification import SpecificationMonitor, SpecificationMonitorVector
+    from safe_envs.wrappers.statistics import (
         CostReturnWrapper,
+        RecordSafetyStatistics,
+        RecordSafetyStatisticsVector,
         make_vec_with_cost,
         make_with_cost,
     )
-    from safe_envs.wrappers.env_wrappers.external_env import ActionMap, FilterSpec
-    from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
-    from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
-    from safe_envs.wrappers.env_wrappers.safety_filter import SafetyFilterWrapper
-    from safe_envs.wrappers.env_wrappers.safety_filter_vector import SafetyFilterVectorWrapper
-    from safe_envs.wrappers.env_wrappers.safety_statistics import (
-        RecordSafetyStatistics,
-        RecordSafetyStatisticsVector,
-    )
-    from safe_envs.wrappers.env_wrappers.specification_monitor import SpecificationMonitor
-    from safe_envs.wrappers.env_wrappers.specification_monitor_vector import (
-        SpecificationMonitorVector,
-    )
-    from safe_envs.wrappers.env_wrappers.state_estimator import StateEstimatorWrapper
-    from safe_envs.wrappers.env_wrappers.state_estimator_vector import StateEstimatorVectorWrapper
-    from safe_envs.wrappers.filter_qp import FilterDecision
-    from safe_envs.wrappers.safety_filter import SafetyFilter
+
 
 __all__ = [
     "ActionMap",
@@ -58,24 +51,24 @@ __all__ += conditions.__all__
 
 _MODULES = {
     **dict.fromkeys(conditions.__all__, conditions.__name__),
-    "ActionMap": "safe_envs.wrappers.env_wrappers.external_env",
-    "CostReturnWrapper": "safe_envs.wrappers.env_wrappers.cost_return",
-    "DelayedFilter": "safe_envs.wrappers.delayed_filter",
-    "FilterDecision": "safe_envs.wrappers.filter_qp",
-    "FilterSpec": "safe_envs.wrappers.env_wrappers.external_env",
-    "RecordSafetyStatistics": "safe_envs.wrappers.env_wrappers.safety_statistics",
-    "RecordSafetyStatisticsVector": "safe_envs.wrappers.env_wrappers.safety_statistics",
-    "SafetyFilter": "safe_envs.wrappers.safety_filter",
-    "SafetyFilterVectorWrapper": "safe_envs.wrappers.env_wrappers.safety_filter_vector",
-    "SafetyFilterWrapper": "safe_envs.wrappers.env_wrappers.safety_filter",
-    "SafetyMonitor": "safe_envs.wrappers.env_wrappers.monitor",
-    "SafetyMonitorVector": "safe_envs.wrappers.env_wrappers.monitor_vector",
-    "SpecificationMonitor": "safe_envs.wrappers.env_wrappers.specification_monitor",
-    "SpecificationMonitorVector": "safe_envs.wrappers.env_wrappers.specification_monitor_vector",
-    "StateEstimatorVectorWrapper": "safe_envs.wrappers.env_wrappers.state_estimator_vector",
-    "StateEstimatorWrapper": "safe_envs.wrappers.env_wrappers.state_estimator",
-    "make_vec_with_cost": "safe_envs.wrappers.env_wrappers.cost_return",
-    "make_with_cost": "safe_envs.wrappers.env_wrappers.cost_return",
+    "ActionMap": "safe_envs.wrappers.external_env",
+    "CostReturnWrapper": "safe_envs.wrappers.statistics",
+    "DelayedFilter": "safe_envs.filters.delayed_filter",
+    "FilterDecision": "safe_envs.filters",
+    "FilterSpec": "safe_envs.wrappers.external_env",
+    "RecordSafetyStatistics": "safe_envs.wrappers.statistics",
+    "RecordSafetyStatisticsVector": "safe_envs.wrappers.statistics",
+    "SafetyFilter": "safe_envs.filters.safety_filter",
+    "SafetyFilterVectorWrapper": "safe_envs.wrappers.safety_filter",
+    "SafetyFilterWrapper": "safe_envs.wrappers.safety_filter",
+    "SafetyMonitor": "safe_envs.wrappers.monitor",
+    "SafetyMonitorVector": "safe_envs.wrappers.monitor",
+    "SpecificationMonitor": "safe_envs.wrappers.specification",
+    "SpecificationMonitorVector": "safe_envs.wrappers.specification",
+    "StateEstimatorVectorWrapper": "safe_envs.wrappers.estimator",
+    "StateEstimatorWrapper": "safe_envs.wrappers.estimator",
+    "make_vec_with_cost": "safe_envs.wrappers.statistics",
+    "make_with_cost": "safe_envs.wrappers.statistics",
 }
 
 __getattr__, __dir__ = lazy_attributes(__name__, _MODULES, globals())

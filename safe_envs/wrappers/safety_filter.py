@@ -1,299 +1,410 @@
-"""The safety filter: from a state and a proposed input to the nearest input that is allowed."""
+"""A safety filter over a scalar env."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Never
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
-import sympy as sp
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
-from safe_envs.dynamics.codegen import finite, stacked
-from safe_envs.dynamics.defined import NO_VALUE
-from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import InvalidInputError
-from safe_envs.problem.clf import CLF
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.conditions.at_estimate import (
-    EstimateSettings,
-    belief_places,
-    constraint_at_estimate,
-    with_belief_signals,
+from safe_envs.envs.compiled_batch import BatchFilter, BatchStepper
+from safe_envs.envs.env import SafeEnv
+from safe_envs.envs.info import Info, VectorStep, filter_info, with_masks
+from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.filters.estimation.estimator import Estimator
+from safe_envs.filters.qp import FilterDecision
+from safe_envs.wrappers.estimator import StateEstimatorVectorWrapper, StateEstimatorWrapper
+from safe_envs.wrappers.filter_layers import (
+    FilterChoice,
+    FilterLayer,
+    filtered_box,
+    rest_info,
+    third_party_spec,
 )
-from safe_envs.wrappers.conditions.parts import parts_of
-from safe_envs.wrappers.conditions.spec_text import Conditions
-from safe_envs.wrappers.estimation import Estimator, make_estimator
-from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP, arguments, limits
-from safe_envs.wrappers.filter_qp.barrier_values import BarrierValues
-from safe_envs.wrappers.filter_qp.component_filter import ComponentFilter
-from safe_envs.wrappers.filter_qp.problem_arguments import known_for_problem
-from safe_envs.wrappers.filter_qp.runtime import RuntimeArguments, doubles, require_finite
-from safe_envs.wrappers.measurement_filter import FiltersMeasurements, certain_states
+from safe_envs.wrappers.layers import only_checks_between, state_layer
+from safe_envs.wrappers.monitor import SafetyMonitor, SafetyMonitorVector
 
 
-class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
-    """Chooses the input nearest to a proposed one that every condition allows.
+class SafetyFilterWrapper(
+    FilterLayer,
+    gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    gym.utils.RecordConstructorArgs,
+):
+    """Replaces each action of a policy by the nearest one that a condition allows.
 
-    It minimises 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier and to the
-    input bounds. Where the constraints cannot all be met, the sum of their squared slacks, weighted
-    by the priorities, is as small as can be. A constraint counts as met where it is violated by no
-    more than the rounding of its terms; see `safe_envs.wrappers.qp.rounding`.
+    The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of
+    `safe_envs.envs.info`, in physical units.
 
-    One constraint has a closed form, and any number an exact solution for one and two inputs. For
-    others DAQP proposes which constraints and bounds hold the answer, and their equations prove it,
-    so that answers are right to rounding; else a slower active-set method decides.
-
-    With a control Lyapunov function the filter solves its joint QP instead: min w_u |u|^2 + w_d d^2
-    subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2).
-    Then the filter pursues the goal by itself, whatever is proposed; the action that is best
-    without constraints takes the place of the proposed one. A slack of a barrier is dearer than
-    any d.
-
-    Conditions that are named without rates get ones, as many as each barrier's relative degree.
-
-    What is measured just now comes in at each call; see `filter`: input bounds, the values of the
-    system's `signals` and of the adjustable parameters, and the time. Their rates are part of the
-    derivatives; see `ControlAffineSDE`. All else is imported and compiled here; see `warm_up`.
+    Over a third-party env the fields of `FilterSpec` are given by name. Then actions are the env's
+    own, and `info` gains the keys of this project's envs too.
 
     Args:
-        system: that the filter knows.
-        barriers: h, safe where h >= 0: a `Barrier` or an expression of states, signals and
-            `safe_envs.problem.signals.TIME`; several of them; or (barrier, condition) pairs.
-        conditions: a `Condition` for all barriers, one for each, or their text, like "hocbf:p=2,8"
-            or "szcbf+hocbf"; see `parse_condition`. "szcbf" with noise and "hocbf" without by
-            default. None with pairs.
-        bounds: (low, high) of all inputs in physical units, or one such pair for each. An end may
-            be infinite unless the filter has a goal, a reciprocal condition or certificate, or an
-            uncertain constraint: these go as far as they can.
-        weights: diagonal of W, one positive number for each input; ones by default.
-        priorities: weights of the squared slacks, one positive number for each barrier; ones by
-            default.
-        dt: control period in s, for conditions with a sampling margin of first order.
-        clf: goal of the joint QP, whose weights replace W.
-        adjustable: names of the system's parameters whose values may be given at each call.
-        estimator: of the state, for `filter_measurement`.
-        instants: control instants of an episode, for conditions with `belief`.
-        region: (low, high) of each state, for conditions with `measurement_error`.
-
-    Attributes:
-        model: the system, as given.
-        pairs: each barrier with its condition.
-        parts: the same for each constraint in `constraints`: a barrier that is a minimum has one
-            for each of its pieces, see `Condition.parts`.
-        qp: the QP, whose model has the adjustable parameters as signals.
+        env: one of this project's envs, possibly wrapped; or any env with a Box action space.
+        condition: a `Condition` for every barrier, one for each, or their text, like "scbf",
+            "hocbf:p=2,8" or "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's. Or
+            the promise filter, like "promise:p=0.99".
+        knowledge: "model" (what the designer believes) or "plant" (the true system).
+        objective: "nearest" to the policy's action; or "clf" for the joint QP with the env's
+            goal, in which the policy has no say: `info["nominal_action"]` is what the goal alone
+            asks for.
+        priorities: of the barriers where not all can be kept: weights of their squared slacks, ones
+            by default.
+        delay: of the inputs as the filter believes it, in control periods; by default that of the
+            env's `delay` and `model_delay`. It predicts so far ahead, see `DelayedFilter`.
+        estimator: of the state, over an env with the option `measurement`; see
+            `StateEstimatorWrapper`. The observation remains what is measured; for estimates put
+            that wrapper below this one.
+        observe_promise: append p_k of the promise filter, in [0, 1], to the observation, on which
+            what it will allow depends.
+        **view: for a third-party env `model`, `barriers`, `state_fn`, and what else of
+            `FilterSpec` is needed.
 
     Raises:
-        SystemDefinitionError: The system or a barrier is none, or they do not fit.
-        RelativeDegreeError: A condition does not suit a barrier.
-        ConfigurationError: A condition, a bound, a weight or a name is not allowed, or dt is
-            missing.
+        ConfigurationError: an argument is unknown or missing, or does not fit the env; or, at a
+            step, a wrapper between the filter and the env changed the action.
+        InvalidInputError: `state_fn` does not make states of observations.
+        RelativeDegreeError: the condition does not suit the env's barrier.
     """
 
-    def __init__(  # noqa: PLR0913  (what a user states, mostly by keyword)
+    def __init__(
         self,
-        system: ControlAffineSDE,
-        barriers: Any,
-        conditions: Conditions | Sequence[Condition | str] | None = None,
-        bounds: Any = None,
-        weights: Sequence[float] | None = None,
-        *,
-        priorities: Sequence[float] | None = None,
-        dt: float | None = None,
-        clf: CLF | None = None,
-        adjustable: Sequence[str | sp.Symbol] = (),
-        estimator: Estimator | None = None,
-        instants: int | None = None,
-        region: Sequence[tuple[float, float]] | None = None,
-        **unknown: Never,
-    ) -> None:
-        arguments.refuse_unknown(unknown, SafetyFilter.__init__)
-        self.model = arguments.require_system(system)
-        known = arguments.with_adjustable(system, adjustable)
-        self.pairs = arguments.read_pairs(known, barriers, conditions)
-        arguments.require_goal(clf, weights)
-        settings = EstimateSettings(dt, instants, region, certain_states(estimator))
-        owners, self.parts = parts_of(self.pairs)
-        self.constraints = tuple(
-            constraint_at_estimate(c, known, barrier, settings, len(self.parts))
-            for barrier, c in self.parts
-        )
-        known = with_belief_signals(known, self.constraints)
-        endless = limits.takes_endless(self.constraints, clf)
-        weights_of = limits.positive_weights("priorities", priorities, len(self.pairs))
-        qp = FilterQP(
-            known,
-            self.constraints,
-            *limits.read_bounds(known.inputs, bounds, endless),
-            limits.positive_weights("weights", weights, known.m),
-            [weights_of[i] for i in owners],
-            limits.control_period(self.constraints, dt),
-            clf,
-            arguments.runtime_symbols(known, self.pairs, self.constraints, clf),
-            owners if len(owners) > len(self.pairs) else (),
-        )
-        super().__init__(qp, [barrier.name for barrier, _ in self.pairs])
-        fixed = [p.name for p in known.parameters]
-        self._given = RuntimeArguments(qp, system.parameters, fixed, endless)
-        self._state_shape, self._input_shape = (system.n,), (system.m,)
-        self.belief_places = belief_places(qp.runtime, system.n)
-        self._measure_by(estimator)
-        self.warm_up()
-
-    @classmethod
-    def for_problem(
-        cls,
-        problem: SafetyProblem,
-        conditions: Conditions,
+        env: gym.Env[np.ndarray, np.ndarray],
+        condition: FilterChoice,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
-        adjustable: Sequence[str | sp.Symbol] = (),
+        observe_promise: bool = False,
+        delay: int | None = None,
         estimator: Estimator | str | None = None,
-    ) -> SafetyFilter:
-        """Return the filter for the barriers of a problem.
-
-        Args:
-            problem: problem whose model, barriers and box are taken.
-            conditions: one for every barrier, one for all, or their text; see
-                `SafetyFilterWrapper`.
-            knowledge: "model" for what the designer believes, "plant" for the true system.
-                Conditions that correct the model start from it in any case.
-            objective: "nearest" to the proposed action, or "clf" for the joint QP with the
-                problem's goal.
-            priorities: see the class.
-            adjustable: see the class.
-            estimator: of a measured problem, or its text, like "ekf".
-
-        Raises:
-            SystemDefinitionError: What is given is no problem.
-            ConfigurationError: A word is unknown, the number of conditions is wrong, a condition is
-                made for another problem, one corrects the model and another knows the plant, or the
-                problem has no clf.
-        """
-        known, each, clf = known_for_problem(problem, conditions, knowledge, objective)
-        return cls(
-            known,
-            problem.barriers,
-            each,
-            bounds=problem.box,
+        **view: Any,
+    ) -> None:
+        if view:
+            env = SafetyMonitor(env, third_party_spec(env.unwrapped, SafeEnv, view, knowledge))
+        if estimator is not None:
+            env = StateEstimatorWrapper(env, estimator, "measurement", knowledge)
+        inner = state_layer(env, (SafeEnv, SafetyMonitor, StateEstimatorWrapper), vector=False)
+        text = self.attach(
+            inner, condition, knowledge, objective, priorities, observe_promise, delay
+        )
+        self.watch_states(inner.episode)
+        # The monitor records the view: an env that is made again from its spec has one already.
+        gym.utils.RecordConstructorArgs.__init__(
+            self,
+            condition=text,
+            knowledge=knowledge,
+            objective=objective,
             priorities=priorities,
-            dt=problem.dt,
-            clf=clf,
-            adjustable=adjustable,
-            estimator=None if estimator is None else make_estimator(estimator, problem, knowledge),
-            instants=problem.steps + 1,
-            region=[(v.low, v.high) for v in problem.states],
+            observe_promise=observe_promise,
+            delay=delay,
         )
+        gym.Wrapper.__init__(self, env)
+        self.action_space = filtered_box(env.action_space, inner)
+        self.know_bounds(env.action_space, objective)
+        if observe_promise:
+            self.observation_space = self.observation_box(env.observation_space)
+        self._directly = only_checks_between(env, inner)
+        self._interventions = 0
+        self._infeasible = 0
 
-    def warm_up(self) -> SafetyFilter:
-        """Import and compile all that any decision may need, as making one did; return itself."""
-        self.compile()
-        _ = self._barriers_floats, self._barriers_arrays
-        return self
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
+        """Start an episode; see `SafeEnv.reset`.
 
-    def filter(
-        self,
-        x: Any,
-        u_nominal: Any,
-        *,
-        bounds: Any = None,
-        parameters: Mapping[Any, Any] | None = None,
-        t: Any = None,
-    ) -> FilterDecision:
-        """Decide for one state or a batch.
-
-        Args:
-            x: states, shape (n,) or (..., n).
-            u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
-            bounds: input bounds in place of the filter's own: (low, high) for all inputs, one such
-                pair for each, (m, 2), or for each input of each state, (..., m, 2). An input whose
-                bounds are equal is held there.
-            parameters: values by name or symbol: of all signals of the system, and of adjustable
-                parameters, which else have the system's. Numbers, or for a batch arrays (...,).
-            t: time in s, likewise, where a barrier or the system depends on it.
-
-        Returns:
-            Arrays with the same leading axes.
+        With a specification to keep, an episode begins at time 0.
 
         Raises:
-            InvalidInputError: A shape does not fit, an entry is no finite real number, or a lower
-                bound is above its upper one.
-            ConfigurationError: A name is unknown, a value is missing, or a bound is infinite where
-                it may not be.
-            NumericalError: A constraint has no finite value at a state where its barrier has one.
+            ConfigurationError: see `SafeEnv.reset`; or a time is given with a specification.
         """
-        x, u = doubles("state", x), doubles("nominal input", u_nominal)
-        if x.shape == self._state_shape and u.shape == self._input_shape:
-            return self._filter_one(x, u, bounds, parameters, t)
-        n, m = self.model.n, self.model.m
-        if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
-            raise InvalidInputError(
-                f"state {x.shape} and input {u.shape} do not fit; give (..., {n}) and (..., {m})"
-                " with the same leading axes"
-            )
-        batch = x.shape[:-1]
-        own = None if bounds is None else self._given.bounds(bounds, batch)
-        values = self._given.values(parameters, t, batch)
-        states, inputs = (
-            tuple(np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T)) for part in (x, u)
+        self.require_whole_episodes(options)
+        self.follow()
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._interventions = 0
+        self._infeasible = 0
+        self._filter.begin(self._inner.components, instants=self._episodes.steps)
+        info = {**info, **rest_info(self._inner.problem), **self._reported()}
+        return self.observed(observation), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Info]:
+        """Filter the action and hold it for one control period."""
+        proposed = self._inner.physical_action(action)
+        self.follow()
+        decision = self._filter.decide_floats(self.known(proposed), proposed)
+        executed, nominal, active = decision.action, decision.proposed, True in decision.active
+        if self._inner.viewer is not None:
+            self._inner.viewer.announce([nominal], [active], [decision.feasible])
+        observation, reward, terminated, truncated, info = self.execute(
+            self.env, executed, self._directly
         )
-        states += tuple(values)
-        with np.errstate(all="ignore"):
-            require_finite(x, u)
-            decision = self._decide(states, inputs, own)
-            barriers = self._barriers_arrays(*states)
-            action, margin, active, feasible, slack, cause, proposed, _ = decision
-            given = () if proposed is inputs else (proposed,)
-            action, margin, active, slack, barrier, *goal = [
-                stacked(part, len(inputs[0])).reshape(*batch, len(part))
-                for part in (action, margin, active, slack, barriers, *given)
-            ]
-            if not finite(barrier.T):
-                table = self._defined(barrier.reshape(-1, len(barriers)), states)
-                barrier = table.reshape(barrier.shape)
-        cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
-        cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
-        return FilterDecision(
-            action,
-            margin,
-            active > 0.0,
-            feasible,
-            slack,
-            cause,
-            goal[0] if goal else np.array(u),
-            barrier,
+        self._filter.advance(self._inner.components, terminated or truncated)
+        differs = active and executed != nominal
+        self._interventions += differs
+        self._infeasible += not decision.feasible
+        info.update(
+            filter_info(
+                nominal_action=np.array(nominal),
+                safe_action=np.array(executed),
+                intervention=differs,
+                filter_active=active,
+                feasible=decision.feasible,
+                slack=max(decision.slack),
+                slacks=np.array(decision.slack),
+                active_barrier=decision.cause if differs else -1,
+                episode_interventions=self._interventions,
+                episode_infeasible=self._infeasible,
+            ),
+            **self._reported(),
+        )
+        return self.observed(observation), reward, terminated, truncated, info
+
+    def _reported(self) -> Info:
+        found: Info = {key: value.item() for key, value in self._filter.report().items()}
+        found |= self.bounds_info()
+        if self._beliefs is not None:
+            tracker = self._inner.tracker
+            found["belief_barrier"] = self._beliefs.barriers(tracker.mean, tracker.covariance)[0]
+        return found
+
+
+_TALLIES = ("interventions", "infeasible")
+
+
+class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
+    """`SafetyFilterWrapper` for a batch: same arguments, same info with the batch in front.
+
+    A step that only resets an env (next-step autoreset) ignores its action: there the filter
+    reports what it reports at reset, and counts nothing.
+
+    Over envs with the engine "compiled" or "auto", made without a render mode, the filter is part
+    of their compiled function; "auto" leaves those that have no compiled form to NumPy.
+
+    Raises:
+        NotCompilableError: the engine of the env is "compiled", and the filter has no compiled
+            form: it has learned terms without one, predicts over a delay, or is the promise filter.
+        ConfigurationError: an argument is unknown or missing, or does not fit the env.
+        InvalidInputError: `state_fn` does not make states of observations.
+        RelativeDegreeError: the condition does not suit the env's barrier.
+    """
+
+    def __init__(
+        self,
+        env: gym.vector.VectorEnv,
+        condition: FilterChoice,
+        knowledge: str = "model",
+        objective: str = "nearest",
+        priorities: Sequence[float] | None = None,
+        observe_promise: bool = False,
+        delay: int | None = None,
+        estimator: Estimator | str | None = None,
+        **view: Any,
+    ) -> None:
+        if view:
+            spec = third_party_spec(env.unwrapped, SafeVectorEnv, view, knowledge)
+            env = SafetyMonitorVector(env, spec)
+        if estimator is not None:
+            env = StateEstimatorVectorWrapper(env, estimator, "measurement", knowledge)
+        kinds = (SafeVectorEnv, SafetyMonitorVector, StateEstimatorVectorWrapper)
+        inner = state_layer(env, kinds, vector=True)
+        self.attach(
+            inner, condition, knowledge, objective, priorities, observe_promise, delay, env.num_envs
+        )
+        self.watch_states(inner.episodes)
+        gym.vector.VectorWrapper.__init__(self, env)
+        self.single_action_space = filtered_box(env.single_action_space, inner)
+        self.know_bounds(env.single_action_space, objective, (self.num_envs,))
+        if observe_promise:
+            self.single_observation_space = self.observation_box(env.single_observation_space)
+            self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._rest = rest_info(inner.problem)
+        self.autoreset_mode = env.metadata["autoreset_mode"]
+        self._stepper = self._compiled() if env is inner else None
+        self._counted = _Counted(self.num_envs) if self._stepper is None else self._stepper
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
+        """Start episodes in every env, or those of a mask.
+
+        See `SafeVectorEnv.reset` and `SafetyFilterWrapper.reset`.
+        """
+        if self._stepper is not None:
+            observation, info = self._inner.reset_filtered(self._stepper, seed, options)
+            return observation, self._with_bounds(info)
+        self.require_whole_episodes(options)
+        self.follow()
+        observation, info = self.env.reset(seed=seed, options=options)
+        present = info["_cost"]
+        self._forget(present)
+        self._filter.begin(self._inner.components, present, self._episodes.steps)
+        at_rest = {
+            key: np.full((self.num_envs, *np.shape(value)), value)
+            for key, value in self._rest.items()
+        }
+        at_rest |= self._reported()
+        return self.observed(observation), {**info, **with_masks(at_rest, present)}
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
+        counts = {name: self._counted.tallies[:, j].copy() for j, name in enumerate(_TALLIES)}
+        return {**self._inner.snapshot(), **counts, **self._filter.snapshot()}
+
+    def restore(
+        self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
+    ) -> None:
+        """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
+        self._inner.restore(snapshot, seed)
+        counts = [np.asarray(snapshot[name], dtype=np.int64) for name in _TALLIES]
+        self._counted.tallies = np.column_stack(counts)
+        self._filter.restore(snapshot)
+        self.watch_states(self._episodes)
+
+    def step(self, actions: Any) -> VectorStep:
+        """Filter the actions and hold them for one control period."""
+        if self._stepper is not None:
+            found = self._inner.step_filtered(self._stepper, actions)
+            info = self._with_bounds(found[-1])
+            if "final_info" in info:
+                self._with_bounds(info["final_info"])
+            return found
+        proposed = self._inner.physical_action(actions)
+        self.follow()
+        decision = self._filter.decide_arrays(tuple(self.known(proposed)), proposed)
+        active = (
+            decision.active[0]
+            if len(decision.active) == 1
+            else np.logical_or.reduce(decision.active)
+        )
+        if self._inner.viewer is not None:
+            self._inner.viewer.announce(
+                np.stack(decision.proposed, axis=-1), active, decision.feasible
+            )
+        observation, reward, terminated, truncated, info = self.execute(
+            self.env, decision.action, self.env is self._inner
+        )
+        self._filter.advance(self._reached(), terminated | truncated)
+        added = self._decided(decision, active) | self._reported(reached=True)
+        begun = self._inner.episodes.begun
+        if np.count_nonzero(begun):
+            if self.autoreset_mode == AutoresetMode.SAME_STEP:
+                last = {key: value.copy() for key, value in added.items()}
+                info["final_info"].update(with_masks(last, begun))
+                self._observe_last(info, begun)
+            self._filter.begin(self._inner.components, begun)
+            self._restart(added, begun)
+            added |= self._reported()
+        info.update(with_masks(added, info["_cost"]))
+        return self.observed(observation), reward, terminated, truncated, info
+
+    def _reached(self) -> Sequence[Any]:
+        """Return the components of the states that a step led to, of ended episodes too."""
+        inner = self._inner
+        estimates = isinstance(inner, StateEstimatorVectorWrapper)
+        last = (inner if estimates else inner.episodes).last_states.T
+        return self._with_last(inner.components, list(last))
+
+    def _with_last(self, now: Sequence[Any], last: Sequence[Any]) -> Sequence[Any]:
+        """Return components of now, with others in envs whose episodes ended in this step."""
+        begun = self._inner.episodes.begun
+        if self.autoreset_mode != AutoresetMode.SAME_STEP or not np.count_nonzero(begun):
+            return now
+        return tuple([np.where(begun, old, c) for old, c in zip(last, now, strict=True)])
+
+    def _reported(self, reached: bool = False) -> Info:
+        """Return what the filter reports, of ended episodes too if they were just reached."""
+        found = {**self._filter.report(), **self.bounds_info()}
+        if self._beliefs is not None:
+            inner = self._inner
+            x, p = inner.components, inner.tracker.covariance
+            if reached:
+                x, p = self._reached(), self._with_last(p, inner.last_covariance)
+            found = {**found, "belief_barrier": self._beliefs.barriers(x, p)}
+        return found
+
+    def _with_bounds(self, info: Info) -> Info:
+        """Add what is always the same to an info of the compiled function."""
+        if self._bounds is not None:
+            info["input_bounds"] = self._bounds.copy()
+            info["_input_bounds"] = info["_cost"].copy()
+        return info
+
+    def _observe_last(self, info: Info, ended: np.ndarray) -> None:
+        """Append p_k to the last observations of episodes, which their envs have not seen."""
+        if self._observes:
+            last, levels = info["final_obs"], self._filter.report()["promise"]
+            for i in np.flatnonzero(ended).tolist():
+                last[i] = np.append(last[i], levels[i]).astype(last[i].dtype)
+
+    def _decided(self, decision: FilterDecision, active: np.ndarray) -> Info:
+        """Count, and report what was decided."""
+        nominal = decision.proposed
+        differs = decision.action[0] != nominal[0]
+        for u, v in zip(decision.action[1:], nominal[1:], strict=True):
+            differs |= u != v
+        differs &= active
+        now = np.column_stack([differs, ~decision.feasible])
+        self._counted.tallies = tallies = self._counted.tallies + now
+        return filter_info(
+            nominal_action=_as_columns(nominal),
+            safe_action=_as_columns(decision.action),
+            intervention=differs,
+            filter_active=active,
+            feasible=decision.feasible,
+            slack=(
+                decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack)
+            ),
+            slacks=_as_columns(decision.slack),
+            active_barrier=np.where(differs, decision.cause, -1),
+            episode_interventions=tallies[:, 0].copy(),
+            episode_infeasible=tallies[:, 1].copy(),
         )
 
-    def _filter_one(
-        self, x: np.ndarray, u: np.ndarray, bounds: Any, parameters: Any, t: Any
-    ) -> FilterDecision:
-        state, inputs = x.tolist(), u.tolist()
-        if not math.isfinite(sum(state) + sum(inputs)):
-            with np.errstate(over="ignore"):
-                require_finite(x, u)
-        own = None if bounds is None else self._given.bounds(bounds)
-        if self.qp.runtime or parameters is not None:
-            state += self._given.values(parameters, t)
-        action, margin, active, feasible, slack, cause, proposed, _ = self.decide_floats(
-            state, inputs, own
+    def _restart(self, added: Info, envs: np.ndarray) -> None:
+        """Put what is reported at reset in place of a decision, for the envs that were reset."""
+        self._forget(envs)
+        for key, value in self._rest.items():
+            # The env itself may hold the array of a single input.
+            added[key] = added[key].copy()
+            added[key][envs] = value
+
+    def _forget(self, envs: np.ndarray) -> None:
+        self._counted.tallies = np.where(envs[:, None], 0, self._counted.tallies)
+
+    def _compiled(self) -> BatchStepper | None:
+        """Return what filters and steps in one compiled function, where the env is compiled."""
+        if not isinstance(self._inner, SafeVectorEnv):
+            return None
+        rest = self._rest
+        at_rest = [rest[key] for key in ("nominal_action", "safe_action", "slack", "slacks")]
+        return self._inner.filtered(
+            BatchFilter(
+                self._filter.source,
+                self._filter.decide_arrays,
+                np.hstack(at_rest),
+            )
         )
-        try:
-            barrier = self._barriers_floats(*state)
-        except NO_VALUE:
-            barrier = (math.nan,)
-        if not math.isfinite(sum(barrier)):
-            with np.errstate(all="ignore"):
-                barrier = stacked(self._barriers_arrays(*[np.array([c]) for c in state]), 1)[0]
-            barrier = self._defined(np.asarray(barrier)[None], state)[0]
-        return FilterDecision(
-            np.array(action),
-            np.array(margin),
-            np.array(active),
-            feasible,
-            np.array(slack),
-            cause if True in active else -1,
-            u.copy() if proposed is inputs else np.array(proposed),
-            np.array(barrier),
-        )
+
+
+class _Counted:
+    """What `BatchStepper` counts."""
+
+    def __init__(self, num_envs: int) -> None:
+        self.tallies = np.zeros((num_envs, 2), dtype=np.int64)
+
+
+def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
+    """Return the layer of a vector env from which a filter reads the states.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    return state_layer(env, (SafeVectorEnv, SafetyMonitorVector), vector=True)
+
+
+def _as_columns(components: Sequence[np.ndarray]) -> np.ndarray:
+    """Return components as columns, which the caller may write to."""
+    if len(components) == 1:  # where `numpy.stack` takes ten times as long
+        return components[0].reshape(-1, 1).copy()
+    return np.stack(components, axis=-1)

@@ -16,8 +16,8 @@ from benchmarks import cases, command_times, figures, latency
 from benchmarks.command_times import MISTAKES
 from benchmarks.figures import Part
 from benchmarks.hand_written_loop import step_by_hand
-from safe_envs.agents.training import vec_env_speed
-from safe_envs.scripts.reports.env_speeds import ENV_ID
+from safe_envs.agents.training import vec_env
+from safe_envs.scripts.reports.installation import ENV_ID
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.scripts.conftest import strictly
 
@@ -202,8 +202,8 @@ def test_figures_are_finite_and_ratios_fit(monkeypatch):
     monkeypatch.setattr(latency, "_CALLS", 50)
     monkeypatch.setattr(latency, "_DRAWN", 1024)
     monkeypatch.setattr(command_times, "_ROUNDS", 1)
-    speeds = partial(vec_env_speed.speeds, steps=5, rounds=1)
-    monkeypatch.setattr(vec_env_speed, "speeds", speeds)
+    speeds = partial(vec_env.speeds, steps=5, rounds=1)
+    monkeypatch.setattr(vec_env, "speeds", speeds)
     found = {name: value for part in figures.parts() for name, value in part.measure().items()}
     assert all(math.isfinite(value) and value >= 0 for value in found.values())
     assert len(latency.rows_of(found)) == 6

@@ -6,14 +6,8 @@ from math import sqrt
 
 import numpy as np
 
-from safe_envs.compiled.plain_natives import (
-    philox_block,
-    single,
-    table_view,
-    uniform_of,
-    vector_view,
-)
-from safe_envs.compiled.slots import reward_of
+from safe_envs.engine.plain_natives import philox_block, single, table_view, uniform_of, vector_view
+from safe_envs.engine.slots import reward_of
 
 FACTOR = 2.0
 

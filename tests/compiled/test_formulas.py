@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formula_kernels import formula_max, formula_min
-from safe_envs.compiled.formulas import Source, formulas
-from safe_envs.compiled.program import Program
-from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.printers import SUPPORTED
+from safe_envs.dynamics.codegen import SUPPORTED, compile_function
+from safe_envs.engine.formulas import Source, formula_max, formula_min, formulas
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
 from safe_envs.errors import SystemDefinitionError
 from tests.compiled import kernels
 

@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from safe_envs.compiled import program
-from safe_envs.compiled.engine import compiled_or_none, periods_of_a_part, require_engine
-from safe_envs.compiled.formulas import Source
-from safe_envs.compiled.program import Program
+from safe_envs.engine import program
+from safe_envs.engine.choice import compiled_or_none, periods_of_a_part, require_engine
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError, SystemDefinitionError
-from safe_envs.user_cache import VARIABLE, cache_folder
+from safe_envs.files import VARIABLE, cache_folder
 from tests.compiled import kernels, other_kernels
 
 HALF = "def reward_of(values):\n    return 0.5 * values[0]\n"

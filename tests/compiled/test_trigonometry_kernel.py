@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.compiled.trigonometry_kernel import arc_tangent, cosine, sine
+from safe_envs.engine.trigonometry_kernel import arc_tangent, cosine, sine
 from tests.compiled.test_formulas import Data, program, read, t, x, y
 
 LIMIT = 2.0**17

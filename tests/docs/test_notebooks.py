@@ -15,7 +15,7 @@ from matplotlib import pyplot as plt
 
 import safe_envs
 from safe_envs import agents, plotting, wrappers
-from safe_envs.scripts.figures.saving import StyledFigure
+from safe_envs.scripts.figures.style import StyledFigure
 
 pytestmark = pytest.mark.slow
 

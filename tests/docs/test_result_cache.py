@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from safe_envs.user_cache import VARIABLE, cache_folder
+from safe_envs.files import VARIABLE, cache_folder
 
 HOOKS = Path(__file__).parents[2] / "docs" / "hooks"
 

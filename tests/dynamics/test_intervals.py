@@ -13,7 +13,7 @@ import sympy as sp
 
 from safe_envs import SystemDefinitionError
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.intervals import Interval, interval_function
+from safe_envs.enclosures.intervals import Interval, interval_function
 
 X, Y, Z = sp.symbols("x y z", real=True)
 INF = math.inf

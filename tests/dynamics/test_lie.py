@@ -21,7 +21,7 @@ from safe_envs.dynamics.lie import (
     relative_degree,
     tidied,
 )
-from safe_envs.dynamics.philox import StreamReader
+from safe_envs.dynamics.noise import StreamReader
 from safe_envs.envs.simulation import Simulation
 from tests.conftest import problem_of
 

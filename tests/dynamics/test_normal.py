@@ -6,8 +6,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from safe_envs.dynamics import normal
-from safe_envs.dynamics.normal import standard_exponentials, standard_normals
+from safe_envs.dynamics import noise
+from safe_envs.dynamics.noise import standard_exponentials, standard_normals
 from safe_envs.dynamics.normal_kernel import standard_exponential, standard_normal
 
 STEP = 2.0**-53
@@ -62,7 +62,7 @@ def test_arrays_and_floats_agree():
 def test_a_number_does_not_depend_on_its_neighbours(monkeypatch):
     u = uniforms()
     together = standard_normals(u)
-    monkeypatch.setattr(normal, "_PIECE", 7)
+    monkeypatch.setattr(noise, "_PIECE", 7)
     np.testing.assert_array_equal(standard_normals(u), together)
     np.testing.assert_array_equal(standard_normals(u[::-2]), together[::-2])
     square = u[:1000].reshape(10, 100).T

@@ -8,8 +8,7 @@ import pytest
 from scipy import stats
 
 from safe_envs import ConfigurationError
-from safe_envs.dynamics.normal import standard_normals
-from safe_envs.dynamics.philox import (
+from safe_envs.dynamics.noise import (
     BRIDGE,
     EPISODE,
     NOISE,
@@ -17,6 +16,7 @@ from safe_envs.dynamics.philox import (
     START,
     StreamReader,
     key_of,
+    standard_normals,
 )
 
 PURPOSES = (NOISE, START, BRIDGE, POLICY, EPISODE)

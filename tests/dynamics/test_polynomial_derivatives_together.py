@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.dynamics.polynomial_forms import ExpandedPolynomial
+from safe_envs.enclosures.polynomial_forms import ExpandedPolynomial
 
 X, Y = sp.symbols("x y", real=True)
 

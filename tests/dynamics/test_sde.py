@@ -19,9 +19,9 @@ from safe_envs import (
     state_problem,
 )
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.declarations import TIME
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.problem.barrier import Barrier
+from safe_envs.dynamics.symbols import TIME
+from safe_envs.problem.problem import Barrier
 from safe_envs.wrappers import SafetyFilter
 
 x, y, u, k = sp.symbols("x y u k", real=True)

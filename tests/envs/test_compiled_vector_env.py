@@ -12,12 +12,11 @@ from gymnasium.wrappers.vector import (
 )
 
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError
-from safe_envs.compiled import engine as engines
-from safe_envs.compiled.program import Program
+from safe_envs.engine import choice as engines
+from safe_envs.engine.program import Program
 from safe_envs.envs.compiled_batch import CompiledBatch
 from safe_envs.errors import NotCompilableError
-from safe_envs.wrappers import SafetyFilterVectorWrapper
-from safe_envs.wrappers.env_wrappers import episode_filter
+from safe_envs.wrappers import SafetyFilterVectorWrapper, filter_layers
 from tests.envs.test_vector_env import assert_same
 
 SCALAR, DUBINS = "safe_envs/Scalar-v0", "safe_envs/StochasticDubins-v0"
@@ -296,7 +295,7 @@ def test_filters_that_cannot_be_compiled(plain, monkeypatch):
     def refuse(*_):
         raise NotCompilableError("no method for learned terms")
 
-    monkeypatch.setattr(episode_filter, "filter_source", refuse)
+    monkeypatch.setattr(filter_layers, "filter_source", refuse)
     env_id = "safe_envs/QuadrotorLimits-v0"
     theirs, ours = (gym.make_vec(env_id, num_envs=2, engine=e) for e in ("numpy", "auto"))
     assert isinstance(ours.unwrapped._batch, CompiledBatch)

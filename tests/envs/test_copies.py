@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from safe_envs.compiled.program import Program
+from safe_envs.engine.program import Program
 
 DUBINS, SCALAR = "safe_envs/StochasticDubins-v0", "safe_envs/Scalar-v0"
 COPIES = {"pickle": lambda given: pickle.loads(pickle.dumps(given)), "deepcopy": copy.deepcopy}

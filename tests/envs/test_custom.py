@@ -14,8 +14,8 @@ from gymnasium.utils.env_checker import check_env
 
 import safe_envs
 from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
-from safe_envs.envs.custom import Custom
-from safe_envs.object_import import load_object
+from safe_envs.envs.registered import Custom
+from safe_envs.plugins import load_object
 from safe_envs.problem.factory import load_system
 from safe_envs.registry import make_problem
 from safe_envs.systems import CUSTOM_ID

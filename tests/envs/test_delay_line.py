@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs import ConfigurationError, SafeEnv, SafeVectorEnv
 from safe_envs.envs.array_batch import ArrayBatch
-from safe_envs.envs.delay_line import Actuators, DelayLine
+from safe_envs.envs.episode import Actuators, DelayLine
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of

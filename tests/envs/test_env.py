@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError
-from safe_envs.dynamics.philox import StreamReader
+from safe_envs.dynamics.noise import StreamReader
 from safe_envs.envs.simulation import Simulation
 from safe_envs.registry import env_class
 from safe_envs.systems.stochastic_dubins import StochasticDubins

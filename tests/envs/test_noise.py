@@ -6,11 +6,10 @@ import pytest
 from gymnasium.utils import seeding
 
 from safe_envs import ConfigurationError
-from safe_envs.dynamics.normal import standard_normals
-from safe_envs.dynamics.philox import NOISE, StreamReader, key_of
+from safe_envs.dynamics.noise import NOISE, StreamReader, key_of, standard_normals
 from safe_envs.envs.noise import NoiseStream, NoiseStreams
-from safe_envs.envs.seeding import EpisodeStreams
 from safe_envs.envs.simulation import Simulation
+from safe_envs.envs.starts import EpisodeStreams
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 import safe_envs
 from safe_envs import ConfigurationError, ControlAffineSDE, SafeEnv, SafetyFilter, SafeVectorEnv
 from safe_envs.agents import make_sb3_env
-from safe_envs.envs.system_env import SystemEnv, SystemVectorEnv
+from safe_envs.envs.registered import SystemEnv, SystemVectorEnv
 from safe_envs.registry import env_class, make_problem
 from safe_envs.systems import CUSTOM_ID
 from safe_envs.wrappers import (

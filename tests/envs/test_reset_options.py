@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError, InvalidInputError
-from safe_envs.compiled.program import Program
+from safe_envs.engine.program import Program
 from tests.envs.test_vector_env import assert_same
 
 DUBINS, QUADROTOR, SCALAR = (

@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 from scipy.stats import binomtest, chi2, kstest
 
 from safe_envs import SafeEnv, SafeVectorEnv
-from safe_envs.dynamics.philox import NOISE, SENSOR, StreamReader, key_of
+from safe_envs.dynamics.noise import NOISE, SENSOR, StreamReader, key_of
 from safe_envs.envs.array_batch import ArrayBatch
 from safe_envs.errors import NotCompilableError
 from safe_envs.problem.measurement import Channel, Measurement

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.program import Program
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
 from safe_envs.envs.simulation import Simulation
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.world_source import noise_channels, world_source
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.starts import Start
 from tests.conftest import problem_of
 from tests.envs import world_kernels
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.compiled.draws import draw_start, store_row
-from safe_envs.compiled.slots import (
+from safe_envs.engine.draws import draw_start, store_row
+from safe_envs.engine.slots import (
     State,
     advance,
     barriers_of,

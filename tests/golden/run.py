@@ -36,8 +36,8 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from cases import SYSTEMS, cases  # noqa: E402
 from environments import rows  # noqa: E402
 
+from safe_envs.files import VARIABLE  # noqa: E402
 from safe_envs.scripts.cli import main as safe_envs_main  # noqa: E402
-from safe_envs.user_cache import VARIABLE  # noqa: E402
 from thesis.__main__ import main as thesis_main  # noqa: E402
 
 ROWS = Path(__file__).parent / "rows"

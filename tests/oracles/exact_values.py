@@ -9,9 +9,8 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.expression_program import ExpressionProgram
-from safe_envs.dynamics.first_order_forms import Form, variables
-from safe_envs.dynamics.form_functions import FormOperations
+from safe_envs.enclosures.expression_program import ExpressionProgram
+from safe_envs.enclosures.forms import Form, FormOperations, variables
 
 DIGITS = 60
 X, Y = sp.symbols("x y", real=True)

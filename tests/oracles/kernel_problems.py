@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safe_envs.wrappers.qp.dispatch import project_arrays
+from safe_envs.engine.qp.dispatch import project_arrays
 
 KINDS = [
     "plain",

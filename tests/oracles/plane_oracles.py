@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from safe_envs.wrappers.qp import plane
-from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
+from safe_envs.engine.qp import plane
+from safe_envs.engine.qp.dispatch import project_arrays, project_floats
 
 EPS = float(np.finfo(float).eps)
 LOW, HIGH = [-1.0, -1.0], [1.0, 1.5]

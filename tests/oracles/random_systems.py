@@ -13,10 +13,10 @@ from scipy import stats
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.starts import Start
+from safe_envs.proofs.posterior import guarantee_of
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.guarantee import guarantee_of
 
 _DT, _HORIZON = 2e-3, 1.0
 _CANDIDATES, _CORNERS = 512, 4

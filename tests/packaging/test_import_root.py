@@ -77,7 +77,7 @@ import safe_envs.wrappers, safe_envs.agents.evaluation.statistics, safe_envs.scr
 assert SafetyFilterWrapper is safe_envs.wrappers.SafetyFilterWrapper
 assert CBF is of_submodule is safe_envs.wrappers.CBF
 assert wrappers is safe_envs.wrappers
-assert wrappers.conditions is safe_envs.wrappers.conditions
+assert wrappers.conditions is safe_envs.filters.conditions
 assert agents.evaluation.statistics is safe_envs.agents.evaluation.statistics
 assert scripts.cli is safe_envs.scripts.cli
 assert pickle.loads(pickle.dumps(CBF(2.0))) == CBF(2.0)

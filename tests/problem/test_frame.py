@@ -13,7 +13,7 @@ from safe_envs import ControlAffineSDE, SystemDefinitionError, state_problem
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.signals import Variable
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.values.reduction import reduced
 
 x, y, p, u, r, k, q, s_1, s_2 = sp.symbols("x y p u r k q s_1 s_2", real=True)
 TURNING = Frame((Variable(r, 0.0, 2.0, "m"),), (sp.sqrt(x**2 + y**2),), (r, sp.Integer(0)))

@@ -16,8 +16,8 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.builder import state_problem
 from safe_envs.problem.measurement import Channel, Measurement, default_measurement
 from safe_envs.problem.signals import TIME, Feature
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.values.reduction import reduced
+from safe_envs.values.tables import ValueSettings
 from tests.conftest import problem_of
 from tests.scripts.own_system import SYSTEM
 

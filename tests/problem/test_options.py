@@ -8,8 +8,7 @@ from typing import get_type_hints
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.sweeps.cell import ENV_OPTIONS
-from safe_envs.agents.sweeps.settings import sections
+from safe_envs.agents.sweeps.spec import ENV_OPTIONS, sections
 from safe_envs.problem.options import (
     OPTION_NAMES,
     PARAMETER_GROUPS,

@@ -8,13 +8,13 @@ import pytest
 import sympy as sp
 
 from safe_envs import ControlAffineSDE, SafeEnv, SafeVectorEnv
-from safe_envs.compiled.program import Program
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.engine.program import Program
 from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError
-from safe_envs.problem.barrier import Barrier
+from safe_envs.filters.conditions import parse_conditions
 from safe_envs.problem.builder import state_problem
+from safe_envs.problem.problem import Barrier
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper
-from safe_envs.wrappers.conditions import parse_conditions
 from tests.conftest import problem_of
 from tests.envs.test_vector_env import assert_same
 

@@ -10,8 +10,8 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import SystemDefinitionError
-from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
+from safe_envs.problem.starts import SamplingDomain
 from safe_envs.registry import make_problem
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")

@@ -10,8 +10,7 @@ from unittest import mock
 import numpy as np
 import pygame
 
-from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.fonts import cut, text_surface
+from safe_envs.rendering.canvas import Canvas, cut, text_surface
 from safe_envs.rendering.scenes import road
 from safe_envs.rendering.style import PAPER
 from tests.readable import Written

@@ -7,15 +7,15 @@ import pytest
 import sympy as sp
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, SafetyProblem
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Feature, Variable
+from safe_envs.problem.starts import Start
 from safe_envs.rendering import style
 from tests.conftest import problem_of
 from tests.rendering.drawn import SCENE, shown, stepped
 
 
 def test_the_disk_is_to_scale():
-    from safe_envs.rendering.frame import Picture
+    from safe_envs.rendering.viewer import Picture
 
     for radius in (1.0, 2.5):
         env = SafeEnv(

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from safe_envs.agents.evaluation import yardstick
-from safe_envs.wrappers.value import table_cache
-from safe_envs.wrappers.value.table_files import load_table, save_table
+from safe_envs.values import solve
+from safe_envs.values.tables import load_table, save_table
 from tests.agents.policies.coarse import COARSE
 from tests.scripts.conftest import strictly
 from tests.scripts.figures.svg_texts import svg_texts
@@ -26,7 +26,7 @@ def own_cache(monkeypatch, tmp_path):
     """An empty folder for tables, so that a test sees its own only."""
     folder = tmp_path / "cache"
     folder.mkdir()
-    monkeypatch.setattr(table_cache, "cache_folder", lambda name: folder)
+    monkeypatch.setattr(solve, "cache_folder", lambda name: folder)
     monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
 
 

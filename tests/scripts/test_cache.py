@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.user_cache import CONTENTS, VARIABLE, cache_folder, entries
+from safe_envs.files import CONTENTS, VARIABLE, cache_folder, entries
 from tests.scripts.conftest import strictly
 
 

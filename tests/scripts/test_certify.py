@@ -8,7 +8,7 @@ from decimal import Decimal
 
 import pytest
 
-from safe_envs.wrappers.certificates.files import load_certificate
+from safe_envs.filters.certificates.files import load_certificate
 from tests.scripts.conftest import strictly
 
 SCALAR = ("safe_envs/Scalar-v0", "--degree", 6, "--rate", 0, "--horizon", 0.5)

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from safe_envs.wrappers.certificates.files import save_certificate
+from safe_envs.filters.certificates.files import save_certificate
 from tests.scripts.conftest import strictly
 from tests.wrappers.certificates.examples import FALSE, TRUE, brownian, disk
 

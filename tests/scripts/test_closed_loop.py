@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from safe_envs.wrappers.value import closed_loop
+from safe_envs.values import closed_loop
 
 SCALAR = ("Scalar-v0", "--horizon", 0.1, "--noise", 1, "--start", 0.5)
 

@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 
 import safe_envs
-from safe_envs.scripts.reports import env_speeds, installation
+from safe_envs.scripts.reports import installation
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.scripts.conftest import strictly
 
@@ -152,7 +152,7 @@ def test_a_folder_on_the_path_is_named(monkeypatch):
 
 
 def test_speeds_are_of_single_envs(monkeypatch):
-    monkeypatch.setattr(env_speeds, "NUM_ENVS", 8)
+    monkeypatch.setattr(installation, "NUM_ENVS", 8)
     found = installation.speeds()
     assert len(found) == 4
     assert all(steps > 0 for steps in found.values())

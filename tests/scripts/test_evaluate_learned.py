@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.agents.evaluation.bound_text import bound_text
+from safe_envs.agents.evaluation.table import bound_text
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.wrappers.export.c_compiler import c_compiler
+from safe_envs.export.comparison import c_compiler
 from tests.scripts.conftest import strictly
 
 NEEDS_COMPILER = pytest.mark.skipif(c_compiler() is None, reason="there is no C compiler")

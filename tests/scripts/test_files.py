@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.atomic_io import require_writable, write_atomically
+from safe_envs.files import require_writable, write_atomically
 
 
 def test_a_file_is_written_and_replaced(tmp_path):

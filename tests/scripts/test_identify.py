@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.agents.jobs.store import package_versions
+from safe_envs.filters.learning import METHODS, learner_of, load_learned
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.data import Transitions
 from safe_envs.registry import make_problem
 from safe_envs.scripts.options.method_settings import SETTINGS, read_settings, settings_of
-from safe_envs.scripts.reports.identify_answer import DataFile, Function, unit_of
-from safe_envs.scripts.reports.quantities import relative_text
-from safe_envs.wrappers.learning import METHODS, learner_of, load_learned
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.scripts.reports.identify import DataFile, Function, unit_of
+from safe_envs.scripts.reports.tables import relative_text
 from tests.scripts.conftest import strictly
 from tests.scripts.figures.svg_texts import svg_texts
 from tests.scripts.own_system import SYSTEM

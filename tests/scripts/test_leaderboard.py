@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_envs.scripts.reports.leaderboard_page import BEGIN, END
+from safe_envs.scripts.reports.leaderboard import BEGIN, END
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_envs.wrappers.learning.data.files import load
+from safe_envs.filters.learning.data import load
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 

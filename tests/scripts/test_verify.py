@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from safe_envs.agents.evaluation import bound_check
-from safe_envs.wrappers.verification import proof
-from safe_envs.wrappers.verification.judge import Supremum
+from safe_envs.agents.evaluation import safety_chain
+from safe_envs.proofs import guarantees
+from safe_envs.proofs.judge import Supremum
 from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
@@ -23,9 +23,9 @@ CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 @pytest.fixture
 def verify(monkeypatch, safe_envs_command):
     """Runs `safe-envs verify` over the shorter horizons, from fewer starts."""
-    monkeypatch.setattr(bound_check, "_LONG_MULTIPLES", ())
-    monkeypatch.setattr(bound_check, "STARTS", 512)
-    monkeypatch.setattr("safe_envs.wrappers.verification.feasibility.verify", verify_once)
+    monkeypatch.setattr(safety_chain, "_LONG_MULTIPLES", ())
+    monkeypatch.setattr(safety_chain, "STARTS", 512)
+    monkeypatch.setattr("safe_envs.proofs.feasibility.verify", verify_once)
     return lambda *arguments: safe_envs_command("verify", *arguments)
 
 
@@ -222,7 +222,7 @@ from dataclasses import replace
 
 import sympy as sp
 
-from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Barrier
 from safe_envs.registry import make_problem
 
 
@@ -256,7 +256,7 @@ def test_what_a_search_misses_is_not_printed_as_a_fact(verify, safe_envs_command
 
 def test_what_only_a_search_knows_says_so(verify, monkeypatch):
     undecided = Supremum(math.inf, -math.inf, None, 0, "not looked at")
-    monkeypatch.setattr(proof, "supremum", lambda *_: undecided)
+    monkeypatch.setattr(guarantees, "supremum", lambda *_: undecided)
     asked = (CUBIC_DISK, "--horizon", 0.7, "--no-simulate", "--json", "o.js")
     status, out, _ = verify(*asked)
     assert status == 0

@@ -14,9 +14,9 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.backup import backup_of
+from safe_envs.proofs.backup_sets import with_terminal_sets
 from safe_envs.registry import make_problem
-from safe_envs.systems._turning import circle_radius
-from safe_envs.wrappers.backup_sets.terminal_set import with_terminal_sets
+from safe_envs.systems.backup_laws import circle_radius
 
 RNG = np.random.default_rng(0)
 

@@ -10,9 +10,9 @@ import sympy as sp
 
 from safe_envs.dynamics.lie import generator, lie_derivative_f
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
+from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.testing.condition import check_condition
 from safe_envs.wrappers import AffineConstraint, Condition
-from safe_envs.wrappers.safety_filter import SafetyFilter
 from tests.conftest import problem_of
 
 

@@ -9,8 +9,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, state_problem
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Feature
+from safe_envs.problem.starts import Start
 from safe_envs.testing.system import check_system
 from tests.conftest import problem_of
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.generator import GeneratorModel, LearnedGenerator
-from safe_envs.wrappers.learning.models.residual import LearnedResidual, ResidualModel
+from safe_envs.filters.learning.bayesian import identify
+from safe_envs.filters.learning.data import Signature
+from safe_envs.filters.learning.generator import learn_generator
+from safe_envs.filters.learning.models.generator import GeneratorModel, LearnedGenerator
+from safe_envs.filters.learning.models.residual import LearnedResidual, ResidualModel
 from tests.conftest import problem_of
 from tests.wrappers.learned import NO_RECORD, some_network
 

@@ -11,12 +11,12 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function, filled, stacked
 from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
-from safe_envs.wrappers.learning.data.collection import draw_states
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.models.base import Record
-from safe_envs.wrappers.learning.models.generator import GeneratorModel
-from safe_envs.wrappers.learning.models.network import Network
-from safe_envs.wrappers.learning.models.residual import ResidualModel
+from safe_envs.filters.learning.collection import draw_states
+from safe_envs.filters.learning.data import Signature
+from safe_envs.filters.learning.models.base import Record
+from safe_envs.filters.learning.models.generator import GeneratorModel
+from safe_envs.filters.learning.models.network import Network
+from safe_envs.filters.learning.models.residual import ResidualModel
 
 NO_RECORD = Record(0, 0.0, 0.0)
 

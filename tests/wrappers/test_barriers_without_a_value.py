@@ -23,17 +23,17 @@ from safe_envs import (
 )
 from safe_envs.agents import evaluate
 from safe_envs.agents.rare_events.estimate import estimate_rare
+from safe_envs.filters.decision_log import DecisionLog
+from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.problem.named_sets import NamedSets
+from safe_envs.proofs.feasibility import verify
+from safe_envs.values.look_ahead import draw_starts
 from safe_envs.wrappers import (
     SafetyFilter,
     SafetyFilterVectorWrapper,
     SafetyFilterWrapper,
     parse_conditions,
 )
-from safe_envs.wrappers.decision_log import DecisionLog
-from safe_envs.wrappers.torch_layer import TorchFilter
-from safe_envs.wrappers.value.starts import draw_starts
-from safe_envs.wrappers.verification.feasibility import verify
 
 p, v, a = sp.symbols("p v a", real=True)
 LOST, KEPT, EDGE = [1.3, 0.2], [-1.0, 0.3], [1.0, 0.4]

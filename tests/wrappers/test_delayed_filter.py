@@ -12,11 +12,11 @@ import sympy as sp
 from safe_envs import ControlAffineSDE
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
-from safe_envs.problem.barrier import Barrier
+from safe_envs.filters.conditions import HOCBF
+from safe_envs.filters.delayed_filter import Prediction
+from safe_envs.problem.problem import Barrier
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import DelayedFilter, SafetyFilter
-from safe_envs.wrappers.conditions import HOCBF
-from safe_envs.wrappers.prediction import Prediction
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 DT = 0.1

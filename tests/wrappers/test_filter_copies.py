@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from safe_envs.agents.policies.registry import make_policy
-from safe_envs.wrappers.conditions.registry import LEARNED
-from safe_envs.wrappers.safety_filter import SafetyFilter
-from safe_envs.wrappers.torch_layer import TorchFilter
+from safe_envs.filters.conditions.registry import LEARNED
+from safe_envs.filters.safety_filter import SafetyFilter
+from safe_envs.filters.torch_layer import TorchFilter
 from tests.conftest import problem_of
 
 COPIES = {"pickle": lambda given: pickle.loads(pickle.dumps(given)), "deepcopy": copy.deepcopy}

@@ -21,7 +21,7 @@ from safe_envs import (
     SystemDefinitionError,
 )
 from safe_envs.agents import evaluate
-from safe_envs.agents.policies.clf import CLFController
+from safe_envs.agents.policies.nominal import CLFController
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.wrappers import CBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF, SafetyFilter, parse_conditions

@@ -9,11 +9,11 @@ from scipy import stats
 
 from safe_envs import ControlAffineSDE, SafeVectorEnv
 from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError
+from safe_envs.filters.estimation import ExtendedKalmanFilter, InitialBelief
 from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.problem.signals import TIME
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper
-from safe_envs.wrappers.estimation import ExtendedKalmanFilter, InitialBelief
 
 
 def measured(env="StochasticDubins-v0", text="scbf", **options):

@@ -13,8 +13,9 @@ import torch
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError
 from safe_envs.agents import make_problem
+from safe_envs.filters import torch_layer
+from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
-from safe_envs.wrappers.torch_layer import TorchFilter, layer
 from tests.wrappers.value.guesses import guess
 
 pytestmark = pytest.mark.slow
@@ -183,7 +184,7 @@ def test_contradicting_rows_on_many_inputs_have_a_finite_slope():
 @pytest.mark.slow
 def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for(monkeypatch):
     # No formula is exact to the last bit: so some are said not to agree.
-    monkeypatch.setattr(layer, "_AGREED", 0.0)
+    monkeypatch.setattr(torch_layer, "_AGREED", 0.0)
     module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
     x, u = (torch.tensor(rng.normal(size=(150, size))) for size in (2, 4))

@@ -16,14 +16,12 @@ from safe_envs import ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
-from safe_envs.scripts.figures.labels import quantity, unit_text
-from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend
-from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.fit import AdamSettings, train
-from safe_envs.wrappers.learning.models.base import Record
-from safe_envs.wrappers.learning.models.residual import LearnedResidual
-from safe_envs.wrappers.learning.residual import ResidualModel
+from safe_envs.filters.learning.collection import collect_paths, draw_states
+from safe_envs.filters.learning.data import Signature
+from safe_envs.filters.learning.models.base import Record
+from safe_envs.filters.learning.models.residual import LearnedResidual, ResidualModel
+from safe_envs.filters.learning.residual import AdamSettings, train
+from safe_envs.scripts.figures.style import COLORS, QUIET, UNSAFE, add_legend, quantity, unit_text
 from thesis.artefact import Claim, Number, Outcome, Sample, settings, texts
 from thesis.chapter_3 import learning
 from thesis.chapter_3.learning import Trajectory, runs

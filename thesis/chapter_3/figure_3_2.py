@@ -13,8 +13,15 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.labels import labelled, quantity
-from safe_envs.scripts.figures.style import COLORS, HALO, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import (
+    COLORS,
+    HALO,
+    QUIET,
+    UNSAFE,
+    add_legend,
+    labelled,
+    quantity,
+)
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
 from thesis.chapter_3 import learning
 from thesis.chapter_3.learning import Trajectories, Trajectory

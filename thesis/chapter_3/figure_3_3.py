@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import QUIET, add_legend
+from safe_envs.scripts.figures.style import QUIET, add_legend, labelled
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot
 from safe_envs.wrappers import AffineConstraint
 from thesis.artefact import Claim, Number, Outcome, Sample, settings

@@ -10,9 +10,10 @@ import numpy as np
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import evaluate, make_problem
+from safe_envs.filters.learning.models.residual import ResidualModel
+from safe_envs.filters.learning.residual import learn_residual
 from safe_envs.scripts.figures.style import COLORS
 from safe_envs.wrappers import Condition
-from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual
 from thesis.artefact import Number, Sample, settings
 from thesis.rates import measure
 

@@ -14,11 +14,10 @@ from scipy.special import ndtr
 
 from safe_envs import ControlAffineSDE, SafetyFilter, SafetyProblem, state_problem
 from safe_envs.agents import make_problem, rate_interval
-from safe_envs.agents.evaluation.rollout import episode_seed
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import COLORS, add_legend
+from safe_envs.agents.evaluation.episodes import episode_seed
+from safe_envs.proofs.guarantees import proposition_4_2_8
+from safe_envs.scripts.figures.style import COLORS, add_legend, labelled
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.bounds import proposition_4_2_8
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
 from thesis.drawing import draw_interval
 from thesis.rates import MeasuredFilter, measure

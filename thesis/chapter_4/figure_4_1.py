@@ -14,9 +14,8 @@ from matplotlib.figure import Figure
 
 from safe_envs import SafetyFilter, SafeVectorEnv
 from safe_envs.agents import NominalController
-from safe_envs.agents.evaluation.rollout import episode_seed
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
+from safe_envs.agents.evaluation.episodes import episode_seed
+from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend, labelled
 from safe_envs.wrappers import SafetyFilterVectorWrapper, parse_conditions
 from thesis.artefact import Claim, Number, Outcome, Sample
 from thesis.chapter_4 import cruise

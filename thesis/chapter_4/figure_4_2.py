@@ -8,8 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import add_legend
+from safe_envs.scripts.figures.style import add_legend, labelled
 from thesis.artefact import Claim, Number, Outcome, Sample
 from thesis.chapter_4 import dubins
 from thesis.chapter_4.dubins import ALPHAS, DUBINS, FILTERS, HORIZON, STARTS, ByFilter

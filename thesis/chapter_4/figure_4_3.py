@@ -10,12 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from safe_envs import SafeVectorEnv
-from safe_envs.agents.evaluation.rollout import episode_seed
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import add_legend
+from safe_envs.agents.evaluation.episodes import episode_seed
+from safe_envs.proofs.guarantees import theorem_4_2_10_printed, union_bound
+from safe_envs.proofs.safe_set import Formulas
+from safe_envs.scripts.figures.style import add_legend, labelled
 from safe_envs.wrappers import SCBF
-from safe_envs.wrappers.verification.bounds import theorem_4_2_10_printed, union_bound
-from safe_envs.wrappers.verification.formulas import Formulas
 from thesis.artefact import Claim, Outcome, Sample
 from thesis.chapter_4 import dubins
 from thesis.chapter_4.dubins import ALPHAS, DUBINS, FILTERS, HORIZON, STARTS, ByFilter, Violations

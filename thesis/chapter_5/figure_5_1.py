@@ -14,9 +14,8 @@ from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient, ito_correction
-from safe_envs.scripts.figures.labels import labelled, quantity
-from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend
-from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.filters.learning.collection import draw_states
+from safe_envs.scripts.figures.style import COLORS, QUIET, add_legend, labelled, quantity
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
 from thesis.chapter_5 import noise
 from thesis.chapter_5.noise import LEARNING, Identification

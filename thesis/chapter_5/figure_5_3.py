@@ -13,8 +13,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.scripts.figures.labels import mathematics
-from safe_envs.scripts.figures.style import COLORS, UNSAFE, add_legend
+from safe_envs.scripts.figures.style import COLORS, UNSAFE, add_legend, mathematics
 from thesis.artefact import Claim, Outcome, Sample, settings
 from thesis.chapter_5 import noise
 from thesis.chapter_5.noise import LEARNING

@@ -13,9 +13,10 @@ import numpy as np
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.estimators import Estimator, ito_part, rates
-from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.drift_checks import Estimator, ito_part, rates
+from safe_envs.filters.learning.generator import learn_generator
+from safe_envs.filters.learning.models.generator import GeneratorModel
 from thesis.artefact import Claim, Sample, settings
 from thesis.rates import PRINTED_EPISODES, MeasuredFilter, difference, measure
 

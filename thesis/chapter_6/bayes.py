@@ -15,13 +15,12 @@ from scipy.special import stdtrit
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import rate_interval
+from safe_envs.filters.learning.bayesian import IdentifiabilityWarning, identify
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.data import Transitions
+from safe_envs.filters.learning.models.posterior import Posterior
 from safe_envs.scripts.figures.style import COLORS
 from safe_envs.wrappers import AffineConstraint
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning
-from safe_envs.wrappers.learning.models.posterior import Posterior
 from thesis.artefact import Claim, Number, Sample, settings
 from thesis.rates import (
     PRINTED_EPISODES,

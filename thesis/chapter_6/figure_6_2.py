@@ -10,11 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import COLORS, add_legend
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.estimators import rates
-from safe_envs.wrappers.learning.models.distributions import sigma_samples
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.drift_checks import rates
+from safe_envs.filters.learning.models.distributions import sigma_samples
+from safe_envs.scripts.figures.style import COLORS, add_legend, labelled
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
 from thesis.chapter_6 import bayes
 from thesis.chapter_6.bayes import SETTINGS

@@ -9,9 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import add_legend
-from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.filters.learning.collection import draw_states
+from safe_envs.scripts.figures.style import add_legend, labelled
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
 from thesis.chapter_6 import bayes
 from thesis.chapter_6.bayes import MOST

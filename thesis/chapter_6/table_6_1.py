@@ -14,12 +14,11 @@ from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.labels import labelled
-from safe_envs.scripts.figures.style import add_legend
-from safe_envs.wrappers.learning.data.collection import collect, draw_states
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.learning.regression import Rows, posterior
+from safe_envs.filters.learning.bayesian import Rows, posterior
+from safe_envs.filters.learning.collection import collect, draw_states
+from safe_envs.filters.learning.data import Transitions
+from safe_envs.filters.learning.models.posterior import Posterior
+from safe_envs.scripts.figures.style import add_legend, labelled
 from thesis.artefact import Claim, Number, Outcome, Sample, settings, texts
 from thesis.chapter_6 import bayes
 from thesis.chapter_6.bayes import SETTINGS

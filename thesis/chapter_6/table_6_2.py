@@ -10,12 +10,12 @@ import sympy as sp
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.agents.evaluation.contradiction import by_rate
+from safe_envs.agents.evaluation.bounds import by_rate
+from safe_envs.filters.learning.generator import learn_generator
+from safe_envs.filters.learning.models.posterior import Posterior
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.guarantees import proposition_4_2_8, shortfall_repaired
 from safe_envs.wrappers import SCBF
-from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.verification.bounds import proposition_4_2_8, shortfall_repaired
-from safe_envs.wrappers.verification.feasibility import verify
 from thesis.artefact import Claim, Number, Outcome, Sample, settings, texts
 from thesis.chapter_6 import bayes
 from thesis.chapter_6.bayes import FEWEST, MOST

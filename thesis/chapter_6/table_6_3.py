@@ -12,7 +12,8 @@ import sympy as sp
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
+from safe_envs.filters.learning.generator import learn_generator
+from safe_envs.filters.learning.models.generator import GeneratorModel
 from thesis.artefact import Claim, Number, Outcome, Sample, settings, texts
 from thesis.chapter_6 import bayes
 from thesis.chapter_6.bayes import FEWEST, MOST

@@ -10,8 +10,7 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.dynamics.lie import quadratic_variation_rate, vanishes
-from safe_envs.dynamics.normal import standard_exponentials
-from safe_envs.dynamics.philox import BRIDGE, EpisodeUniforms
+from safe_envs.dynamics.noise import BRIDGE, EpisodeUniforms, standard_exponentials
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 

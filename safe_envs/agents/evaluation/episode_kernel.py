@@ -13,13 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.compiled.draws import (
-    draw_start,
-    episode_key,
-    fill_uniforms,
-)
-from safe_envs.compiled.normal_runs import fill_normal_run
-from safe_envs.compiled.slots import (
+from safe_envs.dynamics.noise import BRIDGE, NOISE
+from safe_envs.dynamics.normal_kernel import standard_exponential
+from safe_envs.engine.draws import draw_start, episode_key, fill_normal_run, fill_uniforms
+from safe_envs.engine.slots import (
     Input,
     State,
     act,
@@ -36,8 +33,6 @@ from safe_envs.compiled.slots import (
     reward_of,
     smallest_barrier,
 )
-from safe_envs.dynamics.normal_kernel import standard_exponential
-from safe_envs.dynamics.philox import BRIDGE, NOISE
 
 FIRST_STATE = 0
 DEEPEST_STATE = 1

@@ -6,12 +6,55 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from safe_envs.agents.evaluation.kept_episodes import EpisodeSink
 from safe_envs.agents.evaluation.rows import EpisodeResults
-from safe_envs.atomic_io import replaced_at_the_end, require_writable, writing
 from safe_envs.errors import ConfigurationError, install_extra
+from safe_envs.files import replaced_at_the_end, require_writable, writing
+
+
+class EpisodeSink(Protocol):
+    """Receives the results of all episodes in the order of filters, identifications, episodes."""
+
+    def begin(self, name: str, repeat: int) -> None:
+        """Go on with the episodes of another filter or identification.
+
+        Args:
+            name: of the filter.
+            repeat: number of the identification.
+        """
+
+    def add(self, results: EpisodeResults) -> None:
+        """Receive the episodes that follow."""
+
+
+class KeptEpisodes(EpisodeSink):
+    """Keeps the results in memory."""
+
+    def __init__(self) -> None:
+        self._parts: dict[tuple[str, int], list[EpisodeResults]] = {}
+        self._current: list[EpisodeResults] = []
+
+    def begin(self, name: str, repeat: int) -> None:
+        """See `EpisodeSink`.
+
+        Args:
+            name: of the filter.
+            repeat: number of the identification.
+        """
+        self._current = self._parts[name, repeat] = []
+
+    def add(self, results: EpisodeResults) -> None:
+        """See `EpisodeSink`."""
+        self._current.append(results)
+
+    def joined(self) -> dict[str, list[EpisodeResults]]:
+        """Return the results for each filter and identification."""
+        found: dict[str, list[EpisodeResults]] = {}
+        for (name, _), parts in self._parts.items():
+            found.setdefault(name, []).append(EpisodeResults.joined(parts))
+        return found
+
 
 _GROUP = 65_536
 """Rows that are written at a time, so that the file does not depend on the size of batches."""

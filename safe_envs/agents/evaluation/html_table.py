@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 
-from safe_envs.agents.evaluation.bound_marks import marks_in
-from safe_envs.agents.evaluation.evaluation_data import EvaluationData
-from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
-from safe_envs.agents.evaluation.evaluation_table import (
+from safe_envs.agents.evaluation.notes import evaluation_notes
+from safe_envs.agents.evaluation.results import EvaluationData
+from safe_envs.agents.evaluation.table import (
     compared,
     describe,
     evaluation_table,
     interval_name,
+    marks_in,
+    setting_lines,
 )
-from safe_envs.agents.evaluation.setting_text import setting_lines
-from safe_envs.text_lines import visible
-from safe_envs.text_tables import Column
+from safe_envs.text import Column, visible
 
 _WIDTH = 80
 """Of a table, in characters: about what the column of a page holds."""

@@ -7,19 +7,18 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import replace
 
-from safe_envs.agents.evaluation.bound_marks import marks_in
-from safe_envs.agents.evaluation.evaluation_data import EvaluationData
-from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
-from safe_envs.agents.evaluation.evaluation_table import (
+from safe_envs.agents.evaluation.notes import evaluation_notes
+from safe_envs.agents.evaluation.results import EvaluationData
+from safe_envs.agents.evaluation.statistics import points_in
+from safe_envs.agents.evaluation.table import (
     compared,
     evaluation_table,
     interval_name,
+    marks_in,
     p_text,
+    setting_lines,
 )
-from safe_envs.agents.evaluation.rate_text import points_in
-from safe_envs.agents.evaluation.setting_text import setting_lines
-from safe_envs.text_lines import folded, visible
-from safe_envs.text_tables import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of
+from safe_envs.text import SOFT_HYPHEN, Column, FittedTable, arranged, columns_of, folded, visible
 
 _WIDTH = 80
 _NAMES = 0.38

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.agents.evaluation.rollout import acted
+from safe_envs.agents.evaluation.episodes import acted
+from safe_envs.agents.evaluation.resolve import Env
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.agents.evaluation.targets import Env
-from safe_envs.agents.jobs import blas_threads
+from safe_envs.agents.jobs import job
 from safe_envs.agents.policies.base import Policy
-from safe_envs.dynamics.philox import episode_seeds
+from safe_envs.dynamics.noise import episode_seeds
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.wrappers import SpecificationMonitorVector
-from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
+from safe_envs.wrappers.safety_filter import readable
+from safe_envs.wrappers.specification import SpecificationMonitorVector
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def measure_satisfaction(
     for first in range(0, episodes, size):
         rows = range(first, first + size)
         alive = np.arange(first, first + size) < episodes
-        with blas_threads.limited():
+        with job.limited():
             if isinstance(policy, Policy):
                 policy.begin(rows, seed)
             observation, _ = monitor.reset(seed=episode_seeds(seed, rows))

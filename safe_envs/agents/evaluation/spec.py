@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,76 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
 from safe_envs.agents.evaluation.episodes_file import require_parquet
-from safe_envs.agents.evaluation.estimation_options import require_estimation
 from safe_envs.agents.evaluation.statistics import require_confidence
-from safe_envs.compiled.engine import require_engine
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.engine.choice import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
+from safe_envs.filters.conditions.base import Condition, parts_of
+from safe_envs.filters.conditions.names import AT_STATE, unfiltered_in_sum
+from safe_envs.filters.conditions.text import (
+    learned_parts,
+    parse_conditions,
+    require_known,
+    require_readable,
+    spec_of,
+)
+from safe_envs.filters.estimation.names import settings_of
+from safe_envs.filters.learning.models.base import LearnedModel
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import Condition, FilterSpec, spec_of
-from safe_envs.wrappers.conditions.names import AT_STATE
-from safe_envs.wrappers.learning import LearnedModel
+from safe_envs.wrappers import filter_layers
+from safe_envs.wrappers.external_env import FilterSpec
+
+OBSERVATIONS = ("estimate", "measurement")
+"""What policies may see of a measured env."""
+
+
+def require_estimation(estimator: Any, belief: Any, observe: Any) -> None:
+    """Raise ConfigurationError for options that are out of range.
+
+    Args:
+        estimator: text of an estimator; None for none.
+        belief: probability.
+        observe: what policies see.
+    """
+    if estimator is not None:
+        if not isinstance(estimator, str):
+            raise ConfigurationError(
+                f"estimator = {shown(estimator)}; give kf, ekf or ukf, with settings"
+            )
+        settings_of(estimator)
+    is_number = isinstance(belief, int | float) and not isinstance(belief, bool)
+    if not (is_number and 0.0 < belief < 1.0):
+        raise ConfigurationError(
+            f"belief = {shown(belief)}; give a probability above 0 and below 1"
+        )
+    if observe not in OBSERVATIONS:
+        raise ConfigurationError(f"observe = {shown(observe)}; {nearest(observe, OBSERVATIONS)}")
+    if observe != "estimate" and estimator is None:
+        raise ConfigurationError(
+            f"observe = {shown(observe)} goes with an estimator; give one, like 'ekf', or leave it"
+            " out"
+        )
+
+
+def describe_sensor(problem: Any, spec: Any) -> dict[str, Any]:
+    """Return the sensor and the estimator of an evaluation as JSON-able data; {} without a sensor.
+
+    Args:
+        problem: a `SafetyProblem`.
+        spec: an `EvaluationSpec`.
+    """
+    measured = problem.measurement
+    if measured is None:
+        return {}
+    channels = [
+        {**vars(channel), "expression": str(channel.expression)} for channel in measured.channels
+    ]
+    return {
+        "measurement": {"channels": channels, "delay": measured.delay},
+        "estimator": spec.estimator,
+        **({} if spec.estimator is None else {"belief": spec.belief, "observe": spec.observe}),
+    }
+
 
 UNFILTERED = "none"
 """Name of the row without any filter."""
@@ -72,7 +134,7 @@ class EvaluationSpec:
         closed_loop: whether to compute certified tables of the closed loops, which bound from below
             how safe each filter is with this policy.
         estimator: of the state of a measured problem: "kf", "ekf" or "ukf", with settings. Then
-            each filter gets several rows; see `safe_envs.agents.evaluation.views`.
+            each filter gets several rows; see `safe_envs.agents.evaluation.resolve`.
         belief: probability of the rows with belief conditions.
         observe: what policies see with an estimator, the problem's features at the "estimate", or
             the "measurement".
@@ -297,3 +359,33 @@ def conditions_in(given: Condition | Sequence[Condition]) -> tuple[Condition, ..
             " condition for each barrier"
         )
     return found
+
+
+def checked_filter(name: str, problem: SafetyProblem, known: ControlAffineSDE) -> str | None:
+    """Return the text of a filter with all parameters; None where it has to be learned first.
+
+    Args:
+        name: of the filter, as it was given.
+        problem: whose barriers it is for.
+        known: the system that it knows.
+
+    Raises:
+        ConfigurationError: It names something unknown.
+        RelativeDegreeError: A condition does not suit a barrier.
+    """
+    if name == UNFILTERED:
+        return UNFILTERED
+    if UNFILTERED in name.split("+"):
+        raise unfiltered_in_sum(name)
+    require_known(name, UNFILTERED)
+    settings = filter_layers.settings_of(name)
+    if settings is not None:
+        return settings.text
+    if learned_parts(name):
+        require_readable(name, problem)
+        return None
+    conditions = parse_conditions(name, problem)
+    # What does not suit a barrier is an error before tables are read, which may take long.
+    for barrier, condition in parts_of(tuple(zip(problem.barriers, conditions, strict=True)))[1]:
+        replace(condition, belief=None, measurement_error=()).constraint(known, barrier)
+    return spec_of(conditions)

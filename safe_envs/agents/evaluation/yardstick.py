@@ -25,19 +25,17 @@ from safe_envs.agents.evaluation.attainable import (
     AttainableSafety,
     attainable_safety,
     contradicted,
-    withheld,
-)
-from safe_envs.agents.evaluation.contradiction import Bounded, above_attainable, without_held
-from safe_envs.agents.evaluation.countings import leaves_safely
-from safe_envs.agents.evaluation.kept_attainable import (
     keep_attainable,
     kept_attainable,
+    leaves_safely,
     place_of,
+    withheld,
 )
+from safe_envs.agents.evaluation.bounds import Bounded, above_attainable, without_held
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.values.tables import ValueSettings
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,44 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 import time
 import traceback
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
-from safe_envs.agents.jobs.threads import one_thread
+from threadpoolctl import ThreadpoolController
+
 from safe_envs.errors import SafeEnvsError
+
+_SIDE_BY_SIDE: ContextVar[bool] = ContextVar("computations run side by side", default=False)
+
+
+def available_threads() -> int:
+    """Return the processors that this process may use; 1 within `one_thread`."""
+    if _SIDE_BY_SIDE.get():
+        return 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let computations take one thread, where others like them run side by side."""
+    token = _SIDE_BY_SIDE.set(True)
+    try:
+        yield
+    finally:
+        _SIDE_BY_SIDE.reset(token)
+
 
 _FRAMES = 3
 """Lines of code with which an unexpected error is reported."""
@@ -74,3 +103,19 @@ def _where(error: Exception) -> str:
         for frame in frames
     ]
     return f" (at {', from '.join(reversed(places))})"
+
+
+_BRING_A_BLAS = ("numpy", "scipy.linalg", "torch")
+
+
+def limited(threads: int = 1) -> AbstractContextManager[Any]:
+    """Limit the number of threads of every BLAS that is loaded by now."""
+    return _controller(tuple(name in sys.modules for name in _BRING_A_BLAS)).limit(
+        limits=threads, user_api="blas"
+    )
+
+
+@lru_cache
+def _controller(loaded: tuple[bool, ...]) -> ThreadpoolController:
+    """Find the libraries of this process once per set, since that outlasts many simulations."""
+    return ThreadpoolController()

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import sympy as sp
 
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source
+from safe_envs.dynamics.codegen import Components, compile_function
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.slots import Data
 from safe_envs.errors import ConfigurationError, InvalidInputError, NotCompilableError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import TIME
 
 BLOCK = 128
 """Observations in a block; see `BlockPolicy`."""
@@ -85,7 +89,7 @@ class Policy(ABC):
     def source(self, data: Data) -> Source:
         """Return the policy as a function of compiled programs.
 
-        It is called `choose`, takes what `act` of `safe_envs.compiled.slots` takes, and returns the
+        It is called `choose`, takes what `act` of `safe_envs.engine.slots` takes, and returns the
         actions that `predict` returns, a tuple; an action without a finite value is NaN.
 
         Args:
@@ -206,3 +210,171 @@ def _difference(trained: gym.Space[Any], wanted: gym.Space[Any]) -> str:
         f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)
     ]
     return f"{theirs}; the env's is {ours}"
+
+
+class ObservedState:
+    """Solves the features of a problem for its states.
+
+    A state is a feature itself; an angle whose cosine and sine are features, if a whole turn
+    changes nothing; or the only unknown of a feature that is linear in it, such as the relative
+    position of an obstacle once the own position is known.
+
+    Args:
+        problem: whose features they are.
+        needed: states that must be read; the others are 0 where the observation does not hold
+            them.
+
+    Raises:
+        ConfigurationError: The observation does not hold one of the states that are needed.
+    """
+
+    def __init__(self, problem: SafetyProblem, needed: Collection[sp.Basic]) -> None:
+        columns = tuple(sp.Dummy(feature.name, real=True) for feature in problem.features)
+        given: list[tuple[Any, Any]] = [
+            (problem.plant.numeric(feature.expression), column)
+            for feature, column in zip(problem.features, columns, strict=True)
+            if not feature.expression.has(TIME)
+        ]
+        found = _solved(problem, given)
+        missing = [str(s) for s in problem.plant.states if s in needed and s not in found]
+        if missing:
+            raise ConfigurationError(
+                f"the observation of {problem.name} does not determine {', '.join(missing)}, which"
+                " the policy best needs; add features: each of these states, or the cosine and the"
+                " sine of an angle"
+            )
+        values = [found.get(s, sp.Integer(0)) for s in problem.plant.states]
+        self._function = compile_function(columns, values, "arrays")
+
+    def __call__(self, observations: np.ndarray) -> Components:
+        """Return the components of the states, n arrays (B,), of observations (B, k)."""
+        values = self._function(*np.ascontiguousarray(observations.T))
+        return tuple(np.broadcast_to(value, len(observations)) for value in values)
+
+
+def _solved(problem: SafetyProblem, given: list[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Return the states that features determine, as expressions of the features' values.
+
+    Args:
+        problem: whose states they are.
+        given: expressions of the states, with the symbols of their values.
+    """
+    found: dict[Any, Any] = {s: value for s, value in given if s.is_Symbol}
+    of = dict(given)
+    for s in problem.plant.states:
+        if s not in found and {sp.cos(s), sp.sin(s)} <= of.keys() and _turns(problem, s):
+            found[s] = sp.atan2(of[sp.sin(s)], of[sp.cos(s)])
+    known = -1
+    while known < len(found):
+        known = len(found)
+        for expression, value in given:
+            unknown = expression.free_symbols & set(problem.plant.states) - found.keys()
+            if len(unknown) != 1:
+                continue
+            (s,) = unknown
+            slope = sp.expand(expression).coeff(s)
+            rest = sp.expand(expression - slope * s)
+            if slope.is_number and not rest.has(s):
+                found[s] = (value - rest.xreplace(found)) / slope
+    return found
+
+
+def _turns(problem: SafetyProblem, angle: sp.Symbol) -> bool:
+    """Return whether a whole turn of an angle changes neither the motion nor what is safe."""
+    plant = problem.plant
+    parts = [
+        *plant.drift,
+        *plant.input_matrix,
+        *plant.diffusion,
+        *(barrier.expression for barrier in problem.barriers),
+        problem.outside,
+        sp.Integer(0) if problem.goal is None else problem.goal,
+    ]
+    return all(sp.expand(e - e.subs(angle, angle + 2 * sp.pi)) == 0 for e in parts)
+
+
+def rows_of(observation: Any, space: gym.Space[Any]) -> tuple[Any, int, bool]:
+    """Return observations with the batch in front.
+
+    Args:
+        observation: one, or a batch of them.
+        space: of one.
+
+    Returns:
+        The batch, each array of the type of its space; its size; and whether a batch was given.
+
+    Raises:
+        InvalidInputError: The observation is of another space.
+    """
+    try:
+        typed = _typed(observation, space)
+        sizes = {_batch(array, of_space) for array, of_space in _arrays(typed, space)}
+        (size,) = sizes
+    except (KeyError, TypeError, ValueError) as error:
+        raise InvalidInputError(
+            f"the observation is {shapes_of(observation)}; the policy takes one of {space}, or a"
+            " batch of them"
+        ) from error
+    return (
+        (each(lambda array: array[None], typed), 1, False) if size is None else (typed, size, True)
+    )
+
+
+def each(function: Callable[[np.ndarray], Any], observation: Any) -> Any:
+    """Return a function of each array of an observation, in the structure of the observation.
+
+    Args:
+        function: of an array.
+        observation: an array, or a mapping or a tuple of them.
+    """
+    if isinstance(observation, Mapping):
+        return {key: each(function, part) for key, part in observation.items()}
+    if isinstance(observation, tuple):
+        return tuple(each(function, part) for part in observation)
+    return function(observation)
+
+
+def arrays_of(observation: Any) -> list[np.ndarray]:
+    """Return the arrays of an observation."""
+    found: list[np.ndarray] = []
+    each(lambda array: found.append(np.asarray(array)), observation)
+    return found
+
+
+def shapes_of(observation: Any) -> str:
+    """Return the shape of an observation as text, or the shapes of its parts."""
+    if isinstance(observation, Mapping):
+        parts = [f"{key!r}: {shapes_of(part)}" for key, part in observation.items()]
+        return f"{{{', '.join(parts)}}}"
+    try:
+        return f"of shape {np.shape(observation)}"
+    except ValueError:  # parts of different lengths
+        return f"a {type(observation).__name__}"
+
+
+def _typed(observation: Any, space: gym.Space[Any]) -> Any:
+    """Return an observation whose arrays are of the types of the space."""
+    if isinstance(space, gym.spaces.Dict):
+        return {key: _typed(observation[key], part) for key, part in space.spaces.items()}
+    if isinstance(space, gym.spaces.Tuple):
+        return tuple(_typed(*pair) for pair in zip(observation, space.spaces, strict=True))
+    return np.asarray(observation, dtype=space.dtype)
+
+
+def _arrays(typed: Any, space: gym.Space[Any]) -> Iterator[tuple[np.ndarray, gym.Space[Any]]]:
+    """Yield each array of an observation and its space."""
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        parts: Any = space.spaces
+        for key in parts if isinstance(space, gym.spaces.Dict) else range(len(parts)):
+            yield from _arrays(typed[key], parts[key])
+    else:
+        yield typed, space
+
+
+def _batch(array: np.ndarray, space: gym.Space[Any]) -> int | None:
+    """Return the number of elements of a space in an array, None for the element itself."""
+    if array.shape == space.shape:
+        return None
+    if space.shape is None or array.shape[1:] != space.shape:
+        raise ValueError("the shape is another one")
+    return len(array)

@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.base import Policy, checked_observation
-from safe_envs.agents.policies.observed_state import ObservedState
+from safe_envs.agents.policies.base import ObservedState, Policy, checked_observation
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.problem.measurement import require_full_state
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.table import ValueTable
-from safe_envs.wrappers.value.table_cache import table_for
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.reduction import reduced
+from safe_envs.values.solve import table_for
+from safe_envs.values.tables import ValueSettings, ValueTable
 
 
 class BestPolicy(Policy):

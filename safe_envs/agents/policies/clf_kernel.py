@@ -6,7 +6,9 @@ from math import isfinite, nan
 
 import numpy as np
 
-from safe_envs.wrappers.qp.kernels.one_constraint import (
+from safe_envs.dynamics.noise import POLICY
+from safe_envs.engine.draws import uniform_at
+from safe_envs.engine.qp.kernels.one_constraint import (
     project_one_constraint,
     work_of_one_constraint,
 )
@@ -22,7 +24,7 @@ def best_inputs_for_goal(
 ) -> None:
     """Minimise w |u|^2 + w (d / unit)^2 subject to growth + b u <= d and the input bounds.
 
-    It is what `safe_envs.wrappers.filter_qp.solver.FilterQPSolver.best` does.
+    It is what `safe_envs.filters.solver.FilterQPSolver.best` does.
 
     Args:
         goal: growth, and the m entries of b.
@@ -51,3 +53,68 @@ def best_inputs_for_goal(
     if not isfinite(total):
         for j in range(m):
             u[j] = nan
+
+
+def action_of_input(u: float, low: float, high: float, center: float, half: float) -> float:
+    """Return the action in [-1, 1] for an input, which is clipped to its bounds; NaN for NaN.
+
+    Args:
+        u: physical input.
+        low: lower bound.
+        high: upper bound.
+        center: middle of the bounds.
+        half: half of their distance.
+    """
+    clipped = low if u < low else high if u > high else u
+    return (clipped - center) / half
+
+
+def input_of_action(action: float, center: float, half: float) -> float:
+    """Return the input that an env executes for an action; NaN for NaN.
+
+    Args:
+        action: what lies beyond [-1, 1] is clipped.
+        center: middle of the input bounds.
+        half: half of their distance.
+    """
+    if action > 1.0:
+        return center + half
+    if action < -1.0:
+        return center - half
+    return center + half * action
+
+
+def random_action(place: int, k0: int, k1: int) -> float:
+    """Return the action that a word of the policy's stream of an episode stands for.
+
+    Args:
+        place: of the word, from 0.
+        k0: first word of the key of the episode.
+        k1: second word.
+    """
+    return 2.0 * uniform_at(place, 0, POLICY, k0, k1) - 1.0
+
+
+def clip_to_bound(value: float, bound: float) -> float:
+    """Return a number, or the end of [-bound, bound] that it lies beyond; NaN for NaN.
+
+    Args:
+        value: the number.
+        bound: not negative.
+    """
+    return -bound if value < -bound else bound if value > bound else value
+
+
+def action_in_another_box(
+    action: float, center: float, half: float, new_center: float, new_half: float
+) -> float:
+    """Return the action that stands for the same or the nearest input in other input bounds.
+
+    Args:
+        action: in the old bounds.
+        center: of the old bounds.
+        half: width of the old bounds, halved.
+        new_center: of the new bounds.
+        new_half: width of the new bounds, halved.
+    """
+    return clip_to_bound((center + half * action - new_center) / new_half, 1.0)

@@ -6,11 +6,10 @@ import os
 import re
 from pathlib import Path
 
-from safe_envs.agents.policies.statistics_file import statistics_files
+from safe_envs.agents.policies.trained import statistics_files
 from safe_envs.errors import ConfigurationError, nearest, shown
-from safe_envs.object_import import resolved
 from safe_envs.plugins import POLICIES as POLICY_PLUGINS
-from safe_envs.plugins import module_of, plugin_names
+from safe_envs.plugins import module_of, plugin_names, resolved
 
 POLICIES = ("nominal", "clf", "zero", "random", "best")
 """Names that `make_policy` knows without any other package."""

@@ -12,14 +12,13 @@ import numpy as np
 from safe_envs.agents.policies.names import POLICY_FILE, saved_policy_file
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.agents.policies.sb3 import require_same_env
-from safe_envs.agents.policies.training_layers import Normalizer, training_layers
-from safe_envs.envs.env import action_box, observation_box
-from safe_envs.envs.spaces import observation_names
+from safe_envs.agents.policies.trained import Normalizer, training_layers
+from safe_envs.envs.spaces import action_box, observation_box, observation_names
 from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.filters.learning import data
+from safe_envs.filters.learning.data import Signature
+from safe_envs.filters.learning.models.network import Network
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.data import files
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.models.network import Network
 
 KIND = "policy"
 """Kind of a file that holds a policy."""
@@ -43,7 +42,7 @@ def save_policy(
         ConfigurationError: the policy is of another kind or of another problem, its numbers are not
             finite, or the folder cannot be written.
     """
-    from safe_envs.agents.policies.sb3_actor import actor_of
+    from safe_envs.agents.policies.sb3 import actor_of
 
     scaling = _normalization_of(model, problem, normalization)
     weights, biases, activation = actor_of(model.policy)
@@ -68,7 +67,7 @@ def save_policy(
         raise ConfigurationError(
             f"the folder {folder} cannot be made: {error.strerror}; give another one"
         ) from error
-    files.save(
+    data.save(
         folder / POLICY_FILE, KIND, Signature.of(problem), details, network.to_arrays("actor")
     )
 
@@ -119,7 +118,7 @@ def load_policy(path: str | Path, problem: SafetyProblem) -> NetworkPolicy:
             f" ... --resume, or give the best policy so far, {file.parent / 'best'}, which is"
             " there after the first evaluation"
         )
-    content = files.load(file, _WRITER)
+    content = data.load(file, _WRITER)
     if content.kind != KIND:
         raise ConfigurationError(f"{shortened(file)} holds {content.kind}, and no policy")
     try:
@@ -134,7 +133,7 @@ def load_policy(path: str | Path, problem: SafetyProblem) -> NetworkPolicy:
         ) from error
 
 
-def _policy(content: files.Content, problem: SafetyProblem) -> NetworkPolicy:
+def _policy(content: data.Content, problem: SafetyProblem) -> NetworkPolicy:
     details, scaling = content.details, content.details["normalization"]
     network = Network.from_arrays(content.arrays, "actor", details["activation"])
     ends = (len(network.input_mean), len(network.output_mean))
@@ -173,7 +172,7 @@ def _spaces(problem: SafetyProblem) -> dict[str, Any]:
     }
 
 
-def _require_problem(path: Path, content: files.Content, problem: SafetyProblem) -> None:
+def _require_problem(path: Path, content: data.Content, problem: SafetyProblem) -> None:
     difference = content.signature.difference(problem)
     for name, wanted in _spaces(problem).items():
         if not difference and content.details[name] != wanted:

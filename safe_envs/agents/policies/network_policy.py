@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.policies.base import CHOOSE, BlockPolicy
-from safe_envs.agents.policies.policy_kernel import action_in_another_box, clip_to_bound
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source
+from safe_envs.agents.policies.clf_kernel import action_in_another_box, clip_to_bound
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.slots import Data
 from safe_envs.errors import ConfigurationError, nearest, shown
-from safe_envs.wrappers.learning.models.network import Network
-from safe_envs.wrappers.learning.models.network_source import network_source
+from safe_envs.filters.learning.models.network import Network, network_source
 
 _OUTPUTS = {"tanh": np.tanh, "clip": lambda x: np.clip(x, -1.0, 1.0)}
 _COMPILED_OUTPUTS = {"tanh": "tanh({})", "clip": "clip_to_bound({}, 1.0)"}

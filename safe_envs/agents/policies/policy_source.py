@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from safe_envs.agents.policies.base import Policy, not_compilable
-from safe_envs.agents.policies.policy_kernel import input_of_action
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source
-from safe_envs.compiled.own_source import has_own_source
+from safe_envs.agents.policies.clf_kernel import input_of_action
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.program import has_own_source
+from safe_envs.engine.slots import Data
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.problem.problem import SafetyProblem
 
@@ -17,7 +17,7 @@ _COMPUTING = ("predict", "begin", "actions", "act")
 
 
 def policy_source(policy: Any, problem: SafetyProblem, data: Data) -> Source:
-    """Return the function `act` of `safe_envs.compiled.slots`.
+    """Return the function `act` of `safe_envs.engine.slots`.
 
     Args:
         policy: a `Policy`, or another object with its `predict`, which has no such function.

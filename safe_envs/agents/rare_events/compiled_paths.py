@@ -5,24 +5,89 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from safe_envs.agents.evaluation.brownian_bridge import reached_by_noise
-from safe_envs.agents.evaluation.decision_source import Decider, decision_source
+from safe_envs.agents.evaluation.brownian_bridge import bridge_rates, reached_by_noise
+from safe_envs.agents.evaluation.compiled_episodes import Decider, decider_of, decision_source
+from safe_envs.agents.evaluation.episode_kernel import bridge_minimum
+from safe_envs.agents.evaluation.resolve import Env, FilterParts, ResolvedEvaluation
+from safe_envs.agents.jobs.job import available_threads
 from safe_envs.agents.policies.policy_source import policy_source
-from safe_envs.agents.rare_events.heights import Heights
-from safe_envs.agents.rare_events.particles import PathPlayer
+from safe_envs.agents.rare_events.numpy_paths import NumpyPaths, TiltedNoiseEnv, barrier_slopes
 from safe_envs.agents.rare_events.path_kernel import FAILED, FULL, draw_path_starts, play_paths
-from safe_envs.agents.rare_events.path_source import path_source
-from safe_envs.agents.rare_events.records import Records
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.engine import periods_of_a_part
-from safe_envs.compiled.program import Functions, Program
+from safe_envs.agents.rare_events.splitting import Heights, PathPlayer, Records
+from safe_envs.engine.choice import compiled_or_none, periods_of_a_part
+from safe_envs.engine.formulas import Source, formulas
+from safe_envs.engine.program import Functions, Program
+from safe_envs.engine.slots import Data
 from safe_envs.envs.world_source import noise_channels, world_source
-from safe_envs.errors import NotCompilableError, shortened
+from safe_envs.errors import ConfigurationError, NotCompilableError, shortened
+from safe_envs.filters.conditions.text import FilterSettings
 from safe_envs.problem.problem import SafetyProblem
+
+
+def path_source(problem: SafetyProblem, bridged: bool, data: Data) -> Source:
+    """Return the functions that playing paths takes next to those of the world.
+
+    Args:
+        problem: what is simulated.
+        bridged: whether to draw h between control instants.
+        data: receives its numbers.
+    """
+    entries = "".join(f"row[{i}], " for i in range(problem.plant.n))
+    state = Source(f"def state_in(row):\n    return ({entries})\n")
+    return state + _tilt(problem, data) + _lowest(problem, bridged, data)
+
+
+def _tilt(problem: SafetyProblem, data: Data) -> Source:
+    channels, head = len(problem.plant.noise_channels), "def tilt_direction(x, barriers, data):\n"
+    if not channels:
+        return Source(f"{head}    return (0.0,)\n")
+    slopes = barrier_slopes(problem)
+    lines = ["slopes = barrier_slopes(x, data)", "h = barriers[0]"]
+    rows = [
+        "".join(f"slopes[{i}], " for i in range(first, first + channels))
+        for first in range(0, len(slopes), channels)
+    ]
+    lines.append(f"steepest = ({rows[0]})")
+    for i, row in enumerate(rows[1:], 1):
+        lines += [f"if barriers[{i}] < h:", f"    h = barriers[{i}]", f"    steepest = ({row})"]
+    squares = " + ".join(f"steepest[{i}] * steepest[{i}]" for i in range(channels))
+    lines += [
+        f"steepness = sqrt({squares})",
+        "if not steepness > 0.0:",
+        f"    return ({'0.0, ' * channels})",
+        f"return ({''.join(f'steepest[{i}] / steepness, ' for i in range(channels))})",
+    ]
+    text = head + "".join(f"    {line}\n" for line in lines)
+    return formulas("barrier_slopes", {"x": problem.plant.states}, slopes, data) + Source(text)
+
+
+def _lowest(problem: SafetyProblem, bridged: bool, data: Data) -> Source:
+    count = len(problem.barriers)
+    lines = ["def lowest_relative(x, before, after, units, uniforms, first, data):"]
+    if bridged:
+        lines += [
+            "    rates = bridge_rates(x, data)",
+            *(
+                f"    h{i} = bridge_minimum("
+                f"before[{i}], after[{i}], rates[{i}], uniforms[first + {i}])"
+                for i in range(count)
+            ),
+        ]
+    else:
+        lines += [f"    h{i} = after[{i}]" for i in range(count)]
+    lines.append("    lowest = h0 / units[0]")
+    lines += [f"    lowest = min(lowest, h{i} / units[{i}])" for i in range(1, count)]
+    text = "\n".join([*lines, "    return lowest\n"])
+    if not bridged:
+        return Source(text)
+    rates = formulas("bridge_rates", {"x": problem.plant.states}, bridge_rates(problem), data)
+    return rates + Source(text, (bridge_minimum,))
+
 
 _AHEAD = 16
 """Control periods for which noise is drawn ahead at most; a path may end at any time."""
@@ -175,7 +240,7 @@ class CompiledPaths:
         self._reference, self._threads = reference, threads
 
     def starts(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `safe_envs.agents.rare_events.particles.PathPlayer`."""
+        """See `safe_envs.agents.rare_events.splitting.PathPlayer`."""
         states, barriers, found = self._program.starts(self._functions, keys)
         return (states, barriers) if found == len(keys) else self._reference.starts(keys)
 
@@ -187,7 +252,7 @@ class CompiledPaths:
         records: Records,
         length: float,
     ) -> np.ndarray:
-        """See `safe_envs.agents.rare_events.particles.PathPlayer`."""
+        """See `safe_envs.agents.rare_events.splitting.PathPlayer`."""
         ends, outcomes = np.zeros((2, len(keys)), dtype=np.int64)
         left = paths
         while left.size:
@@ -218,3 +283,75 @@ class CompiledPaths:
             ]
             for each in under_way:
                 each.result()
+
+
+class ChosenPlayer(NamedTuple):
+    """Who simulates, and how.
+
+    Attributes:
+        player: who simulates.
+        engine: "numpy" or "compiled".
+        jobs: threads.
+    """
+
+    player: PathPlayer
+    engine: str
+    jobs: int
+
+
+def player_of(
+    resolved: ResolvedEvaluation,
+    conditions: FilterParts,
+    num_envs: int,
+    engine: str,
+    periods: float,
+) -> ChosenPlayer:
+    """Return who simulates paths under a filter.
+
+    Args:
+        resolved: what to simulate.
+        conditions: of the filter, see `FilterParts`.
+        num_envs: the most envs of NumPy side by side.
+        engine: one of `safe_envs.engine.choice.ENGINES`.
+        periods: control periods to simulate, about.
+
+    Raises:
+        ConfigurationError: The filter remembers the path, or the compiled engine was asked for,
+            and Numba is missing.
+        NotCompilableError: It was asked for, and cannot do this.
+    """
+    if isinstance(conditions, FilterSettings) and conditions.of_paths:
+        raise ConfigurationError(
+            f"the filter {conditions.text} remembers {conditions.of_paths}, and paths that are"
+            " split go on from states alone; evaluate it with more episodes instead"
+        )
+    continuous = resolved.spec.monitoring == "continuous"
+    reference = NumpyPaths(
+        resolved.problem,
+        partial(_tilted_env, resolved, conditions),
+        resolved.policy,
+        num_envs,
+        continuous,
+    )
+    compiled = compiled_or_none(
+        engine, periods, partial(_compiled, resolved, conditions, continuous, reference)
+    )
+    return compiled or ChosenPlayer(reference, "numpy", 1)
+
+
+def _tilted_env(resolved: ResolvedEvaluation, conditions: FilterParts, lengths: np.ndarray) -> Env:
+    return resolved.filtered(TiltedNoiseEnv(resolved.problem, lengths), conditions)
+
+
+def _compiled(
+    resolved: ResolvedEvaluation,
+    conditions: FilterParts,
+    continuous: bool,
+    reference: PathPlayer,
+) -> ChosenPlayer:
+    decider = decider_of(resolved, conditions)
+    program = PathProgram(resolved.problem, resolved.policy, decider, continuous)
+    threads = available_threads()
+    functions = program.compiled()
+    player = CompiledPaths(program, functions, reference, threads)
+    return ChosenPlayer(player, "compiled", threads)

@@ -1,13 +1,17 @@
-"""Paths from their last records to a violation or to their end, in one compiled function."""
+"""Paths from their last records to a violation or to their end, in one compiled function.
+
+See also `safe_envs.engine.slots`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from safe_envs.agents.evaluation.episode_kernel import is_finite_input
-from safe_envs.agents.rare_events.path_slots import lowest_relative, state_in, tilt_direction
-from safe_envs.compiled.draws import draw_start, fill_normals, fill_uniforms, store_row
-from safe_envs.compiled.slots import (
+from safe_envs.dynamics.noise import BRIDGE, NOISE
+from safe_envs.engine.draws import draw_start, fill_normals, fill_uniforms, store_row
+from safe_envs.engine.slots import (
+    State,
     act,
     advance,
     barriers_of,
@@ -18,7 +22,43 @@ from safe_envs.compiled.slots import (
     observation_of,
     resting_input,
 )
-from safe_envs.dynamics.philox import BRIDGE, NOISE
+
+
+def state_in(row: np.ndarray) -> State:
+    """Return the state that an array holds."""
+    raise NotImplementedError
+
+
+def tilt_direction(x: State, barriers: tuple[float, ...], data: np.ndarray) -> tuple[float, ...]:
+    """Return the direction in which the smallest barrier rises fastest; see `TiltedNoiseEnv`.
+
+    It has an entry for each noise channel, and a single one, 0, without noise.
+    """
+    raise NotImplementedError
+
+
+def lowest_relative(
+    x: State,
+    before: tuple[float, ...],
+    after: tuple[float, ...],
+    units: np.ndarray,
+    uniforms: np.ndarray,
+    first: int,
+    data: np.ndarray,
+) -> float:
+    """Return the smallest h that counts in a control period, relative to the units of the barriers.
+
+    Args:
+        x: state at its beginning.
+        before: barriers there.
+        after: barriers at its end.
+        units: of the barriers.
+        uniforms: numbers in [0, 1); from `first` on there is one for each barrier, if any is used.
+        first: where those of this period begin.
+        data: numbers of the program.
+    """
+    raise NotImplementedError
+
 
 DONE = 0
 FULL = 1

@@ -10,11 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from safe_envs.agents.jobs.job import JobOutcome
 from safe_envs.agents.jobs.store import ResultStore, reading, remove_stale
-from safe_envs.agents.sweeps.cell import Cell, Sweep
-from safe_envs.agents.sweeps.settings import text_of
-from safe_envs.atomic_io import write_json
-from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
+from safe_envs.agents.sweeps.spec import Cell, Sweep, text_of
 from safe_envs.errors import ConfigurationError, install_extra, shortened
+from safe_envs.files import MOST_BYTES_OF_TEXT, read_bytes, write_json
 
 if TYPE_CHECKING:
     import pyarrow as pa

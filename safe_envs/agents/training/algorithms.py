@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safe_envs.agents.policies.sb3_actor import actor_of
-from safe_envs.agents.training.hyperparameters import OFF_POLICY, python_value, scheduled
+from safe_envs.agents.policies.sb3 import actor_of
+from safe_envs.agents.training.config import OFF_POLICY, python_value, scheduled
 from safe_envs.agents.training.replay_buffer import replay_options
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
@@ -36,7 +36,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     """Return the class of an algorithm.
 
     Args:
-        name: one of `safe_envs.agents.training.hyperparameters.ALGORITHMS`.
+        name: one of `safe_envs.agents.training.config.ALGORITHMS`.
     """
     if name == "ppo-lag":
         from safe_envs.agents.training.ppo_lagrangian import PPOLagrangian

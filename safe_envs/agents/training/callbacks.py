@@ -14,8 +14,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 
 from safe_envs.agents.jobs.store import reading
-from safe_envs.agents.training.promise_curriculum import PromiseCurriculum
-from safe_envs.atomic_io import write_atomically, writing
+from safe_envs.agents.training.config import PromiseCurriculum
+from safe_envs.files import write_atomically, writing
 
 _EPISODES = 100
 

@@ -8,22 +8,26 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.frontier_results import Frontier
+from safe_envs.agents.evaluation.frontier import Frontier
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.evaluation.yardstick import (
     best_for,
     evaluation_settings,
 )
-from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.agents.jobs.store import ResultStore, reading
-from safe_envs.agents.training.hyperparameters import ALGORITHMS
-from safe_envs.agents.training.seed_statistics import SeedEstimate, over_seeds
-from safe_envs.agents.training.study import DEFAULT, Study, StudyResult, Variant
+from safe_envs.agents.jobs.store import ResultStore, package_versions, reading
+from safe_envs.agents.training.config import ALGORITHMS
+from safe_envs.agents.training.study import (
+    DEFAULT,
+    SeedEstimate,
+    Study,
+    StudyResult,
+    Variant,
+    over_seeds,
+)
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.systems import ENV_IDS
-from safe_envs.wrappers.value.frontier import price_violations
-from safe_envs.wrappers.value.priced_values import FrontierSettings
+from safe_envs.values.frontier import FrontierSettings, price_violations
 
 LIMIT = 0.01
 """Chance of a violation that the constrained agent and the promise filter are asked to keep."""

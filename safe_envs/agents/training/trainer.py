@@ -22,37 +22,33 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from safe_envs.agents.evaluation.evaluate import run_evaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, RunSettings
-from safe_envs.agents.jobs import blas_threads
+from safe_envs.agents.jobs import job
 from safe_envs.agents.jobs.store import make_folder
 from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
 from safe_envs.agents.training.callbacks import CurriculumCallback, ProgressLog, SafetyFigures
 from safe_envs.agents.training.checkpoints import (
-    copy_policy,
-    drop_replay_buffer,
-    keep_checkpoint,
-    last_checkpoint,
-    remove_unfinished,
-    restore_model,
-    resume_episodes,
-)
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import OFF_POLICY
-from safe_envs.agents.training.limits import judged, rank
-from safe_envs.agents.training.run_folder import (
     BEST,
     EVALUATIONS,
     LOCK,
     PROGRESS,
     SHOWN,
+    copy_policy,
+    drop_replay_buffer,
+    keep_checkpoint,
+    last_checkpoint,
     prepare,
     read_evaluations,
+    remove_unfinished,
     require_folder,
+    restore_model,
+    resume_episodes,
 )
+from safe_envs.agents.training.config import OFF_POLICY, Training
+from safe_envs.agents.training.constraint import judged, rank
 from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.atomic_io import write_json
-from safe_envs.compiled.engine import engine_for
+from safe_envs.engine.choice import engine_for
 from safe_envs.errors import ConfigurationError, SafeEnvsError, install_extra
-from safe_envs.file_locks import locked
+from safe_envs.files import locked, write_json
 from safe_envs.registry import make_problem
 
 _OF_EVALUATIONS = 2**32 - 1
@@ -115,7 +111,7 @@ def train(
         if not resume:
             prepare(folder, training)
         session.log(tensorboard)
-        with blas_threads.limited(training.threads):
+        with job.limited(training.threads):
             session.run(progress or (lambda _: None))
     return session.seconds
 

@@ -9,8 +9,7 @@ import pygame
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
-from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.fonts import text_size
+from safe_envs.rendering.canvas import Canvas, text_size
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import BOX, StatePlane

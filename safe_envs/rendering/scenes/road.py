@@ -9,8 +9,7 @@ import numpy as np
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
-from safe_envs.rendering.canvas import Box, Canvas
-from safe_envs.rendering.curves import thinned
+from safe_envs.rendering.canvas import Box, Canvas, thinned
 from safe_envs.rendering.safe_set import STEP, Barriers, tint
 from safe_envs.rendering.scenes.base import (
     Scene,

@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.atomic_io import require_writable, write_atomically
 from safe_envs.errors import ConfigurationError, install_extra
+from safe_envs.files import require_writable, write_atomically
 
 SUFFIXES = (".mp4", ".gif", ".png")
 """What can be written."""

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import io
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import matplotlib as mpl
 import numpy as np
+import sympy as sp
+from matplotlib.axes import Axes
+from matplotlib.collections import Collection
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
+
+from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.files import write_atomically
+from safe_envs.filters.decision_log import path_of, printable
 
 # The palette of Okabe and Ito: no two of the seven are closer than 10 in CIEDE2000, also under
 # protanopia, deuteranopia and tritanopia.
@@ -194,3 +210,384 @@ def drawable(h: np.ndarray) -> np.ndarray:
     """
     known = np.abs(h[np.isfinite(h)])
     return np.maximum(h, -2.0 * known.max(initial=1.0))
+
+
+_UNDATED: dict[str, dict[str, Any]] = {
+    "pdf": {"CreationDate": None},
+    "svg": {"Date": None},
+    "png": {"Software": None},
+}
+"""Metadata by format."""
+
+_DATE = "SOURCE_DATE_EPOCH"
+
+_DIGITS = 9
+"""Of the places of panels, as shares of a figure."""
+
+_BEGINNINGS: WeakKeyDictionary[Axes, Bbox] = WeakKeyDictionary()
+"""Where panels outside of a grid were before the first layout."""
+
+_SCREEN_DPI = 150
+"""Of a notebook."""
+
+
+class StyledFigure(Figure):
+    """A figure that a notebook shows, with or without pyplot, and that keeps its style."""
+
+    def savefig(self, fname: Any, **kwargs: Any) -> None:
+        """Write the figure in its style and without a date; see `matplotlib.figure.Figure.savefig`.
+
+        Args:
+            fname: as there.
+            **kwargs: as there.
+        """
+        kind = kwargs.get("format") or Path(str(fname)).suffix.removeprefix(".")
+        undated = _UNDATED.get(kind.lower())
+        if undated is not None:  # of the other formats some refuse any metadata
+            kwargs["metadata"] = {**undated, **(kwargs.get("metadata") or {})}
+        # The formats of fonts are read when a figure is written.
+        with mpl.rc_context(STYLE), _laid_out(self):
+            super().savefig(fname, **kwargs)
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, format="png", dpi=_SCREEN_DPI)
+        return buffer.getvalue()
+
+
+def finished(figure: StyledFigure, out: Path | str | None) -> StyledFigure:
+    """Return a figure, and write it if it has a file.
+
+    Args:
+        figure: to write.
+        out: file of the picture; its suffix is the format. None writes nothing.
+
+    Raises:
+        ConfigurationError: `out` is no path, or its suffix is no format of a picture.
+    """
+    if out is None:
+        return figure
+    path = path_of(out, "FILE.png, FILE.pdf or FILE.svg")
+    if path.suffix.lower().removeprefix(".") not in figure.canvas.get_supported_filetypes():
+        raise ConfigurationError(
+            f"{shortened(path)} names no format of a picture; give FILE.png, FILE.pdf or FILE.svg"
+        )
+    save(figure, path)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure without a date.
+
+    Args:
+        figure: to write.
+        path: of the file; its suffix is the format.
+    """
+    kind = path.suffix.removeprefix(".").lower()
+    # The formats of fonts are read when a figure is written.
+    with mpl.rc_context(STYLE), _dated(), _laid_out(figure):
+        write_atomically(path, lambda part: _write(figure, part, kind))
+
+
+def _write(figure: Figure, part: Path, kind: str) -> None:
+    # Given a path, PostScript would have its name in it.
+    with part.open("wb") as file:
+        figure.savefig(file, format=kind, metadata=_UNDATED.get(kind))
+
+
+@contextmanager
+def _laid_out(figure: Figure) -> Iterator[None]:
+    """Let a figure have one layout in all formats, however often it is written.
+
+    That of Matplotlib begins where the last one ended, with the letters of the format.
+    """
+    engine = figure.get_layout_engine()
+    if not isinstance(engine, ConstrainedLayoutEngine):
+        yield
+        return
+    for axes in figure.axes:
+        place = axes.get_subplotspec()
+        if place is None:  # of a colour bar
+            _place(axes, _BEGINNINGS.setdefault(axes, axes.get_position(original=True)))
+        else:
+            axes.set_subplotspec(place)
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        # The last digits depend on where in memory the solver's variables are, and an SVG has names
+        # that are made of them.
+        box = axes.get_position(original=True)
+        _place(axes, Bbox(np.round(box.get_points(), _DIGITS)))
+    try:
+        yield
+    finally:
+        figure.set_layout_engine(engine)
+
+
+def _place(axes: Axes, box: Bbox) -> None:
+    """Put a panel somewhere, and leave it to the layout all the same."""
+    stays = axes.get_in_layout()
+    axes.set_position(box)
+    axes.set_in_layout(stays)
+
+
+@contextmanager
+def _dated() -> Iterator[None]:
+    """Give the formats that must have a date a fixed one, unless the user has chosen another."""
+    if _DATE in os.environ:
+        yield
+        return
+    os.environ[_DATE] = "0"
+    try:
+        yield
+    finally:
+        del os.environ[_DATE]
+
+
+_GREEK = frozenset(
+    re.findall(
+        r"\w+",
+        "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau"
+        " upsilon phi chi psi omega Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega",
+    )
+)
+_ACCENTS = ("ddot", "dot", "hat", "bar", "tilde")
+_NAME = re.compile(r"([A-Za-z]+?)(\d*)((?:_[A-Za-z0-9]+)*)")
+_ASSIGNED = re.compile(r"\b[A-Za-z]\w*(?= = )")
+_MEASURED = re.compile(r"(?<=\d) (?=[A-Za-z%]\b)")
+_FACTOR = re.compile(r"(?:√|sqrt)\(?([A-Za-z]+)\)?|([A-Za-z]+|1)(?:\^(-?\d+)|([²³]))?")
+_RAISED = {"²": "2", "³": "3"}
+
+
+def plain(text: str, most: int = 40) -> str:
+    """Return a text without what would be read as mathematics; it may come from a file.
+
+    Args:
+        text: a name, say.
+        most: characters, about.
+    """
+    return shortened(printable(text), most).replace("$", r"\$")
+
+
+def symbol(name: str) -> str:
+    r"""Return the name of a quantity as mathematics, or as upright text where it is a word.
+
+    Args:
+        name: such as x, sigma_1, thetadot, rotor_1 or speed; other texts are written as they are.
+
+    Returns:
+        Mathtext, such as "$\sigma_{1}$" and "$\dot{\theta}$"; "speed" for a word.
+    """
+    match = _NAME.fullmatch(name)
+    if match is None or len(name) > 40:
+        return plain(name)
+    base, digits, indices = match.groups()
+    letter = _letter(base)
+    parts = [part for part in (digits, *indices.split("_")) if part]
+    if letter is None:
+        # A word keeps its index, and further words are written after it.
+        if not parts or any(not part.isdigit() for part in parts):
+            return plain(name.replace("_", " "))
+        letter = rf"\mathrm{{{base}}}"
+    below = ",".join(
+        f"\\{part}" if part in _GREEK else part if len(part) == 1 else rf"\mathrm{{{part}}}"
+        for part in parts
+    )
+    return f"${letter}_{{{below}}}$" if below else f"${letter}$"
+
+
+def _letter(base: str) -> str | None:
+    """Return a Latin or Greek letter with its accent; None for a word."""
+    for accent in _ACCENTS:
+        inner = base.removesuffix(accent)
+        if inner != base and (found := _letter(inner)):
+            return f"\\{accent}{{{found}}}"
+    if base in _GREEK:
+        return f"\\{base}"
+    return base if len(base) == 1 else None
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit, upright, with its powers raised.
+
+    Args:
+        unit: such as m/s^2, N m, rad^2/s^2, m/s/sqrt(s); another text is written as it is.
+
+    Returns:
+        Mathtext. What several strokes divide by is in parentheses, as ISO 80000-1 asks for.
+    """
+    groups = [
+        [_factor(factor) for factor in part.replace("·", " ").split()] for part in unit.split("/")
+    ]
+    if not all(groups) or any(factor is None for group in groups for factor in group):
+        return plain(unit)
+    above, *below = ([str(factor) for factor in group] for group in groups)
+    divisors = [factor for group in below for factor in group]
+    text = r"\,".join(above)
+    if divisors:
+        under = r"\,".join(divisors)
+        text += f"/({under})" if len(divisors) > 1 else f"/{under}"
+    return f"${text}$"
+
+
+def _factor(text: str) -> str | None:
+    match = _FACTOR.fullmatch(text)
+    if match is None:
+        return None
+    rooted, name, power, raised = match.groups()
+    if rooted:
+        return rf"\sqrt{{\mathrm{{{rooted}}}}}"
+    exponent = power or _RAISED.get(raised)
+    return rf"\mathrm{{{name}}}" + (f"^{{{exponent}}}" if exponent else "")
+
+
+def labelled(text: str, unit: str = "") -> str:
+    """Return a text with a unit, as every axis has it.
+
+    Args:
+        text: of the quantity, which may hold mathematics.
+        unit: of the quantity; empty for none, "%" for shares.
+
+    Returns:
+        Such as "time [s]".
+    """
+    if not unit:
+        return text
+    return f"{text} [{unit if unit == '%' else unit_text(unit)}]"
+
+
+def quantity(name: str, unit: str = "") -> str:
+    r"""Return the label of a state, an input or a parameter.
+
+    Args:
+        name: as in the problem.
+        unit: as in the problem.
+
+    Returns:
+        Such as "$\theta$ [$\mathrm{rad}$]".
+    """
+    return labelled(symbol(name), unit)
+
+
+def expression(text: str, units: Mapping[str, str]) -> str:
+    """Return the label of an expression of states, such as a coordinate.
+
+    Args:
+        text: as SymPy prints it.
+        units: of the states, by name.
+    """
+    if text in units:
+        return quantity(text, units[text])
+    states = {name: sp.Symbol(name, real=True) for name in units}
+    parsed = sp.parse_expr(text, local_dict=dict(states))
+    names = {state: symbol(name).strip("$") for name, state in states.items()}
+    return f"${sp.latex(parsed, symbol_names=names)}$"
+
+
+def mathematics(text: str) -> str:
+    """Return a text in which names that are given values are mathematics, and units stay at them.
+
+    Args:
+        text: such as "sigma_1 = 0.1, dt = 0.05 s".
+
+    Returns:
+        The text, with mathtext.
+    """
+    joined = _MEASURED.sub("\u00a0", text.replace("$", r"\$"))
+    return _ASSIGNED.sub(lambda match: symbol(match.group()), joined)
+
+
+_APART = 2.0
+_ROOM = 3.0
+"""In pixels, between points of what is drawn, and around a value."""
+
+_TRIED = 80
+_FORM = "%.3g"
+
+
+def write_levels(figure: Figure, axes: Axes, lines: ContourSet) -> None:
+    """Write the value of each contour line into it, where nothing else is drawn.
+
+    Args:
+        figure: complete, since the places depend on its layout.
+        axes: of the contour lines.
+        lines: the contour lines; one without room for its value gets none.
+    """
+    figure.draw_without_rendering()
+    curves = [_pixels(axes, segments) for segments in lines.allsegs]
+    others = [_drawn(axes, lines)]
+    places = []
+    for i, (level, own) in enumerate(zip(lines.levels, curves, strict=True)):
+        rest = [*others, *(curve for k, curve in enumerate(curves) if k != i)]
+        found = _free_place(axes, own, np.concatenate(rest), _extent(axes, _FORM % level))
+        if found is not None:
+            place, corners = found
+            places.append(axes.transData.inverted().transform(place))
+            others.append(corners)
+    if places:
+        style: Any = {"fontsize": SMALL, "fmt": _FORM, "colors": "black", "inline_spacing": 4}
+        axes.clabel(lines, manual=places, **style)
+
+
+def _pixels(axes: Axes, segments: Sequence[Any]) -> np.ndarray:
+    """Return points close to each other along curves, shape (k, 2)."""
+    parts = [np.empty((0, 2))]
+    for segment in segments:
+        if len(segment) < 2:
+            continue
+        points = axes.transData.transform(segment)
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        stops = np.arange(0.0, along[-1], _APART)
+        parts.append(np.stack([np.interp(stops, along, column) for column in points.T], axis=1))
+    return np.concatenate(parts)
+
+
+def _drawn(axes: Axes, lines: ContourSet) -> np.ndarray:
+    """Return points of all lines, marks and edges of areas but those of contour lines."""
+    segments = [np.column_stack(line.get_data(orig=False)) for line in axes.lines]
+    marks = [axes.transData.transform(np.asarray(each, dtype=float)) for each in segments]
+    for collection in axes.collections:
+        if collection is not lines and isinstance(collection, Collection):
+            for path in collection.get_paths():
+                segments += path.to_polygons(closed_only=False)
+    return np.concatenate([*marks, _pixels(axes, segments)])
+
+
+def _extent(axes: Axes, text: str) -> np.ndarray:
+    """Return half of the width and height of a value with the room around it."""
+    probe = axes.text(0.0, 0.0, text, fontsize=SMALL)
+    box = probe.get_window_extent()
+    probe.remove()
+    return 0.5 * np.array([box.width, box.height]) + _ROOM
+
+
+def _free_place(
+    axes: Axes, own: np.ndarray, others: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the place on a contour line that is furthest from what is drawn.
+
+    Args:
+        axes: that the value is to be inside of.
+        own: points of the contour line, shape (k, 2).
+        others: points of everything else, shape (m, 2).
+        half: of the width and the height of the value.
+
+    Returns:
+        The place and points that fill the value's box; None if it has no room.
+    """
+    best, margin = None, 1.0
+    inside = axes.bbox.padded(-float(half.max()))
+    for k in range(3, len(own) - 3, max(1, len(own) // _TRIED)):
+        if not inside.contains(*own[k]):
+            continue
+        along = own[k + 3] - own[k - 3]
+        length = float(np.hypot(*along))
+        if length < 3.0 * _APART:
+            continue
+        turn = np.array([[along[0], along[1]], [-along[1], along[0]]]) / length
+        away = np.abs((others - own[k]) @ turn.T) / half
+        room = float(away.max(axis=1).min(initial=np.inf))
+        if room > margin:
+            grid = np.stack(np.meshgrid(*(np.linspace(-h, h, 9) for h in half)), axis=-1)
+            best, margin = (own[k], own[k] + grid.reshape(-1, 2) @ turn), room
+    return best

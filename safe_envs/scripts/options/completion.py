@@ -28,7 +28,7 @@ def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
 
 def filters(incomplete: str) -> list[str]:
     """Names of filters, those of installed packages too."""
-    from safe_envs.wrappers.conditions.names import BY_THEMSELVES, condition_names
+    from safe_envs.filters.conditions.names import BY_THEMSELVES, condition_names
 
     return words(("none", *condition_names(), *BY_THEMSELVES))(incomplete)
 
@@ -42,6 +42,6 @@ def policies(incomplete: str) -> list[str]:
 
 def algorithms(incomplete: str) -> list[str]:
     """Names of algorithms."""
-    from safe_envs.agents.training.hyperparameters import ALGORITHMS
+    from safe_envs.agents.training.config import ALGORITHMS
 
     return words(ALGORITHMS)(incomplete)

@@ -2,30 +2,72 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import functools
 import inspect
 import io
 import json
 import os
+import re
 import signal
 import sys
 import threading
+import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from safe_envs.atomic_io import require_writable, write_json
 from safe_envs.errors import SafeEnvsError, nearest, shortened, shown
-from safe_envs.scripts.options.number_options import strict
-from safe_envs.text_lines import visible
+from safe_envs.files import require_writable, write_atomically, write_json
+from safe_envs.text import visible, whole_or_real
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.text import Text
+
+    from safe_envs.agents.jobs.executor import Backend
+    from safe_envs.agents.jobs.job import Job, JobOutcome
+
+
+def strict(parameter: inspect.Parameter) -> inspect.Parameter:
+    """Return the parameter of a command, with the project's reader if it is a number.
+
+    Typer itself accepts all that Python does: digits of other scripts, and 1_000.
+    """
+    if typing.get_origin(parameter.annotation) is not Annotated:
+        return parameter
+    hint, option, *_ = typing.get_args(parameter.annotation)
+    kind = next((kind for kind in (int, float) if kind in (hint, *typing.get_args(hint))), None)
+    if kind is None:
+        return parameter
+    found = copy.copy(option)
+    found.parser = _reader(kind, option.min)
+    found.metavar = option.metavar or ("INTEGER" if kind is int else "FLOAT")
+    return parameter.replace(annotation=Annotated[hint, found])
+
+
+def _reader(kind: type[int] | type[float], least: float | None) -> Callable[[Any], int | float]:
+    what = "a whole number" if kind is int else "a number"
+
+    def read(text: Any) -> int | float:
+        try:
+            # A default is a number already.
+            number = whole_or_real(text) if isinstance(text, str) else text
+        except ValueError:
+            number = None
+        if number is None or (kind is int and not isinstance(number, int)):
+            raise typer.BadParameter(f"= {shown(text)}; give {what}")
+        if least is not None and number < least:
+            raise typer.BadParameter(f"= {shown(number)}; give {what} from {least}")
+        return kind(number)
+
+    return read
+
 
 UsageError: Any = typer.BadParameter.__mro__[1]
 """The error of a command line that Typer cannot read, whichever Click it builds on."""
@@ -131,8 +173,6 @@ def with_signature(
 
 def stdout() -> Console:
     """Return the console for results, as wide as the terminal; without one, 80 characters."""
-    from safe_envs.scripts.options.result_console import result_console
-
     return result_console(_Terminal.quiet, _Terminal.silent)
 
 
@@ -294,7 +334,138 @@ def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
     if _Terminal.quiet or not sys.stderr.isatty():
         yield None
         return
-    from safe_envs.scripts.options.result_console import progress
 
     with progress(what) as tell:
         yield tell
+
+
+_LEAST_WIDTH = 40
+_PIPE_WIDTH = 80
+
+
+class _Tables(Console):
+    """A console that leaves out all but tables."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        tables = [found for found in objects if isinstance(found, Table)]
+        if tables:
+            super().print(*tables, **how)
+
+
+class _Trimmed(io.TextIOBase):
+    """A stream without the blanks at the ends of the lines of a table."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The encoding, which decides on the characters that draw tables."""
+        return self._stream.encoding
+
+    def write(self, text: str, /) -> int:
+        """Write whole lines, as a console does."""
+        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
+
+    def flush(self) -> None:
+        """See `io.TextIOBase`."""
+        self._stream.flush()
+
+
+def result_console(quiet: bool, silent: bool) -> Console:
+    """Return the console for results, as wide as the terminal; without one, 80 characters.
+
+    Args:
+        quiet: print tables only.
+        silent: print nothing.
+    """
+    kind = _Tables if quiet else Console
+    if sys.stdout.isatty():
+        return kind(width=max(Console().width, _LEAST_WIDTH), quiet=silent)
+    trimmed: Any = _Trimmed(sys.stdout)
+    return kind(width=_PIPE_WIDTH, quiet=silent, file=trimmed)
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar on stderr.
+
+    Args:
+        what: its title.
+
+    Yields:
+        The function that takes the part that is done.
+    """
+    # Not imported before it is needed: results need no bar.
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def write_text_result(path: Path | None, text: Callable[[], str]) -> None:
+    """Write a text for which an option is given, to a file or to stdout.
+
+    Args:
+        path: of the option.
+        text: makes it, without an end of line.
+
+    Raises:
+        ConfigurationError: the file cannot be written.
+    """
+    if path == STDOUT:
+        print(text())
+    elif path is not None:
+        write_atomically(path, lambda part: part.write_text(f"{text()}\n", encoding="utf-8"))
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    backend: Backend,
+    out: Path,
+    title: str,
+    keep: Callable[[JobOutcome], None] = lambda _: None,
+) -> list[JobOutcome]:
+    """Compute jobs with a progress bar.
+
+    Args:
+        jobs: what to compute.
+        backend: where.
+        out: folder of the results, from which the same command resumes after a stop.
+        title: of the progress bar.
+        keep: receives each outcome as soon as it exists.
+
+    Returns:
+        The outcomes of the jobs that failed.
+    """
+    from safe_envs.agents.jobs.executor import run
+
+    ended: list[JobOutcome] = []
+    with progress_bar(title) as tell:
+
+        def note(outcome: JobOutcome) -> None:
+            keep(outcome)
+            ended.append(outcome)
+            if tell:
+                tell(len(ended) / len(jobs))
+
+        try:
+            run(jobs, backend, note, lambda text: print(text, file=sys.stderr, flush=True))
+        except KeyboardInterrupt:
+            where = visible(str(out))
+            print(f"Stopped. The same command goes on after what is in {where}.", file=sys.stderr)
+            raise
+    return [outcome for outcome in ended if outcome.error is not None]

@@ -30,8 +30,8 @@ def known_filter(text: str | None) -> str | None:
     Raises:
         ConfigurationError: It begins otherwise.
     """
-    from safe_envs.wrappers.conditions.names import AT_STATE, unfiltered_in_sum
-    from safe_envs.wrappers.conditions.text_parts import require_known, require_parameters
+    from safe_envs.filters.conditions.names import AT_STATE, unfiltered_in_sum
+    from safe_envs.filters.conditions.text import require_known, require_parameters
 
     # An empty text, as of a shell's variable that is not set, is no filter.
     filtered = None if text is None else text.removesuffix(AT_STATE)
@@ -49,7 +49,7 @@ def known_estimator(text: str | None) -> str | None:
     Raises:
         ConfigurationError: There is none, or it has no such setting.
     """
-    from safe_envs.wrappers.estimation.names import settings_of
+    from safe_envs.filters.estimation.names import settings_of
 
     if text is not None:
         settings_of(text)
@@ -94,7 +94,7 @@ def known_algorithm(name: str) -> str:
     Raises:
         ConfigurationError: There is none.
     """
-    from safe_envs.agents.training.hyperparameters import ALGORITHMS
+    from safe_envs.agents.training.config import ALGORITHMS
 
     if name not in ALGORITHMS:
         raise ConfigurationError(f"--algo {shortened(name)}: {nearest(name, ALGORITHMS)}")

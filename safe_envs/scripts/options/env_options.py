@@ -108,10 +108,10 @@ class EnvOptions:
             ConfigurationError: The env is unknown, or cannot have an option.
             RelativeDegreeError: A filter does not suit a barrier.
         """
+        from safe_envs.filters.conditions.names import AT_STATE
+        from safe_envs.filters.conditions.text import require_degrees
         from safe_envs.registry import require_own
         from safe_envs.systems.summary import summaries
-        from safe_envs.wrappers.conditions.names import AT_STATE
-        from safe_envs.wrappers.conditions.text_parts import require_degrees
 
         env_id, arguments = self.full_id, self.arguments
         if env_id not in ENV_IDS:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.scripts.options import completion, early_checks, text_options
 
 LEARNED_PARAMETERS = (
@@ -241,3 +242,118 @@ Plot = Annotated[
         ),
     ),
 ]
+
+
+Leaving = Annotated[
+    str,
+    typer.Option(
+        metavar="violation|safe",
+        help=(
+            "How an episode counts that leaves the workspace in the safe set; evaluate counts it as"
+            " safe."
+        ),
+    ),
+]
+Cells = Annotated[
+    str | None,
+    typer.Option(
+        metavar="N|NxM|NxMxL",
+        help="Cells of the grid along each coordinate; by default as many as suit the env.",
+        show_default=False,
+    ),
+]
+Inputs = Annotated[
+    int | None,
+    typer.Option(
+        help="Inputs that are tried along each input; by default as many as suit the env.",
+        show_default=False,
+    ),
+]
+Table = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="The table: read if it is there, else written. By default it is in the cache.",
+        show_default=False,
+    ),
+]
+
+
+_MOST_DIGITS = 9
+
+
+def cells_of(text: str | None, example: str = "400x100") -> tuple[int, ...] | None:
+    """Return the numbers of cells of a text such as 400x100; None for none.
+
+    Args:
+        text: as given.
+        example: of such a text, for messages.
+
+    Raises:
+        ConfigurationError: It is no such text.
+    """
+    if text is None:
+        return None
+    parts = text.lower().split("x")
+    if not all(part.isascii() and part.isdigit() and len(part) <= _MOST_DIGITS for part in parts):
+        raise ConfigurationError(
+            f"--cells {shown(text)}; give a whole number for each coordinate, of at most"
+            f" {_MOST_DIGITS} digits, such as {example}"
+        )
+    return tuple(int(part) for part in parts)
+
+
+WIDTHS = {"single": 3.5, "double": 7.16}
+"""Widths in inches of a figure of one column of a paper and of two.
+
+Source: IEEE Author Center, "Resolution and size" of graphics: 3.5 in and 7.16 in.
+"""
+
+DEFAULT_SIZE = "double"
+
+Size = Annotated[
+    str | None,
+    typer.Option(
+        metavar="|".join(WIDTHS),
+        help="Width of the figure in columns of a paper: {single:g} or {double:g} inches;"
+        " {default} by default.".format(**WIDTHS, default=DEFAULT_SIZE),
+    ),
+]
+
+
+def size_of(size: str | None, plot: Path | None) -> str:
+    """Return the size of the figure of a command.
+
+    Args:
+        size: as given; None where it is not.
+        plot: file of the figure; None where none is drawn.
+
+    Raises:
+        ConfigurationError: there is no such size, or no figure.
+    """
+    if size is None:
+        return DEFAULT_SIZE
+    width_of(size)
+    if plot is None:
+        raise ConfigurationError(
+            f"--size {size} is of a figure, and none is drawn: give --plot FILE too, or leave"
+            " --size out"
+        )
+    return size
+
+
+def width_of(size: str) -> float:
+    """Return the width of a figure.
+
+    Args:
+        size: "single" or "double".
+
+    Returns:
+        Inches.
+
+    Raises:
+        ConfigurationError: there is no such size.
+    """
+    if size not in WIDTHS:
+        raise ConfigurationError(f"size = {shown(size)}; {nearest(str(size), list(WIDTHS))}")
+    return WIDTHS[size]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, shortened
-from safe_envs.number_text import real
+from safe_envs.text import real
 
 
 def read_hyperparameters(texts: Sequence[str]) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def read_hyperparameters(texts: Sequence[str]) -> dict[str, Any]:
     """
     import yaml
 
-    from safe_envs.agents.sweeps.document import value_of
+    from safe_envs.agents.sweeps.spec import value_of
 
     found = {}
     for text in texts:

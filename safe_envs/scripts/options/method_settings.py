@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
-from safe_envs.number_text import named_values, real
 from safe_envs.scripts.options.env_options import EnvOptions
+from safe_envs.text import named_values, real
 
 _NOT_SETTINGS = ("problem", "data", "seed", "step", "progress")
 _OF_COLLECTING = ("starts", "steps", "points", "repetitions")

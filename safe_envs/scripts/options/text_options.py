@@ -10,8 +10,8 @@ from typing import Annotated
 
 import typer
 
-from safe_envs.atomic_io import require_writable
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.files import require_writable
 from safe_envs.scripts.options import early_checks
 from safe_envs.scripts.options.console import STDOUT
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.text import Text
 
-from safe_envs.text_lines import break_points, visible
+from safe_envs.text import break_points, visible
 
 _INDENT = 4
 """Blanks before the further lines of a text that is wrapped."""

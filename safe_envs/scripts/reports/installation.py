@@ -11,14 +11,93 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version  # noqa: TID251
 from importlib.util import find_spec
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 from safe_envs.errors import install_extra
 from safe_envs.rendering.viewer import require_pygame
-from safe_envs.scripts.reports.known_qps import KNOWN_QPS, KnownQP
 from safe_envs.systems import ENV_IDS
+from safe_envs.wrappers.safety_filter import SafetyFilterVectorWrapper, SafetyFilterWrapper
+
+
+@dataclass(frozen=True)
+class KnownQP:
+    """The input nearest to a proposed one, within bounds, that meets constraints a u + b >= 0.
+
+    Attributes:
+        name: of the kind of QP, which decides on the solver.
+        a: k constraints of m coefficients.
+        b: k offsets.
+        proposed: m inputs.
+        bound: of the size of each input.
+        answer: m inputs.
+        feasible: whether the constraints can be met.
+    """
+
+    name: str
+    a: tuple[tuple[float, ...], ...]
+    b: tuple[float, ...]
+    proposed: tuple[float, ...]
+    bound: float
+    answer: tuple[float, ...]
+    feasible: bool = True
+
+    @property
+    def in_closed_form(self) -> bool:
+        """Whether no solver is needed."""
+        return len(self.b) == 1 or len(self.proposed) < 3
+
+
+KNOWN_QPS = (
+    KnownQP("one constraint, in closed form", ((-1.0, -1.0),), (1.0,), (1.0, 1.0), 5.0, (0.5, 0.5)),
+    KnownQP(
+        "one constraint that cannot be met",
+        ((1.0, 0.0),),
+        (-7.0,),
+        (0.0, 1.0),
+        5.0,
+        (5.0, 1.0),
+        feasible=False,
+    ),
+    KnownQP("several constraints, one input", ((-1.0,), (1.0,)), (1.0, 3.0), (2.0,), 5.0, (1.0,)),
+    KnownQP(
+        "several constraints, two inputs",
+        ((-1.0, 0.0), (0.0, -1.0)),
+        (1.0, 0.5),
+        (2.0, 2.0),
+        5.0,
+        (1.0, 0.5),
+    ),
+    KnownQP(
+        "contradicting constraints, two inputs",
+        ((1.0, 0.0), (-1.0, 0.0)),
+        (-2.0, 1.0),
+        (0.0, 0.3),
+        5.0,
+        (1.5, 0.3),
+        feasible=False,
+    ),
+    KnownQP(
+        "three inputs",
+        ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+        (1.0, 0.5),
+        (2.0, 2.0, 2.0),
+        5.0,
+        (1.0, 0.5, 2.0),
+    ),
+    KnownQP(
+        "contradicting constraints, three inputs",
+        ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0)),
+        (-10.0, 1.0),
+        (0.0, 0.0, 0.0),
+        3.0,
+        (3.0, 3.0, 3.0),
+        feasible=False,
+    ),
+)
+
 
 _NEEDED = ""
 """In place of an extra: what is needed in any case."""
@@ -107,7 +186,7 @@ def solvers() -> Iterator[Check]:
 
 
 def _solve(qp: KnownQP, solver: str) -> tuple[bool, str]:
-    from safe_envs.wrappers.qp.dispatch import project_floats
+    from safe_envs.engine.qp.dispatch import project_floats
 
     m, k = len(qp.proposed), len(qp.b)
     low, high, ones = [-qp.bound] * m, [qp.bound] * m, [1.0] * m
@@ -130,7 +209,7 @@ def envs() -> Iterator[Check]:
 def _step(env_id: str) -> tuple[bool, str]:
     from safe_envs.envs.env import SafeEnv
     from safe_envs.registry import make_problem
-    from safe_envs.wrappers import SafetyFilterWrapper
+    from safe_envs.wrappers.safety_filter import SafetyFilterWrapper
 
     problem = make_problem(env_id)
     env = SafetyFilterWrapper(SafeEnv(problem), problem.filter)
@@ -161,8 +240,6 @@ def _check(name: str, look: Callable[[], tuple[bool, str]], advice: str) -> Chec
 
 def speeds() -> dict[str, float]:
     """Return the steps per second of single envs on this machine, by what is stepped."""
-    from safe_envs.scripts.reports.env_speeds import NUM_ENVS, scalar_steps, vector_steps
-
     vector, filtered = f"vector env of {NUM_ENVS}", "with scbf"
     names = ("env", f"env {filtered}", vector, f"{vector} {filtered}")
     found = {}
@@ -172,3 +249,56 @@ def speeds() -> dict[str, float]:
         seconds = min(timeit.repeat(case.call, number=steps, repeat=3))
         found[name] = case.states * steps / seconds
     return found
+
+
+ENV_ID = "safe_envs/StochasticDubins-v0"
+NUM_ENVS = 1024
+
+
+class Case(NamedTuple):
+    """A call to time.
+
+    Attributes:
+        call: what is timed.
+        states: how many it handles.
+        prepare: done before each round.
+        calls: in a round; None for as many as fit its time.
+    """
+
+    call: Callable[[], Any]
+    states: int = 1
+    prepare: Callable[[], Any] = lambda: None
+    calls: int | None = None
+
+
+def scalar_steps() -> dict[str, Case]:
+    """Return steps of a scalar env, unfiltered and filtered."""
+
+    # No episode may end within a round: the vehicle turns on the spot, with little noise.
+    def make() -> gym.Env[Any, Any]:
+        return gym.make(ENV_ID, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01)
+
+    envs = {"unfiltered": make(), "filtered": SafetyFilterWrapper(make(), "scbf")}
+    action = np.array([0.9], dtype=np.float32)
+    return {
+        f"env.step, {name}": Case(
+            lambda env=env: env.step(action), prepare=lambda env=env: env.reset(seed=0)
+        )
+        for name, env in envs.items()
+    }
+
+
+def vector_steps(engine: str = "numpy") -> dict[str, Case]:
+    """Return steps of a vector env, unfiltered and filtered."""
+    unfiltered, other = (gym.make_vec(ENV_ID, num_envs=NUM_ENVS, engine=engine) for _ in range(2))
+    envs = {"unfiltered": unfiltered, "filtered": SafetyFilterVectorWrapper(other, "scbf")}
+    actions = np.full((NUM_ENVS, 1), 0.3, dtype=np.float32)
+    cases = {}
+    for name, env in envs.items():
+        env.reset(seed=0)
+        # Ten whole episodes, so that resets and draws of noise have their share of every round.
+        calls = 10 * (env.unwrapped.problem.steps + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        cases[f"vector env, {name}"] = Case(
+            lambda env=env: env.step(actions), NUM_ENVS, calls=calls
+        )
+    return cases

@@ -7,7 +7,7 @@ import numpy as np
 
 from safe_envs import SafeEnv
 from safe_envs.agents import make_policy
-from safe_envs.agents.evaluation.rollout import episode_seed
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.wrappers import SafetyFilterWrapper
 

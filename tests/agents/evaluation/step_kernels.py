@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.compiled.slots import (
+from safe_envs.engine.slots import (
     Input,
     State,
     advance,

@@ -11,18 +11,22 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import attainable, yardstick
-from safe_envs.agents.evaluation.attainable import AttainableSafety, attainable_safety
-from safe_envs.agents.evaluation.countings import leaves_safely
-from safe_envs.agents.evaluation.greedy_episodes import SimulatedRate, simulate
+from safe_envs.agents.evaluation.attainable import (
+    AttainableSafety,
+    SimulatedRate,
+    attainable_safety,
+    leaves_safely,
+    simulate,
+)
 from safe_envs.agents.evaluation.yardstick import (
     TimesUnavoidable,
     best_for,
     held_against,
     times_unavoidable,
 )
+from safe_envs.files import VARIABLE, entries
 from safe_envs.registry import make_problem
-from safe_envs.user_cache import VARIABLE, entries
-from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.values.tables import ValueSettings
 from tests.agents.policies.coarse import COARSE, SHORT, coarse
 
 NEAR_THE_EDGE = {**SHORT, "start": [0.8], "noise": 1.5}

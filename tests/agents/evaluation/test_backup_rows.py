@@ -10,19 +10,18 @@ import sympy as sp
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import make_policy
-from safe_envs.agents.evaluation.backup_bound import COMPUTED, STATED, BackupBound
+from safe_envs.agents.evaluation.bounds import COMPUTED_PLANS, STATED, BackupBound
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
+from safe_envs.agents.evaluation.episodes import play
 from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
-from safe_envs.agents.evaluation.rollout import play
+from safe_envs.agents.evaluation.resolve import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.sweeps.cell import Sweep
-from safe_envs.agents.sweeps.spec import read_sweep
+from safe_envs.agents.sweeps.spec import Sweep, read_sweep
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.backup import BackupLaw
+from safe_envs.proofs.backup_filter import BackupFilter
 from safe_envs.wrappers import SafetyFilterVectorWrapper
-from safe_envs.wrappers.backup import BackupFilter
 from tests.agents.evaluation.test_compiled_episodes import assert_alike, joined
 from tests.wrappers.backup.carts import DT, STRONGEST, cart, cart_problem, v, x
 
@@ -44,7 +43,10 @@ def rows(problem, filters=("backup",), **settings):
 def test_it_is_safe_where_it_says_and_its_bound_is_the_share_of_such_starts():
     unfiltered, guarded = rows(cart_problem(**WIDE), ("none", "backup"), policy="nominal")
     assert unfiltered.safety_rate == 0.0
-    assert (guarded.held_word, guarded.held_note) == ("computed", COMPUTED + STATED.format("brake"))
+    assert (guarded.held_word, guarded.held_note) == (
+        "computed",
+        COMPUTED_PLANS + STATED.format("brake"),
+    )
     assert 0.3 < guarded.held_bound < 0.95
     assert guarded.safety_rate == guarded.held_bound
     assert "plans" in guarded.continuous_note

@@ -12,9 +12,8 @@ import pytest
 
 from safe_envs import ConfigurationError, RelativeDegreeError
 from safe_envs.agents import NominalController, evaluate, make_problem
-from safe_envs.agents.evaluation import rollout
-from safe_envs.agents.evaluation.rollout import play
-from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation import episodes as played
+from safe_envs.agents.evaluation.episodes import Trajectories, play
 from safe_envs.envs.vector_env import SafeVectorEnv
 
 pytestmark = pytest.mark.slow
@@ -219,10 +218,10 @@ def test_parts_of_processes_do_not_grow_with_episodes(monkeypatch):
             sizes.extend(map(len, parts))
             return ([] for _ in parts)
 
-        monkeypatch.setattr(rollout, "compute_in_order", done)
+        monkeypatch.setattr(played, "compute_in_order", done)
         how = (episodes, 0, 1024, 2, False, told.append)
         no_env: Any = None
-        assert list(rollout.play_in_processes(no_env, None, *how)) == []
+        assert list(played.play_in_processes(no_env, None, *how)) == []
         assert sum(sizes) == told[-1] == episodes
         return max(sizes)
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from safe_envs.agents.evaluation.best_text import attainable_text, ends_text, times_text
+from safe_envs.agents.evaluation.table import attainable_text, ends_text, times_text
 from safe_envs.agents.evaluation.yardstick import TimesUnavoidable
 from tests.agents.evaluation.made_up import attainable
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation import bound_check
-from safe_envs.agents.evaluation.bound_check import Horizon, MeasuredSafety, measure, starts_of
+from safe_envs.agents.evaluation import safety_chain
+from safe_envs.agents.evaluation.safety_chain import Horizon, MeasuredSafety, measure, starts_of
 from safe_envs.errors import ConfigurationError
+from safe_envs.proofs.guarantees import Bound
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.results import Bound
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import verify_once
 
@@ -34,14 +34,14 @@ def contradicted(measurement):
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(bound_check, "_LONG_MULTIPLES", ())
-    monkeypatch.setattr(bound_check, "STARTS", 1024)
+    monkeypatch.setattr(safety_chain, "_LONG_MULTIPLES", ())
+    monkeypatch.setattr(safety_chain, "STARTS", 1024)
 
 
 @pytest.mark.slow
 def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch):
-    monkeypatch.setattr(bound_check, "_MULTIPLES", (1,))
-    monkeypatch.setattr(bound_check, "_LONG_MULTIPLES", (30,))
+    monkeypatch.setattr(safety_chain, "_MULTIPLES", (1,))
+    monkeypatch.setattr(safety_chain, "_LONG_MULTIPLES", (30,))
     # With the default noise of .2 it takes four times as long.
     _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4, dt=0.1)
     assert at_best.state is not None
@@ -80,7 +80,7 @@ def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_bounds_of_the_pendulum_hold(monkeypatch):
-    monkeypatch.setattr(bound_check, "_MULTIPLES", (1, 4))
+    monkeypatch.setattr(safety_chain, "_MULTIPLES", (1, 4))
     measurements = measured("safe_envs/Pendulum-v0")
     assert len(measurements) == 2
     assert not any(contradicted(m) for m in measurements)
@@ -119,7 +119,7 @@ def test_progress_reaches_the_end():
 
 @pytest.mark.usefixtures("short")
 def test_starts_are_one_or_many():
-    assert starts_of(problem_of(CUBIC_DISK)).shape == (bound_check.STARTS, 2)
+    assert starts_of(problem_of(CUBIC_DISK)).shape == (safety_chain.STARTS, 2)
     np.testing.assert_array_equal(
         starts_of(problem_of(CUBIC_DISK, start="thesis-1")), [[-0.1, 0.7]]
     )
@@ -138,6 +138,6 @@ def test_a_mean_over_starts_may_be_off_by_its_error():
     bound = Bound("a", 0.9, "estimated", "", error=0.01)
     nowhere = Horizon(1.0, 1750, 0.875, 0.87, 0.88, (bound,))
     measurement = MeasuredSafety("s", None, 2000, False, (nowhere,))
-    assert bound_check._compared(measurement, nowhere, 1).contradicted == ()
+    assert safety_chain._compared(measurement, nowhere, 1).contradicted == ()
     exact = replace(nowhere, bounds=(replace(bound, error=0.0),))
-    assert bound_check._compared(measurement, exact, 1).contradicted == ("a",)
+    assert safety_chain._compared(measurement, exact, 1).contradicted == ("a",)

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.agents.evaluation.bound_text import (
-    bound_cells,
-    bound_text,
-    continuous_text,
-    held_text,
-)
 from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.agents.evaluation.table import bound_cells, bound_text, continuous_text, held_text
 
 
 def test_only_what_is_proved_or_certified_stands_after_a_sign():

@@ -10,8 +10,8 @@ import sympy as sp
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import evaluate
-from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
+from safe_envs.problem.starts import Start
 
 pytestmark = pytest.mark.slow
 

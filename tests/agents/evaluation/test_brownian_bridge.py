@@ -14,10 +14,15 @@ from scipy.stats import kstest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, bridge_notes
-from safe_envs.agents.evaluation.rollout import episode_seed
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.policies.nominal import RandomPolicy
-from safe_envs.dynamics.normal import standard_exponentials
-from safe_envs.dynamics.philox import BRIDGE, POLICY, StreamReader, episode_seeds
+from safe_envs.dynamics.noise import (
+    BRIDGE,
+    POLICY,
+    StreamReader,
+    episode_seeds,
+    standard_exponentials,
+)
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
 pytestmark = pytest.mark.slow

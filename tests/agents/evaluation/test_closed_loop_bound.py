@@ -7,12 +7,15 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.closed_loop_bound import closed_loop_bound, compute_closed_loop
-from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
+from safe_envs.agents.evaluation.bounds import (
+    FilteredPolicy,
+    closed_loop_bound,
+    compute_closed_loop,
+)
 from safe_envs.agents.evaluation.spec import EvaluationSpec
+from safe_envs.values import closed_loop
+from safe_envs.values.promise_filter import PromiseSettings
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.value import closed_loop
-from safe_envs.wrappers.value.promise_text import PromiseSettings
 from tests.conftest import problem_of
 
 SHORT = {"horizon": 0.1, "noise": 1.0}

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.combined_rates import combined_rates
-from safe_envs.agents.evaluation.comparison import pair_counts
-from safe_envs.agents.evaluation.safe_flags import SafeFlags
-from safe_envs.agents.evaluation.statistics import paired_difference_interval, rate_interval
+from safe_envs.agents.evaluation.statistics import (
+    SafeFlags,
+    combined_rates,
+    pair_counts,
+    paired_difference_interval,
+    rate_interval,
+)
 
 RATIO = 2**-0.5
 LIMIT = (0.0, -RATIO / (1 - RATIO), 1 / (1 - RATIO))

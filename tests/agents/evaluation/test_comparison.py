@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.comparison import compare_all, pair_counts
-from safe_envs.agents.evaluation.safe_flags import SafeFlags
+from safe_envs.agents.evaluation.statistics import SafeFlags, compare_all, pair_counts
 
 
 def test_pairs_are_counted():

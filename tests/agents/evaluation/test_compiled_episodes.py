@@ -12,11 +12,11 @@ from safe_envs.agents import evaluate, make_policy
 from safe_envs.agents.evaluation import compiled_episodes
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
-from safe_envs.agents.evaluation.rollout import play
-from safe_envs.agents.jobs.threads import available_threads, one_thread
-from safe_envs.compiled import engine as engine_module
-from safe_envs.compiled import program as program_module
-from safe_envs.compiled.program import Program
+from safe_envs.agents.evaluation.episodes import play
+from safe_envs.agents.jobs.job import available_threads, one_thread
+from safe_envs.engine import choice as engine_module
+from safe_envs.engine import program as program_module
+from safe_envs.engine.program import Program
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper

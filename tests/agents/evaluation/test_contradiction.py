@@ -13,21 +13,22 @@ from scipy.stats import binom
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation import bound_check, refinement
-from safe_envs.agents.evaluation.contradiction import (
+from safe_envs.agents.evaluation import evaluate as evaluation
+from safe_envs.agents.evaluation import safety_chain
+from safe_envs.agents.evaluation.bounds import (
     above_attainable,
     by_rate,
     end_for,
     judged,
     upper_ends,
 )
-from safe_envs.agents.evaluation.refinement import refine
+from safe_envs.agents.evaluation.evaluate import refine
 from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
+from safe_envs.filters.learning.bayesian import identify
+from safe_envs.proofs import analysis, guarantees
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.judge import JudgeResult, Supremum
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.verification import proof, safe_set_analysis
-from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.judge import JudgeResult, Supremum
 from tests.oracles import false_bounds
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
@@ -64,19 +65,17 @@ HORIZON = 0.5
 def credulous(monkeypatch):
     """A search that knows neither of poles and kinks nor of the starts, and that is cut short: it
     finds what was found before."""
-    monkeypatch.setattr(safe_set_analysis, "roughness", lambda *_: "")
-    monkeypatch.setattr(
-        safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points
-    )
+    monkeypatch.setattr(analysis, "roughness", lambda *_: "")
+    monkeypatch.setattr(analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points)
 
 
 @pytest.fixture
 def undecided(monkeypatch):
     """A judge that decides nothing but that C is bounded."""
     verdict = JudgeResult("undecided", 0, reason="not looked at")
-    monkeypatch.setattr(proof, "judge", lambda *_: verdict)
+    monkeypatch.setattr(guarantees, "judge", lambda *_: verdict)
     monkeypatch.setattr(
-        proof, "supremum", lambda *_: Supremum(math.inf, -math.inf, None, 0, "not looked at")
+        guarantees, "supremum", lambda *_: Supremum(math.inf, -math.inf, None, 0, "not looked at")
     )
 
 
@@ -128,9 +127,7 @@ def test_margins_of_first_order_of_several_conditions_leave_no_bound():
     assert plain.infeasible_rate == 0.0
 
 
-@pytest.mark.filterwarnings(
-    "ignore::safe_envs.wrappers.learning.identifiability.IdentifiabilityWarning"
-)
+@pytest.mark.filterwarnings("ignore::safe_envs.filters.learning.bayesian.IdentifiabilityWarning")
 def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     problem = false_bounds.kink()
     name = "bayesian-scbf:simultaneous=0.9"
@@ -140,9 +137,7 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     assert row.posterior_bound.note.startswith(
         "h is not twice differentiable, which Ito's formula asks for, near x = "
     )
-    monkeypatch.setattr(
-        "safe_envs.wrappers.verification.posterior_guarantee.roughness", lambda *_: ""
-    )
+    monkeypatch.setattr("safe_envs.proofs.posterior.roughness", lambda *_: "")
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
     assert row.posterior_bound.probability is None
     # The judge looks at the kink, where the condition has no value.
@@ -163,16 +158,16 @@ def test_nothing_converges_beside_a_bound_that_is_contradicted():
 @pytest.mark.slow
 @pytest.mark.usefixtures("credulous", "undecided")
 def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
-    monkeypatch.setattr(bound_check, "_MULTIPLES", (1,))
-    monkeypatch.setattr(bound_check, "_LONG_MULTIPLES", ())
+    monkeypatch.setattr(safety_chain, "_MULTIPLES", (1,))
+    monkeypatch.setattr(safety_chain, "_LONG_MULTIPLES", ())
     for make, text in ((false_bounds.island, "scbf"), (false_bounds.rotated, "cbf:alpha=0.1")):
         problem = make()
         found = verify(problem, parse_conditions(text, problem), samples=1024)
         inside = found.analysis.safe.points[:1]
         bounds = found.guarantee.applicable_bounds(inside, problem.duration)
         assert "estimated" in {bound.status for bound in bounds}
-        bounds, measurements = bound_check.judged(
-            bounds, bound_check.measure(found, episodes=40), found
+        bounds, measurements = safety_chain.withhold_contradicted(
+            bounds, safety_chain.measure(found, episodes=40), found
         )
         assert all(bound.value is None for bound in bounds if bound.status == "withheld")
         assert {bound.status for bound in bounds} <= {"withheld", "hypothesis fails"}
@@ -183,9 +178,7 @@ def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
 
 @pytest.mark.usefixtures("undecided")
 def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
-    monkeypatch.setattr(
-        safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points
-    )
+    monkeypatch.setattr(analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points)
     problem = false_bounds.island()
     found = verify(problem, parse_conditions("scbf", problem), samples=512)
     bounds = found.guarantee.applicable_bounds(np.array([[1.5, 0.3]]), HORIZON)
@@ -205,13 +198,13 @@ def test_a_rate_with_a_smaller_period_withholds_too():
         )
         for safe in (5000, 3000)
     ]
-    assert refinement._judged(row, finer[:1]) == row
-    assert refinement._judged(row, finer).withheld.startswith(
+    assert evaluation._judged(row, finer[:1]) == row
+    assert evaluation._judged(row, finer).withheld.startswith(
         "the interval of the measured rate ends at 31.0 %, below 50.0 %"
     )
     # What is of the env's own steps is of its own period.
     held = replace(row, continuous_bound=None, held_bound=0.5, held_word="proved")
-    assert refinement._judged(held, finer) == held
+    assert evaluation._judged(held, finer) == held
 
 
 def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch, request):
@@ -235,7 +228,7 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch, request):
         None,
     )
     assert row.continuous_word == "proved"
-    monkeypatch.setattr(safe_set_analysis.SafeSetAnalysis, "suprema", np.array([2.0, 0.8]))
+    monkeypatch.setattr(analysis.SafeSetAnalysis, "suprema", np.array([2.0, 0.8]))
     request.getfixturevalue("undecided")
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
     assert row.withheld == "b_1 reaches 1, above the supremum of 0.8 that the search found"

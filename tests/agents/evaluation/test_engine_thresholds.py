@@ -10,17 +10,17 @@ import pytest
 
 from safe_envs import RelativeDegreeError
 from safe_envs.agents import make_policy
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source
-from safe_envs.compiled.program import Program
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
 from safe_envs.envs.simulation import Simulation
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.world_source import world_source
 from safe_envs.errors import NotCompilableError
+from safe_envs.filters.decision_source import filter_source
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.proofs.safe_set import draw_starts
 from safe_envs.wrappers import SafetyFilter
-from safe_envs.wrappers.filter_qp.filter_source import filter_source
-from safe_envs.wrappers.verification.safe_set import draw_starts
 from tests.agents.evaluation.step_kernels import take_steps
 from tests.conftest import problem_of
 

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from safe_envs.agents import make_problem
-from safe_envs.agents.evaluation import episode_statistics
-from safe_envs.agents.evaluation.episode_batch import PlayedBatch
-from safe_envs.agents.evaluation.episode_statistics import EpisodeStatistics
-from safe_envs.agents.evaluation.rounding import SlightViolations
+from safe_envs.agents.evaluation import episodes
+from safe_envs.agents.evaluation.episodes import EpisodeStatistics, PlayedBatch, VisitedStates
 from safe_envs.agents.evaluation.rows import EpisodeResults
-from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.agents.evaluation.statistics import SlightViolations
 from tests.agents.evaluation.made_up import made_up
 
 PROBLEM = make_problem("Scalar-v0")
@@ -35,7 +33,7 @@ def statistics_of(results, portion):
 
 @pytest.fixture
 def few_quantiles(monkeypatch):
-    monkeypatch.setattr(episode_statistics, "_QUANTILES_OF", 100)
+    monkeypatch.setattr(episodes, "_QUANTILES_OF", 100)
 
 
 @pytest.mark.usefixtures("few_quantiles")

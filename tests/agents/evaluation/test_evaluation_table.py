@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from safe_envs.agents.evaluation.evaluation_table import evaluation_table, p_text, thousands
+from safe_envs.agents.evaluation.table import evaluation_table, p_text, thousands
 from tests.agents.evaluation.made_up import nasty_evaluation
 
 

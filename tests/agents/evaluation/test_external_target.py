@@ -39,7 +39,7 @@ def test_the_rate_is_that_of_episodes_played_by_hand():
         barriers=SPEC.barriers,
         state_fn=SPEC.state_fn,
     )
-    from safe_envs.agents.evaluation.rollout import episode_seed
+    from safe_envs.agents.evaluation.episodes import episode_seed
 
     smallest, returns = [], []
     for i in range(4):

@@ -7,11 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.frontier import FrontierSpec, frontier
-from safe_envs.agents.evaluation.frontier_results import Frontier, FrontierPoint
+from safe_envs.agents.evaluation.frontier import Frontier, FrontierPoint, FrontierSpec, frontier
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.priced_values import FrontierSettings
+from safe_envs.values.frontier import FrontierSettings
 
 PRICES = np.array([0.0, 10.0, 100.0])
 VALUES = (50.0, 47.0, 40.0)

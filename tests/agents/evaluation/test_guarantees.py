@@ -10,7 +10,7 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.guarantees import together
+from safe_envs.agents.evaluation.bounds import together
 from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 
 

@@ -6,12 +6,12 @@ from fractions import Fraction
 
 import numpy as np
 
-from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
-from safe_envs.agents.evaluation.held_certificate_bound import (
+from safe_envs.agents.evaluation.bounds import (
+    FilteredPolicy,
     HeldCertificateBound,
     held_certificate_bound,
 )
-from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.agents.evaluation.episodes import VisitedStates
 from safe_envs.wrappers import SZCBF, Certified
 from tests.conftest import problem_of
 from tests.wrappers.certificates.held_examples import SCALAR, scalar_certificate, with_numbers

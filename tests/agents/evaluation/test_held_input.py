@@ -7,20 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
-from safe_envs.agents.evaluation.held_input import (
+from safe_envs.agents.evaluation.bounds import (
     MAKERS,
     NO_FILTER,
     NO_MAKER,
+    FilteredPolicy,
     HeldAverager,
+    PromiseBound,
     held_averager_of,
     held_bound_of,
 )
-from safe_envs.agents.evaluation.promise_bound import PromiseBound
+from safe_envs.agents.evaluation.episodes import VisitedStates
 from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.values.promise_filter import PromiseSettings
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.value.promise_text import PromiseSettings
 from tests.conftest import problem_of
 
 SCALAR = "safe_envs/Scalar-v0"

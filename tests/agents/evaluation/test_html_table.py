@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
+from safe_envs.agents.evaluation.notes import evaluation_notes
 from tests.agents.evaluation.made_up import LONG_NAME, nasty_evaluation
 
 ATTACK = '<script>alert("x")</script> & <b onclick="f()">'

@@ -12,8 +12,8 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.identification import Learning, learned_of
+from safe_envs.filters.learning import LearnedFileError, learner_of
 from safe_envs.wrappers import BayesianSCBF
-from safe_envs.wrappers.learning import LearnedFileError, learner_of
 
 pytestmark = pytest.mark.slow
 

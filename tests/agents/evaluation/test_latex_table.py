@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from safe_envs.agents.evaluation.evaluation_notes import evaluation_notes
 from safe_envs.agents.evaluation.latex_table import escape, latex_table
+from safe_envs.agents.evaluation.notes import evaluation_notes
 from tests.agents.evaluation.made_up import nasty_evaluation
 
 SIGNS = r"""\{}^~<>|"'`&%$#_[]*@!?-- --- a_b 50 % -1 x:-2 >= <= λ_1 ü ß Ł 中 🙂"""

@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import norm
 
 from safe_envs.agents import RandomPolicy, evaluate, make_problem
-from safe_envs.agents.evaluation.rollout import episode_seed
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.evaluation.statistics import wilson_interval
-from safe_envs.dynamics.philox import (
+from safe_envs.dynamics.noise import (
     BRIDGE,
     EPISODE,
     NOISE,

@@ -11,11 +11,11 @@ import pytest
 from rich.console import Console
 
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.learned_notes import learned_notes
+from safe_envs.agents.evaluation.notes import learned_notes
 from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorSummary
 from safe_envs.registry import make_problem
 from safe_envs.scripts.options.evaluation_options import LEARNED_PARAMETERS
-from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
+from safe_envs.scripts.reports.evaluation import heading, print_evaluation
 from safe_envs.wrappers import LEARNED
 
 NO_BOUND = "no bound for learned filters"

@@ -12,24 +12,22 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.bounds import COMPUTED_TABLE, judged
 from safe_envs.agents.evaluation.evaluate import evaluate, run_evaluation
-from safe_envs.agents.evaluation.promise_bound import COMPUTED
-from safe_envs.agents.evaluation.promise_notes import computed_notes
-from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.notes import computed_notes
+from safe_envs.agents.evaluation.resolve import ResolvedEvaluation
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.errors import NotCompilableError
-from safe_envs.wrappers.value.promise_tables import (
+from safe_envs.values.promise_filter import (
     _IN_USE,
+    PromiseSettings,
     promise_filter_for,
     why_not_of_plant,
 )
-from safe_envs.wrappers.value.promise_text import PromiseSettings
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
-from safe_envs.wrappers.value.table_files import save_table
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings, save_table
 from tests.conftest import problem_of
 
 SCALAR, SHORT = "safe_envs/Scalar-v0", {"horizon": 0.3}
@@ -45,7 +43,7 @@ def test_a_promise_filter_is_a_row_with_its_own_bound(found):
     none, row, scbf = found.rows
     assert row.filter == NAME
     assert row.held_bound == pytest.approx(0.9, abs=1e-6)
-    assert (row.held_word, row.held_note) == ("computed", COMPUTED)
+    assert (row.held_word, row.held_note) == ("computed", COMPUTED_TABLE)
     assert (row.continuous_bound, row.continuous_word) == (None, "none")
     assert row.continuous_note == PromiseSettings.only_of_steps
     # Equal values at all starts.
@@ -195,7 +193,7 @@ def test_a_bound_is_withheld_where_the_table_lets_p_k_fall(tmp_path):
 
 
 def test_a_bound_that_the_rate_contradicts_is_withheld():
-    row = BoundSummary(held_bound=0.9, held_word="computed", held_note=COMPUTED)
+    row = BoundSummary(held_bound=0.9, held_word="computed", held_note=COMPUTED_TABLE)
     assert judged(row, 0.9, 0.9) == row
     found = judged(row, 0.85, 0.85)
     assert (found.held_bound, found.held_word) == (None, "withheld")

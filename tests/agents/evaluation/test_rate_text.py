@@ -1,7 +1,6 @@
 import pytest
 
-from safe_envs.agents.evaluation.rate_text import percent, percent_in, points_in
-from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.statistics import percent, percent_in, points_in, rate_interval
 
 
 @pytest.mark.parametrize(

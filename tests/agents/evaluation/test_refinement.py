@@ -11,9 +11,8 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
-from safe_envs.agents.evaluation.comparison import pair_counts
-from safe_envs.agents.evaluation.refinement import TOLERANCE, refine, verdict
-from safe_envs.agents.evaluation.statistics import paired_difference_interval
+from safe_envs.agents.evaluation.evaluate import TOLERANCE, refine, verdict
+from safe_envs.agents.evaluation.statistics import pair_counts, paired_difference_interval
 from tests.oracles.laws import mean_reverting
 
 pytestmark = pytest.mark.slow

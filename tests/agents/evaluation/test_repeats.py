@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.repeats import interval_over, pooled
+from safe_envs.agents.evaluation.identification import interval_over, pooled
 from safe_envs.agents.evaluation.rows import EpisodeSummary
-from safe_envs.agents.evaluation.safety_curve import Curve
-from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
+from safe_envs.agents.evaluation.statistics import Curve, rate_interval, repeated_interval
 
 
 def row(safe, episodes, **changes):

@@ -14,7 +14,7 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import episodes_file
-from safe_envs.agents.evaluation.frames import row_columns
+from safe_envs.agents.evaluation.results import row_columns
 from safe_envs.agents.evaluation.spec import RunSettings
 from tests.agents.evaluation.made_up import attainable, nasty_evaluation
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.safe_flags import SafeFlags
+from safe_envs.agents.evaluation.statistics import SafeFlags
 
 
 @pytest.mark.parametrize("portion", [1, 7, 8, 9, 64, 1000])

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.evaluation import safety_chain as of
-from safe_envs.agents.evaluation.bound_check import Horizon, MeasuredSafety
-from safe_envs.agents.evaluation.filtered_policy import FilteredPolicy
+from safe_envs.agents.evaluation.bounds import FilteredPolicy
 from safe_envs.agents.evaluation.rows import BoundSummary
-from safe_envs.agents.evaluation.safety_chain import safety_chain
+from safe_envs.agents.evaluation.safety_chain import Horizon, MeasuredSafety, safety_chain
 from safe_envs.agents.evaluation.yardstick import against_attainable, chained
+from safe_envs.proofs.guarantees import Bound
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.results import Bound
 from tests.agents.evaluation.made_up import attainable
 from tests.conftest import problem_of
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.safety_curve import CurveCounts, curve_instants
-from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.statistics import CurveCounts, curve_instants, rate_interval
 
 
 @pytest.mark.parametrize("steps", [1, 2, 199, 200, 201, 400, 401, 1000, 100_001])

@@ -11,8 +11,9 @@ import pytest
 from scipy.stats import binom, binomtest, multinomial, norm
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.running_sum import RunningMean, RunningSum
 from safe_envs.agents.evaluation.statistics import (
+    RunningMean,
+    RunningSum,
     exact_interval,
     exact_upper_end,
     log_normal_interval,

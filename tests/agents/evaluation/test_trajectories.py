@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents import NominalController, evaluate
-from safe_envs.agents.evaluation.rollout import episode_seed
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.wrappers import SafetyFilterWrapper
 
 pytestmark = pytest.mark.slow

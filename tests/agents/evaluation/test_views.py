@@ -7,12 +7,12 @@ import pytest
 
 from safe_envs import SafeVectorEnv
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.belief_bound import why_not_proved
-from safe_envs.agents.evaluation.promise_notes import computed_notes
+from safe_envs.agents.evaluation.notes import computed_notes
+from safe_envs.agents.evaluation.resolve import why_belief_not_proved
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.estimation import make_estimator
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, StateEstimatorVectorWrapper
-from safe_envs.wrappers.estimation import make_estimator
 
 ENV = "safe_envs/Pendulum-v0"
 OPTIONS = {"measurement": "default", "horizon": 0.3}
@@ -58,7 +58,7 @@ def test_estimates_are_counted_as_the_envs_report_them():
     env = SafetyFilterVectorWrapper(
         StateEstimatorVectorWrapper(SafeVectorEnv(problem, 60)), "scbf:belief=0.1"
     )
-    from safe_envs.agents.evaluation.rollout import episode_seed
+    from safe_envs.agents.evaluation.episodes import episode_seed
     from safe_envs.agents.policies.nominal import NominalController
 
     policy = NominalController(problem.unmeasured)
@@ -176,23 +176,25 @@ def test_what_cannot_be_is_refused(given, words):
 )
 def test_why_a_bound_is_not_proved(options, start, words):
     problem = make_problem(ENV, **{"measurement": "default", **options})
-    assert words in why_not_proved(problem, make_estimator("ekf", problem))
+    assert words in why_belief_not_proved(problem, make_estimator("ekf", problem))
 
 
 def test_a_bound_is_proved_of_a_known_linear_system_alone():
     problem = make_problem("Scalar-v0", measurement="default", start="origin")
-    assert why_not_proved(problem, make_estimator("kf", problem)) is None
-    assert why_not_proved(problem, make_estimator("ekf", problem)) is None
+    assert why_belief_not_proved(problem, make_estimator("kf", problem)) is None
+    assert why_belief_not_proved(problem, make_estimator("ekf", problem)) is None
     for changed, words in (
         ({"start": "spread"}, "start"),
         ({"measurement": ["default:bias=.1"]}, "biased"),
         ({"model": {"sigma": 0.1}}, "model is not the plant"),
     ):
         other = problem.configured(**changed)
-        assert words in why_not_proved(other, make_estimator("kf", other))
-    assert "noise" in why_not_proved(problem, make_estimator("kf:process_noise=0.1", problem))
-    assert "ukf" in why_not_proved(problem, make_estimator("ukf", problem))
-    assert "between" in why_not_proved(problem, make_estimator("kf", problem), "continuous")
+        assert words in why_belief_not_proved(other, make_estimator("kf", other))
+    assert "noise" in why_belief_not_proved(
+        problem, make_estimator("kf:process_noise=0.1", problem)
+    )
+    assert "ukf" in why_belief_not_proved(problem, make_estimator("ukf", problem))
+    assert "between" in why_belief_not_proved(problem, make_estimator("kf", problem), "continuous")
     given = {"options": {"measurement": "default", "horizon": 0.3, "start": "origin"}}
     for monitoring, word in (("discrete", "proved"), ("continuous", "designed")):
         found = evaluate(

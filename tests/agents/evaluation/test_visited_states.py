@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs.agents.evaluation.visited_states import StateWatch, VisitedStates
+from safe_envs.agents.evaluation.episodes import StateWatch, VisitedStates
 
 EPISODES, STEPS = 90, 4
 

@@ -4,7 +4,7 @@ import pytest
 import scipy.linalg  # noqa: F401  (brings a BLAS)
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from safe_envs.agents.jobs import blas_threads
+from safe_envs.agents.jobs import job
 
 
 def threads() -> set[int]:
@@ -16,6 +16,6 @@ def threads() -> set[int]:
 @pytest.mark.parametrize("limit", [1, 2])
 def test_every_blas_is_limited_and_let_go(limit: int):
     with threadpool_limits(3, "blas"):
-        with blas_threads.limited(limit):
+        with job.limited(limit):
             assert threads() == {limit}
         assert threads() == {3}

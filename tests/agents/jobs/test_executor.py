@@ -20,8 +20,7 @@ from typing import Any
 import pytest
 
 from safe_envs.agents.jobs import clusters, executor
-from safe_envs.agents.jobs.executor import Backend, run
-from safe_envs.agents.jobs.processes import end_with_parent
+from safe_envs.agents.jobs.executor import Backend, end_with_parent, run
 from safe_envs.agents.sweeps.spec import sweep_of
 from safe_envs.agents.sweeps.store import Store, read
 from safe_envs.errors import ConfigurationError

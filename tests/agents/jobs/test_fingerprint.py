@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 import safe_envs
-from safe_envs.agents.jobs import fingerprint
-from safe_envs.agents.jobs.fingerprint import json_checksum, package_versions, source_checksum
+from safe_envs.agents.jobs import store
+from safe_envs.agents.jobs.store import json_checksum, package_versions, source_checksum
 
 
 def test_the_checksum_changes_with_each_byte_and_name_of_the_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(fingerprint, "files", lambda package: tmp_path / package)
+    monkeypatch.setattr(store, "files", lambda package: tmp_path / package)
     (tmp_path / "safe_envs" / "scripts").mkdir(parents=True)
     file = tmp_path / "safe_envs" / "code.py"
 
@@ -52,4 +52,4 @@ def test_a_folder_that_is_only_on_the_path_has_no_version(monkeypatch: pytest.Mo
         raise metadata.PackageNotFoundError(package)
 
     monkeypatch.setattr(metadata, "version", version)
-    assert fingerprint._versions.__wrapped__()["safe-envs"] == safe_envs.__version__ == "0+unknown"
+    assert store._versions.__wrapped__()["safe-envs"] == safe_envs.__version__ == "0+unknown"

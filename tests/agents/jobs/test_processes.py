@@ -136,7 +136,7 @@ def work(folder):
 
 if __name__ == "__main__":
     from joblib import Parallel, delayed
-    from safe_envs.agents.jobs.processes import end_with_parent, local_processes
+    from safe_envs.agents.jobs.executor import end_with_parent, local_processes
 
     pool = ProcessPoolExecutor(
         1, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(os.getpid(),)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.values.tables import ValueSettings
 
 SHORT: dict[str, Any] = {"horizon": 0.3}
 

@@ -12,14 +12,14 @@ import sympy as sp
 from safe_envs import ConfigurationError, SafeVectorEnv
 from safe_envs.agents import evaluate, make_policy
 from safe_envs.agents.policies import best
+from safe_envs.agents.policies.base import ObservedState
 from safe_envs.agents.policies.best import BestPolicy
-from safe_envs.agents.policies.observed_state import ObservedState
 from safe_envs.errors import InvalidInputError, NotCompilableError
-from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Barrier
 from safe_envs.problem.signals import TIME
 from safe_envs.registry import make_problem
+from safe_envs.values.tables import ValueSettings
 from safe_envs.wrappers import FilterSpec
-from safe_envs.wrappers.value.settings import ValueSettings
 from tests.agents.policies.coarse import COARSE, SHORT
 
 DISK = "StochasticDubins-v0"

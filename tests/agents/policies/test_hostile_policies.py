@@ -1,6 +1,6 @@
 """Hostile policies are loaded as they were saved, or refused.
 
-The file itself is read by `safe_envs.wrappers.learning.data.files`; see its tests.
+The file itself is read by `safe_envs.filters.learning.data`; see its tests.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import pytest
 from safe_envs.agents.policies.network import load_policy
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.learning.data import load, save
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.data.files import load, save
 from tests.agents.policies.test_network import small
 from tests.test_bounded_reading import damaged_by
 from tests.wrappers.learning.data.test_hostile_files import altered, changed

@@ -20,8 +20,7 @@ from safe_envs.agents.policies.base import BLOCK
 from safe_envs.agents.policies.network import load_policy, save_policy
 from safe_envs.agents.policies.network_policy import NetworkPolicy
 from safe_envs.errors import InvalidInputError
-from safe_envs.wrappers.learning.data.files import load, save
-from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.filters.learning.data import Signature, load, save
 
 pytestmark = pytest.mark.slow
 

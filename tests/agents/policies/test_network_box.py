@@ -11,7 +11,7 @@ from stable_baselines3 import PPO, SAC
 from safe_envs.agents import make_policy, make_problem
 from safe_envs.agents.policies.network import save_policy
 from safe_envs.envs.spaces import center_and_half_width
-from safe_envs.wrappers.learning.data.files import load
+from safe_envs.filters.learning.data import load
 
 DUBINS, QUADROTOR = "safe_envs/StochasticDubins-v0", "safe_envs/Quadrotor-v0"
 BOXES = {DUBINS: (-10.0, 10.0), QUADROTOR: [(0.0, 20.0), (-1.0, 1.0), (-0.5, 1.0), (-0.1, 0.1)]}

@@ -10,19 +10,23 @@ import pytest
 import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
-from safe_envs.agents.policies.clf import CLFController
-from safe_envs.agents.policies.custom import as_policy
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
-from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
+from safe_envs.agents.policies.nominal import (
+    CLFController,
+    NominalController,
+    RandomPolicy,
+    ZeroController,
+)
 from safe_envs.agents.policies.policy_source import policy_source
-from safe_envs.compiled import slots
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.program import Program
-from safe_envs.dynamics.philox import POLICY
+from safe_envs.agents.policies.registry import as_policy
+from safe_envs.dynamics.noise import POLICY
+from safe_envs.engine import slots
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
 from safe_envs.envs.spaces import BatchActions
 from safe_envs.errors import NotCompilableError
+from safe_envs.filters.learning.models.network import Network
 from safe_envs.problem.clf import CLF
-from safe_envs.wrappers.learning.models.network import Network
 from tests.conftest import problem_of
 
 DUBINS = "safe_envs/StochasticDubins-v0"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
-from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
+from safe_envs.agents.rare_events.numpy_paths import NumpyPaths, TiltedNoiseEnv
 
 
 def paths_of(problem, policy, num_envs=4096, continuous=False):

@@ -15,15 +15,13 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, NumericalError, state_problem
 from safe_envs.agents import NominalController, ZeroController, make_problem
 from safe_envs.agents.policies.nominal import RandomPolicy
-from safe_envs.agents.rare_events import records
+from safe_envs.agents.rare_events import splitting
 from safe_envs.agents.rare_events.compiled_paths import CompiledPaths, PathProgram
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
-from safe_envs.agents.rare_events.particles import Particles
-from safe_envs.agents.rare_events.path_keys import PathKeys
-from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
-from safe_envs.compiled.program import Program
-from safe_envs.dynamics.philox import SPLIT
+from safe_envs.agents.rare_events.numpy_paths import NumpyPaths, TiltedNoiseEnv
+from safe_envs.agents.rare_events.splitting import Particles, PathKeys
+from safe_envs.dynamics.noise import SPLIT
+from safe_envs.engine.program import Program
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper, parse_conditions
 from tests.oracles.laws import X, brownian
@@ -108,7 +106,7 @@ def test_paths_are_those_of_numpy(problem, policy, spec, continuous, length):
 def test_paths_go_on_where_there_was_no_room_for_a_record(monkeypatch):
     problem = brownian(0.05, 1.0, 1.0, 0.1)
     players = players_of(problem, NominalController(problem))
-    monkeypatch.setattr(records, "FIRST_ROOM", 2)
+    monkeypatch.setattr(splitting, "FIRST_ROOM", 2)
     wanted = assert_same(*players)
     assert wanted._records.room > 4
 

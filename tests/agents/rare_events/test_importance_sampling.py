@@ -12,20 +12,20 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import NominalController, evaluate
 from safe_envs.agents.evaluation.statistics import log_normal_interval
-from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.rare_events.importance_sampling import (
-    ImportanceSampling,
-    log_ratio,
-    optimal_tilt,
-)
-from safe_envs.agents.rare_events.rows import (
+from safe_envs.agents.rare_events.estimate import (
     PlainEpisodes,
     RareEstimate,
     doubt_of,
+    estimate_rare,
     skewed_interval,
 )
-from safe_envs.agents.rare_events.splitting import Splitting
-from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
+from safe_envs.agents.rare_events.numpy_paths import TiltedNoiseEnv
+from safe_envs.agents.rare_events.splitting import (
+    ImportanceSampling,
+    Splitting,
+    log_ratio,
+    optimal_tilt,
+)
 from tests.agents.rare_events.conftest import paths_of
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 

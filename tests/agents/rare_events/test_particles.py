@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from safe_envs.agents import ZeroController
-from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
-from safe_envs.agents.rare_events.particles import Particles
-from safe_envs.agents.rare_events.path_keys import PathKeys
-from safe_envs.agents.rare_events.records import Records
-from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
-from safe_envs.dynamics.philox import SPLIT
+from safe_envs.agents.rare_events.numpy_paths import NumpyPaths, TiltedNoiseEnv
+from safe_envs.agents.rare_events.splitting import Particles, PathKeys, Records
+from safe_envs.dynamics.noise import SPLIT
 from tests.oracles.laws import X, brownian
 
 pytestmark = pytest.mark.slow

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.agents.rare_events.path_noise import PathNoise
-from safe_envs.dynamics.normal import standard_normals
-from safe_envs.dynamics.philox import NOISE, StreamReader
-from safe_envs.envs.seeding import EpisodeStreams
+from safe_envs.agents.rare_events.numpy_paths import PathNoise
+from safe_envs.dynamics.noise import NOISE, StreamReader, standard_normals
+from safe_envs.envs.starts import EpisodeStreams
 
 SEEDS = (5, 6, 7)
 CHANNELS, PERIODS = 3, 200

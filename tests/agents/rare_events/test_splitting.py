@@ -18,9 +18,8 @@ from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.policies.base import BlockPolicy
 from safe_envs.agents.rare_events import splitting
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling
-from safe_envs.agents.rare_events.splitting import Splitting
-from safe_envs.problem.barrier import Barrier
+from safe_envs.agents.rare_events.splitting import ImportanceSampling, Splitting
+from safe_envs.problem.problem import Barrier
 from tests.agents.rare_events.conftest import paths_of
 from tests.oracles.laws import (
     X,

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from safe_envs.agents.jobs import fingerprint
-from safe_envs.agents.jobs.job import outcome_of
-from safe_envs.agents.jobs.threads import available_threads
-from safe_envs.agents.sweeps import cell
+from safe_envs.agents.jobs import store
+from safe_envs.agents.jobs.job import available_threads, outcome_of
+from safe_envs.agents.sweeps import spec
 from safe_envs.agents.sweeps.spec import sweep_of
 
 pytestmark = pytest.mark.slow
@@ -23,12 +22,12 @@ def test_a_file_that_changed_or_went_is_an_error(tmp_path: Path, monkeypatch: py
     file = tmp_path / "model.npz"
     file.write_bytes(b"1")
     monkeypatch.setattr(
-        cell,
+        spec,
         "run_evaluation",
         lambda *_, **__: Evaluated([SimpleNamespace(as_dict=lambda: {"safe": 1})], {}),
     )
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
-    one = replace(one, files={str(file): fingerprint.file_checksum(file)})
+    one = replace(one, files={str(file): store.file_checksum(file)})
     assert outcome_of(one).result["row"] == {"safe": 1}
     file.write_bytes(b"2")
     assert f"the worker finds another content in {file}" in str(outcome_of(one).error)
@@ -51,7 +50,7 @@ def test_threads_of_a_worker_compute_one_cell_at_a_time(monkeypatch: pytest.Monk
         both.wait(0.3)
         return Evaluated([{}], {})
 
-    monkeypatch.setattr(cell, "run_evaluation", evaluate)
+    monkeypatch.setattr(spec, "run_evaluation", evaluate)
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     with ThreadPoolExecutor(2) as threads:
         errors = [outcome.error for outcome in threads.map(outcome_of, [one, one])]
@@ -67,7 +66,7 @@ def test_a_cell_has_one_thread(monkeypatch: pytest.MonkeyPatch):
         seen.append(available_threads())
         raise RuntimeError("seen")
 
-    monkeypatch.setattr(cell, "run_evaluation", evaluate)
+    monkeypatch.setattr(spec, "run_evaluation", evaluate)
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     with threadpool_limits(2):
         assert "seen" in str(outcome_of(one).error)
@@ -82,7 +81,7 @@ def test_the_engine_is_no_part_of_what_identifies_a_cell(monkeypatch: pytest.Mon
         asked.append(settings.engine)
         return Evaluated([SimpleNamespace(as_dict=dict)], {})
 
-    monkeypatch.setattr(cell, "run_evaluation", evaluate)
+    monkeypatch.setattr(spec, "run_evaluation", evaluate)
     document = {"fixed": {"env": "Scalar-v0", "filter": "none"}}
     found = [sweep_of(document, engine=engine).cells[0] for engine in ("auto", "numpy")]
     assert found[0].key == found[1].key

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.agents.jobs.job import outcome_of
-from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
-from safe_envs.agents.sweeps.spec import sweep_of
+from safe_envs.agents.sweeps.spec import absolute, read_by, sweep_of, with_imported
 
 FILES = {
     "mine.py": (

@@ -12,8 +12,7 @@ import hypothesis.strategies as st
 import pytest
 import yaml
 
-from safe_envs.agents.sweeps.document import document_in, value_of
-from safe_envs.agents.sweeps.spec import read_sweep, sweep_of
+from safe_envs.agents.sweeps.spec import document_in, read_sweep, sweep_of, value_of
 from safe_envs.errors import ConfigurationError
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,7 @@ import pytest
 
 from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.jobs.job import outcome_of
-from safe_envs.agents.sweeps.cell import Cell
-from safe_envs.agents.sweeps.spec import describe, read_sweep, sweep_of
+from safe_envs.agents.sweeps.spec import Cell, describe, read_sweep, sweep_of
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
 
 SMALL: dict[str, Any] = {"env": "Scalar-v0", "filter": "scbf", "episodes": 20, "horizon": 0.2}

@@ -11,8 +11,7 @@ import pytest
 
 from safe_envs.agents.jobs.job import JobOutcome, outcome_of
 from safe_envs.agents.jobs.store import ResultStore
-from safe_envs.agents.sweeps.cell import Sweep
-from safe_envs.agents.sweeps.spec import sweep_of
+from safe_envs.agents.sweeps.spec import Sweep, sweep_of
 from safe_envs.agents.sweeps.store import Store, read
 from safe_envs.errors import ConfigurationError
 from tests.oracles.full_disk import no_file_larger_than

@@ -8,8 +8,7 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.agents.training.vec_env_speed import speeds
+from safe_envs.agents.training.vec_env import make_sb3_env, speeds
 
 pytestmark = pytest.mark.slow
 

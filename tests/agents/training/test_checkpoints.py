@@ -333,7 +333,7 @@ def test_a_training_that_was_killed_holds_its_folder_no_more(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     (tmp_path / "run" / ".checkpoint_000000000096").mkdir()
     lock = tmp_path / "run" / ".lock"
-    code = "import sys, time\nfrom pathlib import Path\nfrom safe_envs.file_locks import locked\n"
+    code = "import sys, time\nfrom pathlib import Path\nfrom safe_envs.files import locked\n"
     code += "with locked(Path(sys.argv[1]), ''):\n    print('held', flush=True)\n    time.sleep(60)"
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(lock)], stdout=subprocess.PIPE, text=True

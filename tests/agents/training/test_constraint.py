@@ -9,7 +9,7 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.training.constraint import EpisodeConstraint, costs_of
-from safe_envs.agents.training.lazy_info import LazyInfo
+from safe_envs.agents.training.vec_env import LazyInfo
 
 GAINS = {"kp": 1.0, "ki": 0.5, "kd": 0.0}
 

@@ -8,14 +8,14 @@ import pytest
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.cost_replay_buffer import (
-    CostReplayBuffer,
-    FilteredCostReplayBuffer,
-    with_costs,
-)
 from safe_envs.agents.training.replay_buffer import (
     FilteredNStepReplayBuffer,
     FilteredReplayBuffer,
+)
+from safe_envs.agents.training.sac_lagrangian import (
+    CostReplayBuffer,
+    FilteredCostReplayBuffer,
+    with_costs,
 )
 
 SPACES = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (1,)))

@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import ALGORITHMS, python_value
+from safe_envs.agents.training.config import ALGORITHMS, Training, python_value
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
 

@@ -18,9 +18,7 @@ from safe_envs.agents.training.leaderboard import (
     require_no_older,
     safety_over_envs,
 )
-from safe_envs.agents.training.seed_statistics import over_seeds
-from safe_envs.agents.training.study import Study, StudyResult, Variant
-from safe_envs.agents.training.study_job import StudyRow
+from safe_envs.agents.training.study import Study, StudyResult, StudyRow, Variant, over_seeds
 
 SCALAR, PENDULUM = "safe_envs/Scalar-v0", "safe_envs/Pendulum-v0"
 

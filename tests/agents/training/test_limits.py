@@ -13,14 +13,19 @@ from stable_baselines3 import PPO, SAC
 
 from safe_envs import ENV_IDS, ConfigurationError
 from safe_envs.agents.training.algorithms import algorithm_class, new_model
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.constraint import EpisodeConstraint
-from safe_envs.agents.training.hyperparameters import CONSTRAINED, hyperparameters
-from safe_envs.agents.training.limits import COST, DEFAULT_VIOLATION_LIMIT, VIOLATION, judged, rank
+from safe_envs.agents.training.config import CONSTRAINED, Training, hyperparameters
+from safe_envs.agents.training.constraint import (
+    COST,
+    DEFAULT_VIOLATION_LIMIT,
+    VIOLATION,
+    EpisodeConstraint,
+    judged,
+    rank,
+)
 from safe_envs.agents.training.trainer import train
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.registry import make_problem
-from safe_envs.scripts.reports.training_report import print_evaluations
+from safe_envs.scripts.reports.sweep import print_evaluations
 
 SCALAR = "safe_envs/Scalar-v0"
 SMALL = {

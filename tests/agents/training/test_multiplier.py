@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.multiplier import PIDMultiplier
+from safe_envs.agents.training.constraint import PIDMultiplier
 from safe_envs.errors import NumericalError
 
 

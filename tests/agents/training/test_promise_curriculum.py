@@ -10,8 +10,7 @@ import torch
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.training import vec_env
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.promise_curriculum import PromiseCurriculum
+from safe_envs.agents.training.config import PromiseCurriculum, Training
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
 from tests.wrappers.value.guesses import SCALAR, guess
@@ -29,7 +28,7 @@ def guessed(monkeypatch):
         text = guess(**HORIZON) if text == PROMISE else text
         return make_sb3_env(env_id, num_envs, text, **options)
 
-    monkeypatch.setattr("safe_envs.agents.training.trainer.make_sb3_env", make)
+    monkeypatch.setattr("safe_envs.agents.training.vec_env.make_sb3_env", make)
 
 
 def training(**changes):

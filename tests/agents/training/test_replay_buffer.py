@@ -19,15 +19,15 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.cost_replay_buffer import FilteredCostReplayBuffer
 from safe_envs.agents.training.replay_buffer import (
     FilteredDictReplayBuffer,
     FilteredNStepReplayBuffer,
     FilteredReplayBuffer,
     replay_options,
 )
+from safe_envs.agents.training.sac_lagrangian import FilteredCostReplayBuffer
 from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.object_import import load_object
+from safe_envs.plugins import load_object
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.policies.sb3_actor import actor_of
+from safe_envs.agents.policies.sb3 import actor_of
 from safe_envs.agents.training.replay_buffer import replay_options
 from safe_envs.agents.training.sac_lagrangian import SACLagrangian
 from safe_envs.agents.training.vec_env import make_sb3_env

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import binom, trim_mean
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training import seed_statistics
-from safe_envs.agents.training.seed_statistics import caution, interquartile_mean, over_seeds
+from safe_envs.agents.training import study
+from safe_envs.agents.training.study import caution, interquartile_mean, over_seeds
 
 
 @pytest.mark.parametrize("count", range(1, 15))
@@ -39,7 +39,7 @@ def test_one_env_is_the_enumeration_of_all_draws(count, confidence):
 
 def test_all_draws_are_counted_once():
     for count in range(1, 9):
-        chosen, ways = seed_statistics._multisets(count)
+        chosen, ways = study._multisets(count)
         assert ways.sum() == count**count
         assert len(np.unique(chosen, axis=0)) == len(chosen)
 
@@ -68,7 +68,7 @@ def test_several_envs_are_drawn_within_each():
     found = over_seeds(values.tolist(), 0.9)
     for end, tail in ((found.low, 0.05), (found.high, 0.95)):
         # Within three standard deviations of the number of draws below the end.
-        error = 3 * np.sqrt(0.05 * 0.95 / seed_statistics._RESAMPLES)
+        error = 3 * np.sqrt(0.05 * 0.95 / study._RESAMPLES)
         below, up_to = (means < end - 1e-12).mean(), (means <= end + 1e-12).mean()
         assert below - error <= tail <= up_to + error
     assert over_seeds(values.tolist(), 0.9) == found
@@ -123,6 +123,6 @@ def test_intervals_of_few_seeds_come_with_what_they_are_worth():
 )
 def test_how_often_the_interval_holds(count, rate):
     # The guide names the number for five seeds, and the notes of tables those up to five.
-    assert seed_statistics._HOLDS.get(count, round(100 * rate)) == round(100 * rate)
+    assert study._HOLDS.get(count, round(100 * rate)) == round(100 * rate)
     found = coverage(normal, 0.0, count, 20_000, seed=1)
     assert found == pytest.approx(rate, abs=4 * np.sqrt(rate * (1 - rate) / 20_000) + 5e-4)

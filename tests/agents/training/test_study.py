@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.jobs.executor import Backend
 from safe_envs.agents.training import study as study_module
-from safe_envs.agents.training import study_job
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.study import (
+    Planned,
     Study,
     StudyResult,
     Variant,
@@ -23,9 +23,8 @@ from safe_envs.agents.training.study import (
     run_study,
     training_seed,
 )
-from safe_envs.agents.training.study_job import Planned
 from safe_envs.agents.training.trainer import train
-from safe_envs.file_locks import locked
+from safe_envs.files import locked
 
 SCALAR = "safe_envs/Scalar-v0"
 SMALL = {
@@ -248,7 +247,7 @@ def test_a_return_that_is_no_number_stops_no_other_evaluation(tmp_path, monkeypa
         row = replace(result.rows[0], return_mean=float("nan"))
         return replace(result, rows=(row,)) if policy == "zero" else result
 
-    monkeypatch.setattr(study_job, "evaluate", found)
+    monkeypatch.setattr(study, "evaluate", found)
     few = replace(study(seeds=1), variants=(Variant("a", policy="zero"), Variant("b")))
     result = run_study(few, tmp_path, ALONE)
     assert [row.variant for row in result.rows] == ["b"]
@@ -266,4 +265,4 @@ def test_wrong_numbers_and_equal_names_are_errors():
 
 def test_a_row_of_another_type_is_refused():
     with pytest.raises(TypeError, match="env_id is 1"):
-        study_job.StudyRow(1, *[None] * 17)
+        study.StudyRow(1, *[None] * 17)

@@ -7,11 +7,16 @@ import pytest
 import yaml
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.seed_statistics import over_seeds
-from safe_envs.agents.training.study import Study, StudyResult
-from safe_envs.agents.training.study_file import read_study, shipped_studies
-from safe_envs.agents.training.study_job import StudyRow
-from safe_envs.agents.training.study_summary import differences, summaries
+from safe_envs.agents.training.study import (
+    Study,
+    StudyResult,
+    StudyRow,
+    differences,
+    over_seeds,
+    read_study,
+    shipped_studies,
+    summaries,
+)
 
 SCALAR = "safe_envs/Scalar-v0"
 ONE = {"name": "one", "algorithm": "ppo", "filters": ["default", "none"]}

@@ -14,21 +14,21 @@ import yaml
 import safe_envs
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.rollout import episode_seed
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import (
+from safe_envs.agents.training.config import (
     ALGORITHMS,
     CONSTRAINED,
+    Training,
     scheduled,
     whole_batches,
 )
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.compiled import engine as engines
-from safe_envs.compiled.program import Program
+from safe_envs.engine import choice as engines
+from safe_envs.engine.program import Program
+from safe_envs.filters.learning.data import load
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.data.files import load
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
 
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
-from safe_envs.compiled.program import Program
+from safe_envs.engine.program import Program
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 from tests.wrappers.value.guesses import SCALAR, guess

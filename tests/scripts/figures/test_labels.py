@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from matplotlib.mathtext import MathTextParser
 
-from safe_envs.scripts.figures.labels import expression, labelled, mathematics, quantity, symbol
+from safe_envs.scripts.figures.style import expression, labelled, mathematics, quantity, symbol
 from safe_envs.systems import ENV_IDS
 from tests.conftest import problem_of
 

@@ -6,8 +6,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from safe_envs.agents.training.leaderboard import entry_of
-from safe_envs.scripts.figures import leaderboard_figure
-from safe_envs.scripts.figures.leaderboard_figure import draw
+from safe_envs.scripts.figures import leaderboard
+from safe_envs.scripts.figures.leaderboard import draw
 from tests.agents.training.test_leaderboard import SCALAR, result
 from tests.readable import figure_texts, unreadable
 
@@ -43,5 +43,5 @@ def test_agents_are_inside_the_axes_and_look_different(tmp_path, monkeypatch, cu
         assert bottom < row.return_mean < top
     labels = axes.get_legend_handles_labels()[1]
     assert labels == (["largest return, computed"] if curve else []) + NAMES
-    assert len(set(leaderboard_figure._LOOKS)) == len({m for _, m in leaderboard_figure._LOOKS})
+    assert len(set(leaderboard._LOOKS)) == len({m for _, m in leaderboard._LOOKS})
     assert unreadable(*figure_texts(figure)) == []

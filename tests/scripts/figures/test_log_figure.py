@@ -7,8 +7,8 @@ import pytest
 from matplotlib.collections import PolyCollection
 
 from safe_envs import ConfigurationError, DecisionLog, plot_log
-from safe_envs.scripts.figures.log_panels import LogColors
-from safe_envs.wrappers.decision_log import LogColumns
+from safe_envs.filters.decision_log import LogColumns
+from safe_envs.scripts.figures.log import LogColors
 
 COLUMNS = LogColumns.of(("x",), ("u", "rotor_speed"), ("wall",), units={"u": "m/s^2"})
 

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 
 from safe_envs import ConfigurationError, plot_log
 from safe_envs.scripts import cli
-from safe_envs.scripts.figures import saving, sweep_figure
+from safe_envs.scripts.figures import style, sweep
 from safe_envs.scripts.figures.style import COLORS, DASHES, MARKERS, STYLE, WARM, look
-from safe_envs.scripts.options.figure_options import WIDTHS
+from safe_envs.scripts.options.evaluation_options import WIDTHS
 from tests.readable import figure_texts, unreadable
 from tests.scripts.figures import test_log_figure, test_sweep_figure
 from tests.scripts.figures.colour_vision import VISIONS, ciede2000, lab
@@ -84,8 +84,8 @@ def figure_of(kind: str, size: str) -> Figure:
         return plot_log(test_log_figure.log_of(test_log_figure.UNSAFE), size=size)
     if kind == "sweep":
         rows = test_sweep_figure.ROWS
-        layout = sweep_figure.Layout.of(rows, test_sweep_figure.SWEPT)
-        return sweep_figure.figure_of(rows, layout, size)[0]
+        layout = sweep.Layout.of(rows, test_sweep_figure.SWEPT)
+        return sweep.figure_of(rows, layout, size)[0]
     return figure_maker(kind)(size)
 
 
@@ -148,14 +148,14 @@ def test_a_figure_that_is_written_twice_is_the_same_file(kind, tmp_path, monkeyp
 
 
 def written(figure: Figure, path: Path) -> bytes:
-    saving.save(figure, path)
+    style.save(figure, path)
     return path.read_bytes()
 
 
 def test_a_pdf_of_a_command_embeds_truetype_fonts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for kind in ("verification", "identification", "log"):
-        saving.save(figure_of(kind, "single"), tmp_path / "figure.pdf")
+        style.save(figure_of(kind, "single"), tmp_path / "figure.pdf")
         content = (tmp_path / "figure.pdf").read_bytes()
         assert b"/FontFile2" in content
         assert not re.search(rb"/Subtype\s*/Type3", content)

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
-from safe_envs.scripts.figures import sweep_figure
-from safe_envs.scripts.figures.sweep_figure import Layout, _rate, draw, figure_of
-from safe_envs.scripts.options.figure_options import WIDTHS
+from safe_envs.scripts.figures import sweep
+from safe_envs.scripts.figures.sweep import Layout, _rate, draw, figure_of
+from safe_envs.scripts.options.evaluation_options import WIDTHS
 from tests.readable import figure_texts, unreadable
 
 pytestmark = pytest.mark.slow
@@ -104,7 +104,7 @@ def test_a_picture_of_each_kind(
 
 
 def test_panels_without_room_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(sweep_figure, "_MOST_PANELS", 3)
+    monkeypatch.setattr(sweep, "_MOST_PANELS", 3)
     layout = Layout("dt", "noise", ("filter", "seed"))
     assert draw(ROWS, layout, tmp_path / "rates.svg") == 5
     assert "filter = none, seed = 2" in (text := (tmp_path / "rates.svg").read_text())

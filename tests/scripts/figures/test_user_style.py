@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import image
 
 from safe_envs.agents import evaluate
-from safe_envs.plotting import plot_evaluation
+from safe_envs.scripts.figures.evaluation import plot_evaluation
 
 _TEX = {"text.usetex": True, "axes.facecolor": "black", "pdf.fonttype": 3, "savefig.dpi": 50}
 

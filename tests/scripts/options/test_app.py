@@ -10,8 +10,7 @@ import typer
 
 import safe_envs
 from safe_envs.scripts import cli
-from safe_envs.scripts.options.app import CommandEntry, make_app
-from safe_envs.scripts.options.panels import EXAMPLES, PANELS, panel_of
+from safe_envs.scripts.options.app import EXAMPLES, PANELS, CommandEntry, make_app, panel_of
 
 
 def command() -> None:

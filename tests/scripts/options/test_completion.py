@@ -11,9 +11,9 @@ import pytest
 import safe_envs
 from safe_envs.agents.policies import registry
 from safe_envs.agents.policies.names import POLICIES
+from safe_envs.filters.conditions import LEARNED, Certified, names
 from safe_envs.scripts import cli
 from safe_envs.wrappers import CONDITIONS
-from safe_envs.wrappers.conditions import LEARNED, Certified, names
 
 pytestmark = pytest.mark.slow
 

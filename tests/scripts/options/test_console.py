@@ -146,10 +146,10 @@ def test_errors_are_not_quiet(safe_envs_command):
 @pytest.mark.parametrize("arguments", [QUICK, ("list",), ("verify", "Scalar-v0", "--no-simulate")])
 def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments):
     monkeypatch.setattr(
-        "safe_envs.scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
+        "safe_envs.systems.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
     )
-    monkeypatch.setattr("safe_envs.agents.evaluation.bound_check.STARTS", 512)
-    monkeypatch.setattr("safe_envs.wrappers.verification.feasibility.verify", verify_once)
+    monkeypatch.setattr("safe_envs.agents.evaluation.safety_chain.STARTS", 512)
+    monkeypatch.setattr("safe_envs.proofs.feasibility.verify", verify_once)
     status, out, err = safe_envs_command(*arguments, "--json", "-")
     assert (status, err) == (0, "")
     given = json.loads(out)
@@ -256,7 +256,7 @@ def test_what_is_misspelt_has_a_suggestion(safe_envs_command, arguments, suggest
 
 def test_tables_on_a_pipe_have_no_trailing_blanks(safe_envs_command, monkeypatch):
     monkeypatch.setattr(
-        "safe_envs.scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
+        "safe_envs.systems.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
     )
     lines = safe_envs_command("list")[1].splitlines()
     assert any("─" in line for line in lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from safe_envs.scripts.reports.engine_notes import engine_notes
+from safe_envs.scripts.reports.evaluation import engine_notes
 
 
 def test_the_filters_of_the_compiled_engine_are_named_unless_all_are():

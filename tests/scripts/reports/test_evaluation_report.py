@@ -13,9 +13,9 @@ from rich.console import Console
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.evaluation_data import Timing
-from safe_envs.agents.evaluation.rounding import touches
-from safe_envs.scripts.reports.evaluation_report import print_evaluation
+from safe_envs.agents.evaluation.results import Timing
+from safe_envs.agents.evaluation.statistics import touches
+from safe_envs.scripts.reports.evaluation import print_evaluation
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 

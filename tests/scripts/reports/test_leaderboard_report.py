@@ -10,13 +10,16 @@ from rich.console import Console
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.training.leaderboard import entry_of, safety_over_envs
-from safe_envs.scripts.reports.leaderboard_page import BEGIN, END, link_from, put_into
-from safe_envs.scripts.reports.leaderboard_report import (
+from safe_envs.scripts.reports.leaderboard import (
+    BEGIN,
+    END,
     LeaderboardReport,
     _count,
     leaderboard_markdown,
     leaderboard_notes,
     leaderboard_tables,
+    link_from,
+    put_into,
 )
 from safe_envs.scripts.reports.tables import print_columns
 from tests.agents.training.test_leaderboard import PENDULUM, SCALAR, result

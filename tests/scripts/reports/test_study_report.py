@@ -7,9 +7,8 @@ import io
 import pytest
 from rich.console import Console
 
-from safe_envs.agents.training.seed_statistics import SeedEstimate
-from safe_envs.agents.training.study_summary import AgentSummary
-from safe_envs.scripts.reports.study_report import study_columns, study_markdown
+from safe_envs.agents.training.study import AgentSummary, SeedEstimate
+from safe_envs.scripts.reports.leaderboard import study_columns, study_markdown
 from safe_envs.scripts.reports.tables import print_columns
 
 MOST_COLUMNS = 6

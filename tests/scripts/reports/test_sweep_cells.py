@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from safe_envs.scripts.reports.sweep_cells import print_cells
+from safe_envs.scripts.reports.sweep import print_cells
 
 CELL = {
     "filter": "scbf",

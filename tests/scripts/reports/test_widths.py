@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from safe_envs.scripts.options import result_console, wrapping
+from safe_envs.scripts.options import console, wrapping
 from safe_envs.scripts.reports import tables
-from safe_envs.scripts.reports.evaluation_report import print_evaluation
-from safe_envs.scripts.reports.sweep_cells import print_cells
-from safe_envs.scripts.reports.training_report import print_evaluations
-from safe_envs.text_lines import text_width
+from safe_envs.scripts.reports.evaluation import print_evaluation
+from safe_envs.scripts.reports.sweep import print_cells, print_evaluations
+from safe_envs.text import text_width
 from tests.agents.evaluation.made_up import LONG_NAME, LONG_WORD, nasty_evaluation
 from tests.scripts.reports.test_sweep_cells import CELL
 from tests.wrappers.certificates.examples import disk
@@ -61,7 +60,7 @@ def told(request, monkeypatch):
 
     monkeypatch.setattr(tables, "arranged", spied)
     monkeypatch.setattr(wrapping, "wrapped_for", said)
-    monkeypatch.setattr(result_console, "_PIPE_WIDTH", width)
+    monkeypatch.setattr(console, "_PIPE_WIDTH", width)
 
     def check(out):
         assert parts
@@ -184,7 +183,7 @@ def test_commands(told, name, safe_envs_command, monkeypatch):
 
 
 def test_check(told, safe_envs_command, tmp_path):
-    from safe_envs.wrappers.certificates.files import save_certificate
+    from safe_envs.filters.certificates.files import save_certificate
 
     save_certificate(disk(), tmp_path / "psi.json")
     status, out, _ = safe_envs_command("check", "psi.json", "--state=0,0", "--state=-.1,.7")

@@ -8,7 +8,7 @@ import sympy as sp
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.problem.builder import state_problem
-from safe_envs.wrappers.backup import BackupFilter, BackupSettings
+from safe_envs.proofs.backup_filter import BackupFilter, BackupSettings
 
 x, v, a = sp.symbols("x v a", real=True)
 STRONGEST = 1.5

@@ -12,7 +12,7 @@ import sympy as sp
 
 from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionError
 from safe_envs.problem.backup import Backup, BackupLaw
-from safe_envs.wrappers.backup import BackupFilter
+from safe_envs.proofs.backup_filter import BackupFilter
 from tests.wrappers.backup.carts import (
     BRAKE,
     DT,

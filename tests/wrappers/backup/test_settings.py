@@ -6,10 +6,10 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.proofs.backup_filter import BackupSettings
+from safe_envs.values.promise_filter import PromiseSettings
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.backup import BackupSettings
-from safe_envs.wrappers.env_wrappers.lone_filters import settings_of
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.wrappers.filter_layers import settings_of
 from tests.conftest import problem_of
 from tests.wrappers.backup.carts import cart_problem
 

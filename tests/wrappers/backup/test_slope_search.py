@@ -7,11 +7,11 @@ import pytest
 
 from safe_envs.agents import make_policy
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
-from safe_envs.agents.evaluation.rollout import play
+from safe_envs.agents.evaluation.episodes import play
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.proofs.backup_filter import BackupFilter
+from safe_envs.proofs.backup_search import DIFFERENCE, LEFT, aims
 from safe_envs.wrappers import SafetyFilterVectorWrapper
-from safe_envs.wrappers.backup import BackupFilter
-from safe_envs.wrappers.backup.slope_search import DIFFERENCE, LEFT, aims
 from tests.agents.evaluation.test_compiled_episodes import assert_alike
 from tests.wrappers.backup.carts import STRONGEST, cart_filter, table_problem
 

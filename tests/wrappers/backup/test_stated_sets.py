@@ -10,8 +10,8 @@ import sympy as sp
 
 from safe_envs import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.backup import BackupLaw
-from safe_envs.wrappers.backup import BackupFilter
-from safe_envs.wrappers.backup.stated_sets import sampled_states
+from safe_envs.proofs.backup_filter import BackupFilter
+from safe_envs.proofs.backup_plans import sampled_states
 from tests.wrappers.backup.carts import BRAKE, PULL, STRONGEST, cart_problem, v, x
 
 

@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from safe_envs.dynamics.interval_arithmetic import Interval
-from safe_envs.wrappers.backup_sets.ball_matrices import (
+from safe_envs.enclosures.intervals import Interval
+from safe_envs.proofs.backup_sets import (
     BallMatrix,
     enclosing,
     exactly,

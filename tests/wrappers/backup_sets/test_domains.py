@@ -9,8 +9,8 @@ import pytest
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.integrators import Integrator
+from safe_envs.proofs.backup_filter import BackupFilter
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.backup import BackupFilter
 
 SYSTEMS = {
     "DubinsDisk": ({}, (-1, -1, -4), (1, 1, 4)),

@@ -9,10 +9,10 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, SystemDefinitionError
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.dynamics.interval_arithmetic import Interval
+from safe_envs.enclosures.intervals import Interval
 from safe_envs.problem.backup import BackupLaw, backup_of
+from safe_envs.proofs.backup_sets import Disturbance, held_law
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.backup_sets.held_law import Disturbance, held_law
 
 x, v, w, u, k = sp.symbols("x v w u k", real=True)
 NOTHING = Disturbance(*[Interval(np.zeros(0), np.zeros(0))] * 2)

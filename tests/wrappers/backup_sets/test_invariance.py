@@ -9,10 +9,9 @@ import pytest
 import sympy as sp
 
 from safe_envs import ControlAffineSDE
-from safe_envs.dynamics.interval_arithmetic import Interval
+from safe_envs.enclosures.intervals import Interval
 from safe_envs.problem.backup import BackupLaw
-from safe_envs.wrappers.backup_sets.held_law import Disturbance, held_law
-from safe_envs.wrappers.backup_sets.invariance import Conditions, Ellipsoid, is_kept
+from safe_envs.proofs.backup_sets import Conditions, Disturbance, Ellipsoid, held_law, is_kept
 
 x, v, u = sp.symbols("x v u", real=True)
 NOTHING = Disturbance(*[Interval(np.zeros(0), np.zeros(0))] * 2)

@@ -12,8 +12,8 @@ from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionErro
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.problem.backup import Backup, BackupLaw
+from safe_envs.proofs.backup_sets import derived_sets, with_terminal_sets
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.backup_sets.terminal_set import derived_sets, with_terminal_sets
 
 x, v, u, k = sp.symbols("x v u k", real=True)
 

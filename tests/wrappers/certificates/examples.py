@@ -9,9 +9,9 @@ from fractions import Fraction
 import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
+from safe_envs.filters.certificates.certificate import BarrierCertificate, Plant
+from safe_envs.filters.certificates.matching import plant_of
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
-from safe_envs.wrappers.certificates.statements import plant_of
 
 x, y, u = sp.symbols("x y u", real=True)
 R = sp.Rational

@@ -10,9 +10,9 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
+from safe_envs.filters.certificates.certificate import BarrierCertificate
+from safe_envs.filters.certificates.matching import plant_of
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate
-from safe_envs.wrappers.certificates.statements import plant_of
 
 
 def polynomial_of(problem: SafetyProblem, expression: Any, scale: Any = 1) -> Polynomial:

@@ -8,11 +8,10 @@ from fractions import Fraction
 from typing import Any
 
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.wrappers.certificates.certificate import HeldCertificate
-from safe_envs.wrappers.certificates.held_step import held_period
-from safe_envs.wrappers.certificates.statements import plant_of
-from safe_envs.wrappers.verification.held_bound import prove_held_bound
-from safe_envs.wrappers.verification.held_check import held_certificate
+from safe_envs.filters.certificates.certificate import HeldCertificate
+from safe_envs.filters.certificates.held_step import held_period
+from safe_envs.filters.certificates.matching import plant_of
+from safe_envs.proofs.held import held_certificate, prove_held_bound
 from tests.conftest import problem_of
 
 SCALAR = "safe_envs/Scalar-v0"

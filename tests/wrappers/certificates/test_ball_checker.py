@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.certificates.ball_checker import check_with_balls
+from safe_envs.filters.certificates.balls import check_with_balls
 from tests.wrappers.certificates.examples import FALSE, TRUE, UNDECIDED
 
 

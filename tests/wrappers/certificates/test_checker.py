@@ -14,8 +14,8 @@ import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.certificates import checker
-from safe_envs.wrappers.certificates.checker import Bands, check
+from safe_envs.filters.certificates import checker
+from safe_envs.filters.certificates.checker import Bands, check
 from tests.wrappers.certificates.examples import (
     FALSE,
     TRUE,
@@ -41,7 +41,7 @@ def test_it_is_one_file_that_a_person_can_read():
             assert node.level == 0
             imported.add(node.module)
     known = {"__future__", "math", "time", "functools", "typing", "numpy", "sympy"}
-    certificates = "safe_envs.wrappers.certificates."
+    certificates = "safe_envs.filters.certificates."
     own = {"safe_envs.errors", certificates + "certificate", certificates + "check_result"}
     assert imported <= known | own
     for name in ("certificate", "check_result"):

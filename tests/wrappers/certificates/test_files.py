@@ -11,22 +11,13 @@ from fractions import Fraction
 import pytest
 import sympy as sp
 
-from safe_envs.dynamics.expression_text import read_expression
+from safe_envs.dynamics.expression_text import number_text, read_expression
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.certificates.checker import check
+from safe_envs.filters.certificates.files import checksum, load_certificate, save_certificate
+from safe_envs.filters.certificates.matching import difference, env_difference, plant_of
 from safe_envs.registry import make_problem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
-from safe_envs.wrappers.certificates.checker import check
-from safe_envs.wrappers.certificates.files import (
-    checksum,
-    load_certificate,
-    number_text,
-    save_certificate,
-)
-from safe_envs.wrappers.certificates.statements import (
-    difference,
-    env_difference,
-    plant_of,
-)
 from tests.wrappers.certificates.examples import TRUE, brownian, disk, in_line, with_plant, x
 
 

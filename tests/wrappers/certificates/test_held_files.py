@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.certificates.files import load_certificate
-from safe_envs.wrappers.certificates.statements import env_difference
+from safe_envs.filters.certificates.files import load_certificate
+from safe_envs.filters.certificates.matching import env_difference
 from tests.wrappers.certificates.held_examples import scalar_certificate, with_numbers
 from tests.wrappers.certificates.test_files import rewritten, saved
 

@@ -11,10 +11,9 @@ import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.certificates.certificate import Plant
+from safe_envs.filters.certificates.held_step import HeldStep, Order, derivative, held_period
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.certificates.certificate import Plant
-from safe_envs.wrappers.certificates.gaussian_moments import Order
-from safe_envs.wrappers.certificates.held_step import HeldStep, derivative, held_period
 
 X, Y, U, V = sp.symbols("x y u v", real=True)
 DT = Fraction(1, 20)

@@ -10,17 +10,18 @@ from scipy import stats
 
 from safe_envs import ControlAffineSDE, SafeEnv
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem.barrier import Barrier
-from safe_envs.registry import make_problem
-from safe_envs.wrappers import CBF, HOCBF, SCBF, SafetyFilter, parse_condition, spec_of
-from safe_envs.wrappers.conditions.at_estimate import EstimateSettings, constraint_at_estimate
-from safe_envs.wrappers.conditions.belief import (
+from safe_envs.filters.conditions.estimates import (
+    EstimateSettings,
     belief_barrier,
     belief_symbols,
     belief_system,
+    constraint_at_estimate,
+    largest_slope,
     standard_deviations,
 )
-from safe_envs.wrappers.conditions.bounded_error import largest_slope
+from safe_envs.problem.problem import Barrier
+from safe_envs.registry import make_problem
+from safe_envs.wrappers import CBF, HOCBF, SCBF, SafetyFilter, parse_condition, spec_of
 
 x, y, u = sp.symbols("x y u", real=True)
 LINE = ControlAffineSDE.from_rate((x,), (u,), [0.5 * x + u], diffusion=[0.3])

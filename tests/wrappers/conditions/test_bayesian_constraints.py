@@ -14,8 +14,8 @@ from scipy import stats
 
 from safe_envs import Barrier, ConfigurationError
 from safe_envs.errors import RelativeDegreeError
+from safe_envs.filters.learning.models.distributions import Gaussian
 from safe_envs.wrappers import SCBF, BayesianSCBF, SafetyFilter
-from safe_envs.wrappers.learning.models.distributions import Gaussian
 from tests.wrappers.learned import assert_same_decisions, situations, values
 
 pytestmark = pytest.mark.slow

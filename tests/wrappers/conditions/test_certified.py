@@ -14,6 +14,13 @@ from safe_envs import Barrier, ControlAffineSDE, state_problem
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.certificates import kept
+from safe_envs.filters.certificates.certificate import HeldCertificate
+from safe_envs.filters.certificates.files import save_certificate
+from safe_envs.filters.conditions.text import files_of, with_absolute_paths
+from safe_envs.filters.torch_layer import TorchFilter
+from safe_envs.proofs.guarantees import no_bound
+from safe_envs.proofs.safe_set import Formulas
 from safe_envs.testing import check_condition
 from safe_envs.wrappers import (
     SZCBF,
@@ -27,13 +34,6 @@ from safe_envs.wrappers import (
     parse_conditions,
     spec_of,
 )
-from safe_envs.wrappers.certificates import kept
-from safe_envs.wrappers.certificates.certificate import HeldCertificate
-from safe_envs.wrappers.certificates.files import save_certificate
-from safe_envs.wrappers.conditions.text_parts import files_of, with_absolute_paths
-from safe_envs.wrappers.torch_layer import TorchFilter
-from safe_envs.wrappers.verification.assumptions import no_bound
-from safe_envs.wrappers.verification.formulas import Formulas
 from tests.conftest import problem_of
 from tests.wrappers.certificates.handmade import (
     certificate_of,

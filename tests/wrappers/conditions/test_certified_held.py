@@ -9,9 +9,9 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.certificates.files import save_certificate
+from safe_envs.filters.certificates.held_step import HeldStep
 from safe_envs.wrappers import Certified, SafetyFilter, parse_conditions, spec_of
-from safe_envs.wrappers.certificates.files import save_certificate
-from safe_envs.wrappers.certificates.held_step import HeldStep
 from tests.conftest import problem_of
 from tests.wrappers.certificates.held_examples import SCALAR, scalar_certificate
 from tests.wrappers.filter_qp.test_filter_source import check

@@ -7,8 +7,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SystemDefinitionError
+from safe_envs.filters.conditions.class_k import S
 from safe_envs.wrappers import CBF, HOCBF, ClassK, power
-from safe_envs.wrappers.conditions.class_k import S
 from tests.conftest import problem_of
 
 x, y, u = sp.symbols("x y u", real=True)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.compiled.data import Data
+from safe_envs.engine.slots import Data
 from safe_envs.errors import NotCompilableError
-from safe_envs.wrappers.conditions.constraint import terms_source
-from safe_envs.wrappers.learning.models.network import Network
-from safe_envs.wrappers.learning.models.residual import LearnedResidual
+from safe_envs.filters.conditions.base import terms_source
+from safe_envs.filters.learning.models.network import Network
+from safe_envs.filters.learning.models.residual import LearnedResidual
 from tests.conftest import problem_of
 from tests.wrappers.learned import Terms
 

@@ -11,8 +11,8 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.conditions.class_k import S
 from safe_envs.wrappers import ClassK, parse_conditions, spec_of
-from safe_envs.wrappers.conditions.class_k import S
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow

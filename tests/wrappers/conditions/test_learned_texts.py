@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 
 from safe_envs import Barrier, ConfigurationError
+from safe_envs.filters.learning.data import LearnedFileError
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.posterior import PosteriorGuarantee, guarantee_of
+from safe_envs.proofs.safe_set import Formulas
 from safe_envs.wrappers import (
     DDSCBF,
     HOCBF,
@@ -21,11 +25,6 @@ from safe_envs.wrappers import (
     parse_conditions,
     spec_of,
 )
-from safe_envs.wrappers.learning.data.values import LearnedFileError
-from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.guarantee import guarantee_of
-from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
 from tests.conftest import problem_of
 from tests.wrappers.learned import assert_same_decisions, situations
 

@@ -15,6 +15,7 @@ from safe_envs import plugins
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.conditions.text import files_of, learned_parts, with_absolute_paths
 from safe_envs.scripts.options import completion
 from safe_envs.wrappers import (
     CBF,
@@ -27,7 +28,6 @@ from safe_envs.wrappers import (
     require_readable,
     spec_of,
 )
-from safe_envs.wrappers.conditions.text_parts import files_of, learned_parts, with_absolute_paths
 from tests.conftest import problem_of
 
 SCALAR = problem_of("safe_envs/Scalar-v0")
@@ -298,7 +298,7 @@ class Certain(Condition):
 
 
 def test_what_bounds_ask_of_a_condition_it_says_itself():
-    from safe_envs.wrappers.verification.formulas import Formulas
+    from safe_envs.proofs.safe_set import Formulas
 
     assert Formulas(SCALAR, (Certain(),), "model").certain
     assert not Formulas(SCALAR, (CBF(),), "model").certain

@@ -13,10 +13,10 @@ import sympy as sp
 from safe_envs import ConfigurationError
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import generator
+from safe_envs.filters.learning.bayesian import identify
+from safe_envs.filters.learning.models.distributions import Diffusion
+from safe_envs.proofs.posterior import posterior_guarantee
 from safe_envs.wrappers import BayesianSCBF
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.models.distributions import Diffusion
-from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow
@@ -134,9 +134,7 @@ def test_intervals_of_sigma_hold_it_whatever_its_unit(sigma, count):
     assert hits / times == pytest.approx(0.9, abs=4 * math.sqrt(0.09 / times))
 
 
-@pytest.mark.filterwarnings(
-    "ignore::safe_envs.wrappers.learning.identifiability.IdentifiabilityWarning"
-)
+@pytest.mark.filterwarnings("ignore::safe_envs.filters.learning.bayesian.IdentifiabilityWarning")
 def test_few_data_make_both_regions_wider():
     sizes = {}
     for repetitions in (4, 50):

@@ -12,10 +12,10 @@ import sympy as sp
 from safe_envs import CLF, Barrier, ConfigurationError, ControlAffineSDE, RelativeDegreeError
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.lie import relative_degree
+from safe_envs.filters.conditions.certified import Certified
+from safe_envs.filters.conditions.learned import LearnedCondition
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, ECBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF, ClassK, Condition
-from safe_envs.wrappers.conditions.certified import Certified
-from safe_envs.wrappers.conditions.learned import LearnedCondition
 
 x, y, u, w, p, q, clock = sp.symbols("x y u w p q clock", real=True)
 mass = sp.Symbol("mass", positive=True)

@@ -16,9 +16,9 @@ from safe_envs import (
     DecisionLog,
     InvalidInputError,
 )
+from safe_envs.filters.decision_log import LogColumns
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, SafetyFilter
-from safe_envs.wrappers.decision_log import LogColumns
 from tests.conftest import problem_of
 
 x, y, u, w = sp.symbols("x y u w", real=True)

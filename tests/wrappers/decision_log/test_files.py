@@ -7,7 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from safe_envs import ConfigurationError, DecisionLog
-from safe_envs.wrappers.decision_log import LogColumns, files
+from safe_envs.filters import decision_log
+from safe_envs.filters.decision_log import LogColumns
 
 HEADINGS = LogColumns.of(("x",), ("u",), ("h",)).headings
 TOP = ",".join(HEADINGS)
@@ -75,7 +76,7 @@ def test_a_table_that_is_no_log_is_refused(tmp_path, given, reason):
 def test_a_small_file_of_a_large_table_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "log.parquet"
     pq.write_table(pa.table({name: pa.array([0.0] * 10_000) for name in HEADINGS}), path)
-    monkeypatch.setattr(files, "MOST_BYTES", 100_000)
+    monkeypatch.setattr(decision_log, "MOST_BYTES", 100_000)
     assert path.stat().st_size < 100_000
     with pytest.raises(ConfigurationError, match="the largest that is read"):
         DecisionLog.read(path)
@@ -96,7 +97,7 @@ def test_other_files_are_refused(tmp_path):
 
 def test_without_pyarrow_the_message_names_the_extra(tmp_path, monkeypatch):
     log = DecisionLog(LogColumns.read(HEADINGS))
-    monkeypatch.setattr(files, "find_spec", lambda name: None)
+    monkeypatch.setattr(decision_log, "find_spec", lambda name: None)
     (tmp_path / "there.parquet").write_bytes(b"")
     with pytest.raises(ConfigurationError, match=r"\.\[sweep\].*CSV"):
         log.to_parquet(tmp_path / "log.parquet")
@@ -109,7 +110,7 @@ def test_a_failed_writing_leaves_the_file_before(tmp_path, monkeypatch):
     log.append([float(entry) for entry in LINE.split(",")])
     path = tmp_path / "log.csv"
     path.write_text("before")
-    monkeypatch.setattr(files.csv, "writer", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(decision_log.csv, "writer", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         log.to_csv(path)
     assert path.read_text() == "before"

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.envs.system_env import SystemEnv
+from safe_envs.envs.registered import SystemEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.proofs.backup_filter import BackupFilter, BackupSettings
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
-from safe_envs.wrappers.backup import BackupFilter, BackupSettings
 from tests.wrappers.backup.carts import cart_problem
 
 KEYS = (

@@ -20,7 +20,7 @@ from safe_envs.wrappers import (
     SpecificationMonitor,
     SpecificationMonitorVector,
 )
-from safe_envs.wrappers.env_wrappers.cost_return import CostReturnWrapper
+from safe_envs.wrappers.statistics import CostReturnWrapper
 from tests.conftest import problem_of
 from tests.envs.test_copies import assert_goes_on_alone, copied, plain  # noqa: F401
 from tests.wrappers.env_wrappers.test_external_env import CAR

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 import safe_envs  # noqa: F401  (registers the envs)
 from safe_envs import ConfigurationError
-from safe_envs.object_import import load_object
+from safe_envs.plugins import load_object
 from safe_envs.wrappers import (
     CostReturnWrapper,
     SafetyFilterVectorWrapper,

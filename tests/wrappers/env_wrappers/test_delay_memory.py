@@ -9,12 +9,12 @@ import pytest
 from safe_envs import SafeEnv, SafeVectorEnv
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.compiled.program import Program
+from safe_envs.engine.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError
+from safe_envs.filters.conditions import parse_conditions
+from safe_envs.proofs.posterior import guarantee_of
+from safe_envs.values.reduction import reduced
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper, SafetyFilterWrapper
-from safe_envs.wrappers.conditions import parse_conditions
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.verification.guarantee import guarantee_of
 from tests.conftest import problem_of
 
 PENDULUM = "safe_envs/Pendulum-v0"

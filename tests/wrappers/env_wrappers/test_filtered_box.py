@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import safe_envs  # noqa: F401  (registers the envs)
-from safe_envs.object_import import load_object
+from safe_envs.plugins import load_object
 from safe_envs.wrappers import ActionMap, SafetyFilterVectorWrapper, SafetyFilterWrapper
-from safe_envs.wrappers.env_wrappers.filtered_box import ends_of
+from safe_envs.wrappers.filter_layers import ends_of
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 

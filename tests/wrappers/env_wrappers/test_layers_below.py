@@ -12,7 +12,7 @@ from gymnasium import wrappers
 from stable_baselines3.common.monitor import Monitor
 
 from safe_envs.errors import ConfigurationError, SystemDefinitionWarning
-from safe_envs.wrappers.env_wrappers.layers_below import doubt_layers
+from safe_envs.wrappers.layers import doubt_layers
 
 NOTHING = ""
 SIGHT = "and changes observations: unless state_fn undoes that, the filter"

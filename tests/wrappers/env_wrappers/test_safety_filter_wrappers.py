@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError, InvalidInputError, RelativeDegreeError
-from safe_envs.agents.policies.clf import CLFController
+from safe_envs.agents.policies.nominal import CLFController
 from safe_envs.wrappers import HOCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import safe_envs  # noqa: F401  (registers the envs)
 from safe_envs import ConfigurationError
-from safe_envs.object_import import load_object
+from safe_envs.plugins import load_object
 from safe_envs.wrappers import (
     RecordSafetyStatistics,
     RecordSafetyStatisticsVector,

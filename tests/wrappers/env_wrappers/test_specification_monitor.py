@@ -13,6 +13,7 @@ import sympy as sp
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.filters.specification import Specification
 from safe_envs.wrappers import (
     FilterSpec,
     SafetyFilterVectorWrapper,
@@ -22,7 +23,6 @@ from safe_envs.wrappers import (
     SpecificationMonitor,
     SpecificationMonitorVector,
 )
-from safe_envs.wrappers.value.specification import Specification
 from tests.conftest import problem_of
 
 ENV_ID = "safe_envs/DubinsReach-v0"

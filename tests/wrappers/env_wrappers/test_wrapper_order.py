@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 import safe_envs  # noqa: F401  (registers the ids)
 from safe_envs.agents import make_sb3_env
 from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionWarning
-from safe_envs.object_import import load_object
+from safe_envs.plugins import load_object
 from safe_envs.wrappers import SafetyFilterWrapper
 
 ROOT = Path(__file__).parents[3]

@@ -10,17 +10,17 @@ import sympy as sp
 from safe_envs import ControlAffineSDE
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, SystemDefinitionError
-from safe_envs.problem.measurement import Channel, Measurement
-from safe_envs.registry import make_problem
-from safe_envs.wrappers.estimation import (
+from safe_envs.filters.estimation import (
     ExtendedKalmanFilter,
     InitialBelief,
     KalmanFilter,
     UnscentedKalmanFilter,
     make_estimator,
 )
-from safe_envs.wrappers.estimation.consistency import nees
-from safe_envs.wrappers.estimation.packed import cholesky, packed, positive_part, unpacked
+from safe_envs.filters.estimation.consistency import nees
+from safe_envs.filters.estimation.estimator import cholesky, packed, positive_part, unpacked
+from safe_envs.problem.measurement import Channel, Measurement
+from safe_envs.registry import make_problem
 
 
 def linear(seed: int, n: int = 3, k: int = 2, noise: float = 0.4, substeps: int = 2):

@@ -5,12 +5,12 @@ import copy
 import numpy as np
 import pytest
 
-from safe_envs.envs.sample import Sample
+from safe_envs.envs.sensor import Sample
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.estimation import BeliefTracker, ExtendedKalmanFilter, make_estimator
+from safe_envs.filters.estimation.consistency import chi_square_interval, consistency_of, nees
+from safe_envs.filters.estimation.estimator import packed, unpacked
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.estimation import BeliefTracker, ExtendedKalmanFilter, make_estimator
-from safe_envs.wrappers.estimation.consistency import chi_square_interval, consistency_of, nees
-from safe_envs.wrappers.estimation.packed import packed, unpacked
 
 
 def tracked(delay: int = 0, num_envs: int | None = None, **options):

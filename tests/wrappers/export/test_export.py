@@ -15,13 +15,13 @@ import sympy as sp
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE
 from safe_envs.errors import NotCompilableError
+from safe_envs.export import CComparison, ExportOptions, compare, export_filter
+from safe_envs.export.comparison import c_compiler
+from safe_envs.filters.conditions.bayesian import BayesianSCBF
+from safe_envs.filters.conditions.learned import DDSCBF, LearnedHOCBF
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, DelayedFilter, SafetyFilter, parse_conditions
-from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
-from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedHOCBF
-from safe_envs.wrappers.export import CComparison, ExportOptions, compare, export_filter
-from safe_envs.wrappers.export.c_compiler import c_compiler
 from tests.conftest import problem_of
 from tests.wrappers.filter_qp.test_filter_source import CASES, Corrected, case_of, integrators
 from tests.wrappers.learned import Terms

@@ -12,21 +12,15 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE, SafetyProblem, state_problem
-from safe_envs.compiled.linker import linked
+from safe_envs.engine.program import linked
 from safe_envs.errors import NotCompilableError
-from safe_envs.wrappers.export import (
-    ExportOptions,
-    PromiseComparison,
-    compare_promise,
-    export_promise,
-)
-from safe_envs.wrappers.export.promise_reference import clipped, decided, random_cases
-from safe_envs.wrappers.value import promise_layout as layout
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_kernel import promise_decision
-from safe_envs.wrappers.value.promise_source import promise_program
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.export import ExportOptions, PromiseComparison, compare_promise, export_promise
+from safe_envs.export.promise_export import clipped, decided, random_cases
+from safe_envs.values import promise_kernel as layout
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.promise_filter import PromiseFilter, PromiseSettings
+from safe_envs.values.promise_kernel import promise_decision
+from safe_envs.values.promise_source import promise_program
 from tests.conftest import problem_of
 from tests.wrappers.export.test_export import COMPILERS, NEEDS_COMPILER, STRICT, run_selftest
 from tests.wrappers.value.systems import s, scalar, solved, u, v, x, y

@@ -19,8 +19,8 @@ from safe_envs import (
     SafeEnvsError,
     SystemDefinitionError,
 )
+from safe_envs.filters.arguments import WIDEST
 from safe_envs.wrappers import CBF, HOCBF, RCBF, SCBF, SZCBF, SafetyFilter
-from safe_envs.wrappers.filter_qp.limits import WIDEST
 from tests.conftest import problem_of
 
 x, v, y, u, w, p = sp.symbols("x v y u w p", real=True)

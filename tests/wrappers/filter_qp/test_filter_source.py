@@ -21,10 +21,14 @@ from safe_envs import (
     NumericalError,
     RelativeDegreeError,
 )
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source, formulas
-from safe_envs.compiled.program import Program
 from safe_envs.dynamics.codegen import filled
+from safe_envs.engine.formulas import Source, formulas
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
+from safe_envs.filters.conditions.base import AffineConstraint
+from safe_envs.filters.conditions.bayesian import BayesianSCBF
+from safe_envs.filters.conditions.learned import DDSCBF, LearnedHOCBF
+from safe_envs.filters.decision_source import filter_source, unfiltered_source
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
     CBF,
@@ -34,10 +38,6 @@ from safe_envs.wrappers import (
     SafetyFilterVectorWrapper,
     parse_conditions,
 )
-from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
-from safe_envs.wrappers.conditions.constraint import AffineConstraint
-from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedHOCBF
-from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
 from tests.conftest import problem_of
 from tests.wrappers.filter_qp.decision_kernels import decided
 from tests.wrappers.learned import Terms

@@ -12,13 +12,13 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, SafeEnv, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.proofs.posterior import guarantee_of
 from safe_envs.wrappers import (
     SafetyFilter,
     SafetyFilterVectorWrapper,
     SafetyFilterWrapper,
     parse_conditions,
 )
-from safe_envs.wrappers.verification.guarantee import guarantee_of
 from tests.wrappers.filter_qp.test_filter_source import Decided
 
 x, y, v, u, w = sp.symbols("x y v u w", real=True)

@@ -13,8 +13,8 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.filters.solver import INWARDS
 from safe_envs.wrappers import SafetyFilter
-from safe_envs.wrappers.filter_qp.period_search import INWARDS
 from tests.wrappers.filter_qp.test_filter_source import Decided
 
 x, v, y, w, u, a = sp.symbols("x v y w u a", real=True)

@@ -16,12 +16,12 @@ from safe_envs import (
     NumericalError,
     SafeEnvsError,
 )
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.program import Program
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
+from safe_envs.filters.conditions.base import AffineConstraint
+from safe_envs.filters.decision_source import filter_source
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, HOCBF, RCBF, SCBF, SRCBF, SafetyFilter
-from safe_envs.wrappers.conditions.constraint import AffineConstraint
-from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from tests.conftest import problem_of
 from tests.wrappers.filter_qp.decision_kernels import decided
 from tests.wrappers.filter_qp.test_filter_source import Corrected, Measured

@@ -12,8 +12,8 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, NumericalError
 from safe_envs.dynamics import codegen
+from safe_envs.filters import solver
 from safe_envs.wrappers import SRCBF, DelayedFilter, SafetyFilter
-from safe_envs.wrappers.filter_qp import compiled
 
 _SCRIPT = """
 import sys
@@ -110,7 +110,7 @@ def test_formulas_by_pieces_goals_and_reciprocal_conditions_are_compiled_at_once
         raise AssertionError("compiled after construction")
 
     monkeypatch.setattr(codegen.sp, "lambdify", refuse)
-    monkeypatch.setattr(compiled, "compile_function", refuse)
+    monkeypatch.setattr(solver, "compile_function", refuse)
     states = np.linspace(-3, 3, 13)[:, None]
     batch = made.filter(states, np.zeros((13, 1)), parameters={"p": 1.0})
     for i, state in enumerate(states):

@@ -14,20 +14,15 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import generator, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.learning.bayesian import Prior, Rows, fit, identify, posterior
+from safe_envs.filters.learning.collection import collect, draw_states
+from safe_envs.filters.learning.data import LearnedFileError, Signature, Transitions, load
+from safe_envs.filters.learning.models.features import Features
+from safe_envs.filters.learning.models.posterior import Posterior
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems.acc_gap import acc_gap
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.dubins import dubins_disk
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.bayesian_fit import Prior, fit
-from safe_envs.wrappers.learning.data.collection import collect, draw_states
-from safe_envs.wrappers.learning.data.files import load
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.data.values import LearnedFileError
-from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.learning.regression import Rows, posterior
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_room
+from safe_envs.filters.learning.checks import Purpose, random_stream, require_room
 
 _SEED = 7
 

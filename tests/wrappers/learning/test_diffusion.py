@@ -10,12 +10,11 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import ito_correction
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.drift_checks import drift_warnings, mean_rates, rates, slack
+from safe_envs.filters.learning.generator import covariances, learn_diffusion
+from safe_envs.filters.learning.models.generator import LearnedDiffusion
 from safe_envs.systems.cubic import x_1, x_2
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.diffusion import covariances, learn_diffusion
-from safe_envs.wrappers.learning.drift_checks import drift_warnings, slack
-from safe_envs.wrappers.learning.estimators import mean_rates, rates
-from safe_envs.wrappers.learning.models.diffusion import LearnedDiffusion
 from tests.conftest import problem_of
 
 CORRELATED = [[0.3, 0.0], [0.2, 0.15]]

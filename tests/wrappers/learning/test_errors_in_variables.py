@@ -8,11 +8,10 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.learning.bayesian import identify, unbiased
+from safe_envs.filters.learning.collection import collect
 from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.errors_in_variables import unbiased
 
 x, y, u, sigma = sp.symbols("x y u sigma", real=True)
 

@@ -12,10 +12,17 @@ import pytest
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.drift_checks import drift_score, drift_warnings, region_warnings
-from safe_envs.wrappers.learning.estimators import in_bulk, ito_part, mean_rates, rates
-from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.drift_checks import (
+    drift_score,
+    drift_warnings,
+    in_bulk,
+    ito_part,
+    mean_rates,
+    rates,
+    region_warnings,
+)
+from safe_envs.filters.learning.models.network import Network
 from tests.conftest import problem_of
 
 K = 200

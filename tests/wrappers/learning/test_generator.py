@@ -10,15 +10,12 @@ import pytest
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.errors import ConfigurationError, InvalidInputError
-from safe_envs.problem.barrier import Barrier
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.data import LearnedFileError, Signature, Transitions, load
+from safe_envs.filters.learning.generator import learn_generator
+from safe_envs.filters.learning.models.generator import GeneratorModel
+from safe_envs.problem.problem import Barrier
 from safe_envs.systems.pendulum import pendulum
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.data.files import load
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.data.values import LearnedFileError
-from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.generator import GeneratorModel
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow

@@ -7,17 +7,14 @@ import warnings
 import numpy as np
 import pytest
 
+from safe_envs.filters.learning.bayesian import IdentifiabilityWarning, identify, term_names
+from safe_envs.filters.learning.collection import collect, draw_states, plant_step
+from safe_envs.filters.learning.data import Signature, Transitions
+from safe_envs.filters.learning.models.features import Features
+from safe_envs.filters.learning.models.posterior import Posterior
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.quadrotor_altitude import quadrotor_altitude
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.data.collection import collect, draw_states
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.steps import plant_step
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, term_names
-from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.posterior import Posterior
 
 PROBLEM = cubic_sde_disk()
 

@@ -9,13 +9,13 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import kstest, norm
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.learning.models.distributions import (
+from safe_envs.filters.learning.bayesian import posterior
+from safe_envs.filters.learning.models.distributions import (
     Gaussian,
     sigma_map,
     sigma_quantile,
     sigma_samples,
 )
-from safe_envs.wrappers.learning.regression import posterior
 
 
 @pytest.fixture

@@ -8,15 +8,13 @@ import pytest
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import lie_derivative_f, lie_derivative_g
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.sampling_domain import SamplingDomain
-from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
-from safe_envs.wrappers.learning.data.files import load
-from safe_envs.wrappers.learning.data.steps import plant_step
-from safe_envs.wrappers.learning.data.values import LearnedFileError
-from safe_envs.wrappers.learning.models.base import Record
-from safe_envs.wrappers.learning.models.residual import ResidualModel
-from safe_envs.wrappers.learning.residual import learn_residual, residual_labels
+from safe_envs.filters.learning.collection import collect_paths, draw_states, plant_step
+from safe_envs.filters.learning.data import LearnedFileError, load
+from safe_envs.filters.learning.models.base import Record
+from safe_envs.filters.learning.models.residual import ResidualModel
+from safe_envs.filters.learning.residual import learn_residual, residual_labels
+from safe_envs.problem.problem import Barrier
+from safe_envs.problem.starts import SamplingDomain
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from safe_envs.wrappers.qp import proxqp
-from safe_envs.wrappers.qp.dispatch import SOLVERS, project_arrays, project_floats
+from safe_envs.engine.qp import proxqp
+from safe_envs.engine.qp.dispatch import SOLVERS, project_arrays, project_floats
 
 
 def active_set_oracle(a, b, v, low, high, w):
@@ -252,7 +252,7 @@ def test_a_constraint_that_moves_the_action_is_active_however_far_the_proposal()
 _LATE = """
 import sys
 import numpy as np
-from safe_envs.wrappers.qp import dispatch
+from safe_envs.engine.qp import dispatch
 for k, m in ((1, 2), (3, 1), (3, 2), (3, 4)):
     for solver in dispatch.SOLVERS:
         rng = np.random.default_rng(0)

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
+from safe_envs.engine.qp.dispatch import project_arrays, project_floats
 
 EPS = float(np.finfo(float).eps)
 

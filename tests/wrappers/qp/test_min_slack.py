@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
-from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
-from safe_envs.wrappers.qp.working_set import FloatQP, WorkingSet
-from safe_envs.wrappers.qp.working_set_batch import ArrayQP, find_points
+from safe_envs.engine.qp.dispatch import project_arrays, project_floats
+from safe_envs.engine.qp.rounding import ROUNDING, tolerance
+from safe_envs.engine.qp.working_set import ArrayQP, FloatQP, WorkingSet, find_points
 from tests.oracles.rational_oracle import nearest_of_least_violating
 
 KINDS = ["plain", "flat", "integers", "parallel", "sides", "sizes", "far", "weights", "endless"]

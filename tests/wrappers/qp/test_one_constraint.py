@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import qpsolvers
 
-from safe_envs.wrappers.qp.one_constraint import project_arrays, project_floats
-from safe_envs.wrappers.qp.rounding import added
+from safe_envs.engine.qp.one_constraint import project_arrays, project_floats
+from safe_envs.engine.qp.rounding import added
 
 project_arrays = np.errstate(divide="ignore")(project_arrays)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from safe_envs.wrappers.qp import bounded_least_squares, min_slack
-from safe_envs.wrappers.qp.dispatch import project_arrays
+from safe_envs.engine.qp import bounded_least_squares, plane
+from safe_envs.engine.qp.dispatch import project_arrays
 from tests.oracles.plane_oracles import (
     EPS,
     HIGH,
@@ -295,7 +295,7 @@ def test_fallback_finds_the_same_minimisers(monkeypatch):
     a, b, v, low, high, w = random_batch(rng, 60, 3, "plain")
     b -= 1.5
     newton, *_ = many(a, b, v, low, high, w, [1.0, 5.0, 0.3])
-    monkeypatch.setattr(min_slack, "_STEPS", 0)
+    monkeypatch.setattr(plane, "_STEPS", 0)
     fallback, _, _, feasible = many(a, b, v, low, high, w, [1.0, 5.0, 0.3])
     assert np.count_nonzero(~feasible) > 30
     np.testing.assert_allclose(fallback, newton, atol=1e-9)

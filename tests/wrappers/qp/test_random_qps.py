@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
+from safe_envs.engine.qp.dispatch import project_arrays, project_floats
 from tests.oracles.rational_oracle import nearest_of_least_violating
 
 KINDS = [

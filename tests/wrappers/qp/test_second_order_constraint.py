@@ -8,10 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import interval
-from safe_envs.wrappers.qp.majorant import majorant
-from safe_envs.wrappers.qp.second_order_batch import project_arrays
-from safe_envs.wrappers.qp.second_order_constraint import project_floats
+from safe_envs.engine.qp import interval
+from safe_envs.engine.qp.second_order import majorant, project_arrays, project_floats
 
 EPS = float(np.finfo(float).eps)
 LOW, HIGH = -2.0, 1.5

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import sympy as sp
 
-from safe_envs.wrappers.certificates.certificate import Plant
-from safe_envs.wrappers.synthesis.synthesize import Task
+from safe_envs.filters.certificates.certificate import Plant
+from safe_envs.proofs.certify import Task
 
 x = sp.Symbol("x", real=True)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
+from safe_envs.proofs.linear_program import ChebyshevBasis
 
 X, Y = sp.symbols("x y", real=True)
 BASIS = ChebyshevBasis(

@@ -9,16 +9,13 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.certificates.held_step import HeldStep, held_period
+from safe_envs.filters.certificates.matching import plant_of
+from safe_envs.proofs.certify import Named, SynthesisSettings
+from safe_envs.proofs.held import check_held
+from safe_envs.proofs.held_synthesis import SampledStep, certify_held
+from safe_envs.proofs.linear_program import ChebyshevBasis, Domain
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.certificates.held_step import HeldStep, held_period
-from safe_envs.wrappers.certificates.statements import plant_of
-from safe_envs.wrappers.synthesis.basis import ChebyshevBasis
-from safe_envs.wrappers.synthesis.certify import Named
-from safe_envs.wrappers.synthesis.domain import Domain
-from safe_envs.wrappers.synthesis.held_samples import SampledStep
-from safe_envs.wrappers.synthesis.held_synthesis import certify_held
-from safe_envs.wrappers.synthesis.settings import SynthesisSettings
-from safe_envs.wrappers.verification.held_check import check_held
 
 
 def test_a_low_degree_proves_a_bound_of_the_scalar_system():

@@ -12,16 +12,22 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.certificates.checker import check
+from safe_envs.filters.certificates.matching import plant_of
+from safe_envs.proofs import certify as synthesis_module
+from safe_envs.proofs.certify import (
+    Named,
+    Synthesis,
+    SynthesisSettings,
+    Task,
+    certify,
+    degrees_of,
+    finalize,
+    nominal_laws,
+)
+from safe_envs.proofs.held_synthesis import certify_held
+from safe_envs.proofs.linear_program import Domain
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.certificates.checker import check
-from safe_envs.wrappers.certificates.statements import plant_of
-from safe_envs.wrappers.synthesis import improvement
-from safe_envs.wrappers.synthesis.certify import Named, certify, nominal_laws
-from safe_envs.wrappers.synthesis.domain import Domain
-from safe_envs.wrappers.synthesis.finalize import finalize
-from safe_envs.wrappers.synthesis.held_synthesis import certify_held
-from safe_envs.wrappers.synthesis.settings import SynthesisSettings
-from safe_envs.wrappers.synthesis.synthesize import Synthesis, Task, degrees_of
 from tests.wrappers.synthesis.systems import brownian, survival
 
 HORIZON = 1.0
@@ -56,9 +62,9 @@ def test_the_bound_of_brownian_motion_approaches_that_of_the_eigenfunction():
 def test_a_degree_that_finds_nothing_keeps_the_psi_of_the_lower_one(monkeypatch):
     # Behind the first linear programs none has a solution.
     synthesis = Synthesis(brownian(HORIZON), SynthesisSettings(degrees=(2, 4, 6), rates=(0.5,)))
-    made = improvement.solve
+    made = synthesis_module.solve
     fails = lambda claims, *rest: None if len(rest[1]) > 3 else made(claims, *rest)  # noqa: E731
-    monkeypatch.setattr(improvement, "solve", fails)
+    monkeypatch.setattr(synthesis_module, "solve", fails)
     first, *others = synthesis.attempts()
     assert first.candidate.mean > 0.2
     x = np.linspace(0.1, 3.0, 20)[:, None]
@@ -68,7 +74,7 @@ def test_a_degree_that_finds_nothing_keeps_the_psi_of_the_lower_one(monkeypatch)
         np.testing.assert_allclose(attempt.candidate.psi(x), first.candidate.psi(x))
     automatic = Synthesis(brownian(HORIZON), SynthesisSettings(rates=(0.5,)))
     monkeypatch.setattr(
-        improvement,
+        synthesis_module,
         "solve",
         lambda claims, *rest: None if len(rest[1]) > 9 else made(claims, *rest),
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.value.specification_text import Parsed
+from safe_envs.filters.specification import Parsed
 
 NAMES = ("safe", "goal")
 

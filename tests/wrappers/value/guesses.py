@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.values.promise_filter import PromiseFilter, PromiseSettings
 from tests.conftest import problem_of
 
 SCALAR = "safe_envs/Scalar-v0"

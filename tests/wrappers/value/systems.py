@@ -11,10 +11,9 @@ from scipy.special import ndtr
 
 from safe_envs import ControlAffineSDE, SafetyProblem, state_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
-from safe_envs.wrappers.value.table import ValueTable
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings, ValueTable
 
 x, y, u, v, s = sp.symbols("x y u v s", real=True)
 

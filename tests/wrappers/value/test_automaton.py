@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.value.automaton_building import MOST_STATES, automaton_of
-from safe_envs.wrappers.value.specification import Specification
-from safe_envs.wrappers.value.specification_text import parsed
+from safe_envs.filters.specification import MOST_STATES, Specification, automaton_of, parsed
 
 from .formulas import NAMES, random_text, satisfied
 

@@ -7,14 +7,13 @@ import itertools
 import numpy as np
 import pytest
 
-from safe_envs.compiled.formulas import Source
-from safe_envs.compiled.program import Program, is_available
-from safe_envs.wrappers.value import bellman_arrays
-from safe_envs.wrappers.value.bellman_kernel import expected_values, sweep_lower, sweep_upper
-from safe_envs.wrappers.value.expected_value_kernel import AXES
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.grid_arrays import grid_arrays
-from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.program import Program, is_available
+from safe_envs.values import bellman_arrays
+from safe_envs.values.bellman_kernel import expected_values, sweep_lower, sweep_upper
+from safe_envs.values.expected_value_kernel import AXES
+from safe_envs.values.grid import Axis, Grid, grid_arrays
+from safe_envs.values.input_search import scanned_inputs
 
 ENTRIES = (expected_values, sweep_lower, sweep_upper)
 PROGRAM = Program("dynamic programs", ENTRIES, Source(""))

@@ -9,8 +9,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
-from safe_envs.wrappers.value.cell_sets import Sets, hull_of, uniform_grid
-from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.values.cells import Sets, hull_of, uniform_grid
+from safe_envs.values.reduction import reduced
 from tests.wrappers.value.systems import scalar, x
 
 pytestmark = pytest.mark.filterwarnings("ignore:the input bounds")

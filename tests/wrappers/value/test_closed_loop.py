@@ -7,9 +7,9 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
+from safe_envs.filters.conditions.text import conditions_for
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.conditions.spec_text import conditions_for
-from safe_envs.wrappers.value.closed_loop import closed_loop_table
+from safe_envs.values.closed_loop import closed_loop_table
 from tests.wrappers.value.systems import quadrature, scalar, x
 
 

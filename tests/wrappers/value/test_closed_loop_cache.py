@@ -10,14 +10,18 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
-from safe_envs.array_files import checksum, write_arrays
+from safe_envs.files import checksum, write_arrays
+from safe_envs.filters.conditions.text import conditions_for
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.conditions.spec_text import conditions_for
-from safe_envs.wrappers.value import closed_loop, closed_loop_cache
-from safe_envs.wrappers.value.closed_loop import ClosedLoop, require_few_states
-from safe_envs.wrappers.value.closed_loop_cache import closed_loop_for
-from safe_envs.wrappers.value.closed_loop_files import load_closed_loop, save_closed_loop
-from safe_envs.wrappers.value.table_files import ValueFileError
+from safe_envs.values import closed_loop
+from safe_envs.values.closed_loop import (
+    ClosedLoop,
+    closed_loop_for,
+    load_closed_loop,
+    require_few_states,
+    save_closed_loop,
+)
+from safe_envs.values.tables import ValueFileError
 from tests.wrappers.value.systems import scalar
 
 POINTS = (np.linspace(0.05, 1.95, 40),)
@@ -27,7 +31,7 @@ POINTS = (np.linspace(0.05, 1.95, 40),)
 def _own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path))
     monkeypatch.setattr(closed_loop, "CELLS", {1: 60, 2: 400})
-    closed_loop_cache._IN_USE.clear()
+    closed_loop._IN_USE.clear()
 
 
 def loop(sigma: Any = 0.3, condition: str | None = "scbf", policy="nominal", knowledge="model"):
@@ -37,7 +41,7 @@ def loop(sigma: Any = 0.3, condition: str | None = "scbf", policy="nominal", kno
 
 
 def files(tmp_path):
-    return sorted((tmp_path / closed_loop_cache.FOLDER).glob("*.npz"))
+    return sorted((tmp_path / closed_loop.FOLDER).glob("*.npz"))
 
 
 def refuse(*_, **__):
@@ -50,7 +54,7 @@ def test_a_second_process_reads_what_the_first_one_kept(tmp_path, monkeypatch):
     assert done[-1] == 1.0
     assert bounds.max() > 0.1
     # Nothing of this process holds the table any longer.
-    assert not closed_loop_cache._IN_USE
+    assert not closed_loop._IN_USE
     monkeypatch.setattr(ClosedLoop, "table", refuse)
     found = closed_loop_for(loop())
     assert (found.start_bounds(POINTS) == bounds).all()
@@ -63,7 +67,7 @@ def test_a_table_in_use_needs_no_folder(monkeypatch):
     table = closed_loop_for(loop())
     assert closed_loop_for(loop()) is table
     del table
-    assert not closed_loop_cache._IN_USE
+    assert not closed_loop._IN_USE
 
 
 def test_each_closed_loop_has_a_table_of_its_own():

@@ -7,9 +7,9 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
-from safe_envs.wrappers.conditions.spec_text import conditions_for
-from safe_envs.wrappers.safety_filter import SafetyFilter
-from safe_envs.wrappers.value.executed_inputs import ExecutedInputs
+from safe_envs.filters.conditions.text import conditions_for
+from safe_envs.filters.safety_filter import SafetyFilter
+from safe_envs.values.closed_loop import ExecutedInputs
 from tests.wrappers.value.systems import scalar, x
 
 RNG = np.random.default_rng(3)

@@ -10,14 +10,11 @@ from scipy.stats import norm
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.frontier import price_violations
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.node_grid import NodeGrid
-from safe_envs.wrappers.value.noise_rules import edge_rule, smooth_rule
-from safe_envs.wrappers.value.priced_values import FrontierSettings
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
-from safe_envs.wrappers.value.starts import start_values
+from safe_envs.values.frontier import FrontierSettings, edge_rule, price_violations, smooth_rule
+from safe_envs.values.grid import NodeGrid
+from safe_envs.values.look_ahead import LookAhead, start_values
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings
 
 x, y, u, w, a, b = sp.symbols("x y u w a b", real=True)
 DT, NOISE, STEPS = 0.1, 0.5, 6
@@ -154,7 +151,7 @@ def test_settings_are_checked(given):
 
 
 def test_a_frame_is_used_only_where_the_reward_is_a_function_of_it():
-    from safe_envs.wrappers.value.rewarded import rewarded
+    from safe_envs.values.frontier import rewarded
 
     names = [str(s) for s in rewarded(make_problem("StochasticDubins-v0")).small.symbols]
     assert names == ["x", "y", "theta"]

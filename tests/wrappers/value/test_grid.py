@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.value.expected_value_kernel import cell_of_value
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.grid_arrays import grid_arrays
+from safe_envs.values.expected_value_kernel import cell_of_value
+from safe_envs.values.grid import Axis, Grid, grid_arrays
 
 UNEVEN = np.array([-1.0, -1.0 + 1e-9, -0.5, 0.1, 0.1 + 1e-12, 2.0, 2.0 + 1e-9])
 EDGES = [UNEVEN, np.linspace(-3, 3, 8), np.array([0.0, 1.0]), np.array([-1e6, 0, 1e-6, 2e-6, 1e6])]

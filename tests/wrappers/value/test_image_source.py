@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from safe_envs.compiled.program import is_available
+from safe_envs.engine.program import is_available
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.step_images import Step
+from safe_envs.values.images import Step
+from safe_envs.values.reduction import reduced
 
 
 @pytest.mark.skipif(not is_available(), reason="needs Numba")

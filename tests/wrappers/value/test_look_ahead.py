@@ -12,11 +12,9 @@ from scipy.special import ndtr
 from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.agents.evaluation.statistics import wilson_interval
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_memory import PromiseMemory
-from safe_envs.wrappers.value.promise_text import PromiseSettings
-from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.promise_filter import PromiseFilter, PromiseMemory, PromiseSettings
+from safe_envs.values.reduction import reduced
 from tests.wrappers.value.systems import (
     random_states,
     require_promised,

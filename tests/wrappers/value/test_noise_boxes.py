@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from safe_envs.wrappers.value.noise_boxes import noise_boxes
+from safe_envs.values.smoothing import noise_boxes
 
 
 @pytest.mark.parametrize("counts", [(), (20,), (17, 11), (8, 4, 6)])

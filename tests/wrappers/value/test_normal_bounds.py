@@ -8,7 +8,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.value.normal_bounds import coefficients, normal_above, normal_below
+from safe_envs.values.smoothing import coefficients, normal_above, normal_below
 
 
 def exact(z: float) -> Any:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.value.automaton import Automaton
-from safe_envs.wrappers.value.automaton_building import automaton_of
-from safe_envs.wrappers.value.specification import Specification
-from safe_envs.wrappers.value.specification_text import Parsed, parsed
+from safe_envs.filters.specification import Automaton, Parsed, Specification, automaton_of, parsed
 
 from .formulas import satisfied
 

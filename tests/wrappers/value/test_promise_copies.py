@@ -7,11 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_text import PromiseSettings
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.promise_filter import PromiseFilter, PromiseSettings
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings
 
 from .walks import walk
 

@@ -11,9 +11,7 @@ import sympy as sp
 from safe_envs import ConfigurationError, ControlAffineSDE
 from safe_envs.errors import InvalidInputError
 from safe_envs.problem.builder import state_problem
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_memory import PromiseMemory
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.values.promise_filter import PromiseFilter, PromiseMemory, PromiseSettings
 from tests.wrappers.value.chain import SAFE, STATES, STEPS, Chain, U, X, chain_problem
 
 EXACT, PROBLEM = Chain(), chain_problem()

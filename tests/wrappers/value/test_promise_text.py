@@ -7,17 +7,17 @@ from pathlib import Path
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.scripts.options import completion
-from safe_envs.scripts.render import split_filters
-from safe_envs.wrappers import SafetyFilter, parse_conditions
-from safe_envs.wrappers.conditions.names import PROMISE, condition_names
-from safe_envs.wrappers.conditions.text_parts import (
+from safe_envs.filters.conditions.names import PROMISE, condition_names
+from safe_envs.filters.conditions.text import (
     files_of,
     learned_parts,
     require_known,
     with_absolute_paths,
 )
-from safe_envs.wrappers.value.promise_text import PromiseSettings
+from safe_envs.scripts.options import completion
+from safe_envs.scripts.render import split_filters
+from safe_envs.values.promise_filter import PromiseSettings
+from safe_envs.wrappers import SafetyFilter, parse_conditions
 from tests.conftest import problem_of
 
 WHOLE = "promise:p=0.9:robust=v:0.8..2.4;w:-1.0..-0.5:leaving=safe:table=/a/b+c.npz"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.proved_sets import ProvedSets
-from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.values.grid import Axis, Grid
+from safe_envs.values.proved import ProvedSets
+from safe_envs.values.reduction import reduced
 from tests.wrappers.value.systems import scalar, x
 
 

@@ -8,8 +8,8 @@ import mpmath
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.proved_smoothing import ProvedSmoothing
+from safe_envs.values.grid import Axis, Grid
+from safe_envs.values.proved import ProvedSmoothing
 
 RNG = np.random.default_rng(1)
 

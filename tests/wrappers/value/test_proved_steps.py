@@ -8,11 +8,11 @@ import pytest
 import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.noise_boxes import noise_boxes
-from safe_envs.wrappers.value.proved_steps import ProvedImages, ProvedWeights
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.step_images import Step
+from safe_envs.values.grid import Axis, Grid
+from safe_envs.values.images import Step
+from safe_envs.values.proved import ProvedImages, ProvedWeights
+from safe_envs.values.reduction import reduced
+from safe_envs.values.smoothing import noise_boxes
 from tests.wrappers.value.systems import u, x, y
 
 RNG = np.random.default_rng(5)

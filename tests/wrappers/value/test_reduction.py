@@ -18,8 +18,7 @@ from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.simulation import Simulation
 from safe_envs.problem.signals import TIME
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.one_step import occurrences, sub_step
-from safe_envs.wrappers.value.reduction import reduced
+from safe_envs.values.reduction import occurrences, reduced, sub_step
 
 COORDINATES = {
     "DubinsDisk": ("distance", "phi"),
@@ -342,7 +341,7 @@ def test_fingerprints_are_the_same_in_every_process():
     names = ("StochasticDubins", "DubinsObstacle", "Pendulum")
     script = (
         "from safe_envs.registry import make_problem\n"
-        "from safe_envs.wrappers.value.reduction import reduced\n"
+        "from safe_envs.values.reduction import reduced\n"
         f"for name in {names}:\n"
         "    print(reduced(make_problem(f'safe_envs/{name}-v0')).fingerprint)\n"
     )

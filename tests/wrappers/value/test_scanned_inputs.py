@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.wrappers.value.scanned_inputs import scanned_inputs
+from safe_envs.values.input_search import scanned_inputs
 
 
 @pytest.mark.parametrize("m", [1, 2, 3])

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.value.settings import ValueSettings
+from safe_envs.values.tables import ValueSettings
 
 
 @pytest.mark.parametrize(

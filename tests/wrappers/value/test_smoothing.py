@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.smoothing import Smoothing, rounded_down
+from safe_envs.values.grid import Axis, Grid
+from safe_envs.values.smoothing import Smoothing, rounded_down
 
 
 def exact(axis, values, counts, size, mean):

@@ -10,9 +10,9 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, state_problem
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings
 from tests.wrappers.value.systems import (
     quadrature,
     require_around,

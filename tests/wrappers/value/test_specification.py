@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.value.specification import Specification
-from safe_envs.wrappers.value.specification_text import parsed
+from safe_envs.filters.specification import Specification, parsed
 
 from .formulas import NAMES, random_text, robustness
 

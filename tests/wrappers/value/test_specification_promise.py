@@ -10,21 +10,23 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from safe_envs import ConfigurationError, InvalidInputError
-from safe_envs.agents.evaluation.promise_bound import PromiseBound
-from safe_envs.agents.evaluation.promise_notes import computed_notes
+from safe_envs.agents.evaluation.bounds import PromiseBound
+from safe_envs.agents.evaluation.notes import computed_notes
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.filters.conditions.text import files_of, with_absolute_paths
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.render import split_filters
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.promise_filter import (
+    PromiseFilter,
+    PromiseMemory,
+    PromiseSettings,
+    promise_filter_for,
+    why_not_of_safety,
+)
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings, ValueTable
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SpecificationMonitorVector
-from safe_envs.wrappers.conditions.text_parts import files_of, with_absolute_paths
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_memory import PromiseMemory
-from safe_envs.wrappers.value.promise_tables import promise_filter_for, why_not_of_safety
-from safe_envs.wrappers.value.promise_text import PromiseSettings
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
-from safe_envs.wrappers.value.table import ValueTable
 
 from .walks import NOISE, PERIOD, STEPS, walk
 
@@ -288,7 +290,7 @@ def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
     problem = walk()
     starts = np.array([[0.0], [0.5], [-0.9]])
     with pytest.MonkeyPatch.context() as patch:
-        made = "safe_envs.agents.evaluation.promise_bound.promise_filter_for"
+        made = "safe_envs.values.promise_filter.promise_filter_for"
         patch.setattr(made, lambda problem, settings, knowledge: filter_of(REACH, 0.9))
         bound = PromiseBound(PromiseSettings(0.9, specification=REACH), problem, "model")
         assert (bound.why_none, bound.at(starts).mean()) == ("", pytest.approx(0.6))

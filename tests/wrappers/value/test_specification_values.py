@@ -11,13 +11,11 @@ from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.satisfaction import measure_satisfaction
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.filters.specification import SpecificationTracker
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
-from safe_envs.wrappers.value.specification_tracker import SpecificationTracker
-from safe_envs.wrappers.value.starts import start_values
-from safe_envs.wrappers.value.table_files import ValueFileError, load_table, save_table
+from safe_envs.values.look_ahead import LookAhead, start_values
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueFileError, ValueSettings, load_table, save_table
 
 from .walks import NOISE, PERIOD, POINTS, SPEED, STEPS, WITHIN, exact_values, labels_of, walk
 

@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.value import bellman_arrays
-from safe_envs.wrappers.value.expected_value_kernel import AXES
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.grid_arrays import grid_arrays
-from safe_envs.wrappers.value.spending_kernel import kept_values
+from safe_envs.values import bellman_arrays
+from safe_envs.values.expected_value_kernel import AXES
+from safe_envs.values.grid import Axis, Grid, grid_arrays
+from safe_envs.values.promise_kernel import kept_values
 
 CELLS = np.array([[0.0, 0.5, 0.8, 1.0]], dtype=np.float32)
 WEIGHTS = np.array([0.1, 0.2, 0.3, 0.4])

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.starts import draw_starts, start_values
+from safe_envs.values.look_ahead import LookAhead, draw_starts, start_values
 from tests.wrappers.value.systems import quadrature, scalar, solved, x
 
 

@@ -8,8 +8,8 @@ import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.step_images import Step
+from safe_envs.values.images import Step
+from safe_envs.values.reduction import reduced
 from tests.wrappers.value.systems import s, scalar, u, v, x, y
 
 

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.file_locks import locked
-from safe_envs.user_cache import VARIABLE
-from safe_envs.wrappers.value import table_cache
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.table_cache import table_for
-from safe_envs.wrappers.value.table_files import FORMAT, ValueFileError, load_table, save_table
+from safe_envs.files import VARIABLE, locked
+from safe_envs.values import solve as solving
+from safe_envs.values.solve import table_for
+from safe_envs.values.tables import FORMAT, ValueFileError, ValueSettings, load_table, save_table
 from tests.wrappers.value.systems import scalar, solved, x
 from tests.wrappers.value.test_table_files import PROBLEM, table_of
 
@@ -38,7 +36,7 @@ def computed(monkeypatch):
             progress(1.0)
         return table_of(problem, settings)
 
-    monkeypatch.setattr(table_cache, "solve", solve)
+    monkeypatch.setattr(solving, "solve", solve)
     return calls
 
 
@@ -99,7 +97,7 @@ def test_an_interrupted_computation_leaves_nothing(folder, computed, monkeypatch
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr(table_cache, "solve", interrupted)
+        patch.setattr(solving, "solve", interrupted)
         with pytest.raises(error):
             table_for(PROBLEM)
     assert not list(folder.iterdir())
@@ -112,7 +110,7 @@ def test_an_interrupted_writing_leaves_nothing(folder, computed, monkeypatch):
         stream.write(b"half of a table")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("safe_envs.array_files.np.savez", interrupted)
+    monkeypatch.setattr("safe_envs.files.np.savez", interrupted)
     with pytest.raises(KeyboardInterrupt):
         table_for(PROBLEM)
     assert not list(folder.iterdir())
@@ -122,11 +120,11 @@ def test_a_full_disk_costs_no_table(folder, computed, monkeypatch, caplog):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("safe_envs.array_files.np.savez", full)
+    monkeypatch.setattr("safe_envs.files.np.savez", full)
     with caplog.at_level(logging.WARNING, "safe_envs"):
         assert table_for(PROBLEM).steps == 6
     assert "the table is not kept: cannot write" in caplog.text
-    monkeypatch.setattr("safe_envs.file_locks._opened", full)
+    monkeypatch.setattr("safe_envs.files._opened", full)
     assert table_for(PROBLEM).steps == 6
     assert len(computed) == 2
 

@@ -11,11 +11,10 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
-from safe_envs.wrappers.value import table_check
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.proved_starts import ProvedStarts
-from safe_envs.wrappers.value.table_check import TableRefusedError, check_table, check_table_file
-from safe_envs.wrappers.value.table_files import save_table
+from safe_envs.values import proved
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.proved import ProvedStarts, TableRefusedError, check_table, check_table_file
+from safe_envs.values.tables import save_table
 from tests.wrappers.value.systems import quadrature, scalar, solved, u, x, y
 
 
@@ -92,7 +91,7 @@ def exact_deficit(table, cell: int, low_of_c: float) -> Any:
 
 
 def test_deficits_are_no_less_than_those_of_exact_arithmetic(monkeypatch):
-    monkeypatch.setattr(table_check, "TOLERANCE", 1.0)
+    monkeypatch.setattr(proved, "TOLERANCE", 1.0)
     problem = scalar(barriers=x - sp.Rational(1, 64), horizon=0.2)
     table = solved(problem, 200, inputs=3)
     lower = np.array(table.lower)

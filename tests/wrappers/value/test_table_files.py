@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.array_files import checksum, reading, write_arrays
+from safe_envs.files import checksum, reading, write_arrays
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value import table_files
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.table import ValueTable
-from safe_envs.wrappers.value.table_files import (
+from safe_envs.values import tables
+from safe_envs.values.grid import Axis, Grid
+from safe_envs.values.reduction import reduced
+from safe_envs.values.tables import (
     FORMAT,
     ValueFileError,
+    ValueSettings,
+    ValueTable,
     load_table,
     require_asked,
     save_table,
@@ -188,7 +188,7 @@ def test_an_object_is_not_unpickled(file):
 
 
 def test_sizes_are_looked_at_before_memory_is_taken(file, monkeypatch):
-    monkeypatch.setattr(table_files, "MOST_BYTES_OF_TABLE", file.stat().st_size - 1)
+    monkeypatch.setattr(tables, "MOST_BYTES_OF_TABLE", file.stat().st_size - 1)
     with pytest.raises(ValueFileError, match="larger than"):
         load_table(file)
 
@@ -198,7 +198,7 @@ def test_a_table_that_would_not_be_read_is_not_written(tmp_path, monkeypatch):
     table = table_of()
     with pytest.raises(ConfigurationError, match="0 <= lower <= upper <= 1"):
         save_table(dataclasses.replace(table, lower=table.upper + np.float32(1e-3)), path)
-    monkeypatch.setattr(table_files, "MOST_BYTES_OF_TABLE", table_files.MOST_BYTES_OF_TEXT)
+    monkeypatch.setattr(tables, "MOST_BYTES_OF_TABLE", tables.MOST_BYTES_OF_TEXT)
     with pytest.raises(ConfigurationError, match="would take"):
         save_table(table, path)
     assert not list(tmp_path.iterdir())

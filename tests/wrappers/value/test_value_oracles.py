@@ -9,14 +9,11 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.envs.simulation import Simulation
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.value.look_ahead import LookAhead
-from safe_envs.wrappers.value.promise_filter import PromiseFilter
-from safe_envs.wrappers.value.promise_memory import PromiseMemory
-from safe_envs.wrappers.value.promise_text import PromiseSettings
-from safe_envs.wrappers.value.reduction import reduced
-from safe_envs.wrappers.value.settings import ValueSettings
-from safe_envs.wrappers.value.solve import solve
-from safe_envs.wrappers.value.starts import draw_starts, start_values
+from safe_envs.values.look_ahead import LookAhead, draw_starts, start_values
+from safe_envs.values.promise_filter import PromiseFilter, PromiseMemory, PromiseSettings
+from safe_envs.values.reduction import reduced
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings
 
 pytestmark = pytest.mark.oracle
 

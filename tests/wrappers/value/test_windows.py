@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.wrappers.value.grid import Axis, Grid
-from safe_envs.wrappers.value.windows import Bordered, Groups, windows_of
+from safe_envs.values.grid import Axis, Grid
+from safe_envs.values.windows import Bordered, Groups, windows_of
 
 RNG = np.random.default_rng(0)
 PLAIN = Axis(np.sort(RNG.random(18)) * 3.0 - 1.0)

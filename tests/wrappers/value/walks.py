@@ -7,11 +7,10 @@ import sympy as sp
 from scipy.special import ndtr
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
+from safe_envs.filters.specification import Automaton
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Variable
-from safe_envs.wrappers.value.automaton import Automaton
+from safe_envs.problem.starts import Start
 
 x, wall, u = sp.symbols("x wall u", real=True)
 

@@ -13,14 +13,9 @@ import sympy as sp
 from scipy import stats
 
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
-from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.certificate_statements import (
-    CertificateStatements,
-    judged,
-    rounded_up,
-)
-from safe_envs.wrappers.verification.judge import supremum
+from safe_envs.filters.certificates.certificate import BarrierCertificate, Plant
+from safe_envs.proofs.guarantees import CertificateStatements, judged, rounded_up
+from safe_envs.proofs.judge import Budget, supremum
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 R = sp.Rational

@@ -10,12 +10,11 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Barrier
+from safe_envs.proofs.analysis import SafeSetAnalysis, infeasible_part
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.safe_set import Formulas, draw_starts
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import draw_starts
-from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis, infeasible_part
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import (
     CUBIC_DISK,

@@ -12,15 +12,13 @@ import pytest
 import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
-from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Barrier
+from safe_envs.proofs import guarantees
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.guarantees import HOLDING
+from safe_envs.proofs.posterior import guarantee_of
+from safe_envs.proofs.safe_set import Formulas, draw_starts, unbounded
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification import proof
-from safe_envs.wrappers.verification.extrema import unbounded
-from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.guarantee import guarantee_of
-from safe_envs.wrappers.verification.results import HOLDING
-from safe_envs.wrappers.verification.safe_set import draw_starts
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import (
     CUBIC_DISK,
@@ -398,7 +396,7 @@ def crowd(noise):
 
 def test_the_judge_is_not_asked_for_what_is_0_at_the_starts_anyway(monkeypatch):
     for name in ("judge", "supremum"):
-        monkeypatch.setattr(proof, name, lambda *_: pytest.fail("it was asked"))
+        monkeypatch.setattr(guarantees, name, lambda *_: pytest.fail("it was asked"))
     problem = crowd(0.05)
     found = guarantee_of(problem, parse_conditions("scbf", problem), seconds=6.0)
     assert found.note == "it is 0 at these starts up to this horizon"

@@ -15,10 +15,10 @@ from scipy.stats import beta
 
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.certificates.certificate import Plant
-from safe_envs.wrappers.certificates.held_step import HeldStep
-from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.held_bound import HeldBound, prove_held_bound, tail_bound
+from safe_envs.filters.certificates.certificate import Plant
+from safe_envs.filters.certificates.held_step import HeldStep
+from safe_envs.proofs.held import HeldBound, prove_held_bound, tail_bound
+from safe_envs.proofs.judge import Budget
 
 X, Y, U = sp.symbols("x y u", real=True)
 DT = Fraction(1, 100)

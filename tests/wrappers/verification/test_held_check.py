@@ -10,12 +10,7 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.verification.held_check import (
-    check_held,
-    held_certificate,
-    stated_bound,
-    why_not_proved,
-)
+from safe_envs.proofs.held import check_held, held_certificate, stated_bound, why_not_proved
 from tests.wrappers.certificates.held_examples import scalar_certificate, with_numbers
 
 

@@ -12,11 +12,9 @@ import sympy as sp
 from safe_envs import ControlAffineSDE
 from safe_envs.dynamics.lie import generator
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.wrappers.certificates.certificate import BarrierCertificate, Plant
-from safe_envs.wrappers.verification.branch_and_bound import Budget
-from safe_envs.wrappers.verification.certificate_statements import judged
-from safe_envs.wrappers.verification.judge import judge, supremum
-from safe_envs.wrappers.verification.statements import PolynomialPart, Statement
+from safe_envs.filters.certificates.certificate import BarrierCertificate, Plant
+from safe_envs.proofs.guarantees import judged
+from safe_envs.proofs.judge import Budget, PolynomialPart, Statement, judge, supremum
 
 x, y, z, u = sp.symbols("x y z u", real=True)
 R = sp.Rational

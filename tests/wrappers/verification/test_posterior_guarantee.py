@@ -13,9 +13,9 @@ from scipy import stats
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.filters.learning.bayesian import identify
+from safe_envs.proofs.posterior import posterior_guarantee
 from safe_envs.wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVectorWrapper
-from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow
@@ -182,7 +182,7 @@ def test_an_unbounded_set_has_none(cubic, posterior):
 def test_the_bound_is_below_what_happens(cubic, monkeypatch, identifications):
     """From one start, with identifications that know little; a shorter search finds less of the
     shortfall, and promises more."""
-    monkeypatch.setattr("safe_envs.wrappers.verification.search._ROUNDS", (30, 10))
+    monkeypatch.setattr("safe_envs.proofs.safe_set._ROUNDS", (30, 10))
     envs, horizon, promised = 100, 0.5, []
     for seed in range(identifications):
         condition = BayesianSCBF(

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import SafeEnvsError
+from safe_envs.proofs import analysis
+from safe_envs.proofs.guarantees import ChainProof
+from safe_envs.proofs.posterior import guarantee_of
+from safe_envs.proofs.safe_set import Formulas
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification import safe_set_analysis
-from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.guarantee import guarantee_of
-from safe_envs.wrappers.verification.proof import ChainProof
 from tests.oracles import false_bounds
 from tests.oracles.nasty_systems import NASTY, REFUSED, UNPROVED
 from tests.oracles.random_systems import (
@@ -75,7 +75,7 @@ def test_what_has_no_derivatives_is_refused(name):
 
 @pytest.mark.parametrize("name", UNPROVED)
 def test_the_judge_does_not_rely_on_the_search_for_kinks_and_poles(name, monkeypatch):
-    monkeypatch.setattr(safe_set_analysis, "roughness", lambda *_: "")
+    monkeypatch.setattr(analysis, "roughness", lambda *_: "")
     problem, text = NASTY[name]()
     formulas = Formulas(problem, parse_conditions(text, problem), "model")
     proof = ChainProof(formulas, [1.0] * len(formulas.names), 0.0, np.empty((0, problem.plant.n)))

@@ -10,14 +10,12 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import Barrier
+from safe_envs.problem.starts import Start
+from safe_envs.proofs.analysis import SafeSetAnalysis
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.safe_set import Formulas, largest, region_of, repeats, sample, towards_zero
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import region_of, repeats, sample
-from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
-from safe_envs.wrappers.verification.search import largest, towards_zero
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import (
     CUBIC_DISK,

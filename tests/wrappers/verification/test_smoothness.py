@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import sympy as sp
 
-from safe_envs.wrappers.verification.smoothness import edges
+from safe_envs.proofs.safe_set import edges
 from tests.wrappers.verification.verified import made, made_bound, problem_with, x
 
 

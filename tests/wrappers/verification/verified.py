@@ -5,14 +5,13 @@ from __future__ import annotations
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.problem import Barrier, SafetyProblem
 from safe_envs.problem.signals import Variable
+from safe_envs.problem.starts import Start
+from safe_envs.proofs import analysis, safe_set
+from safe_envs.proofs.feasibility import verify
+from safe_envs.proofs.posterior import guarantee_of
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification import extrema, safe_set_analysis, search
-from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import guarantee_of
 from tests.conftest import problem_of
 
 DUBINS = "safe_envs/DubinsDisk-v0"
@@ -55,8 +54,8 @@ def problem_with(
 
 def hurry(monkeypatch):
     """Search less, where what is asked does not depend on how much is found."""
-    monkeypatch.setattr(extrema, "_POOL_LOG2", 10)
-    monkeypatch.setattr(search, "_ROUNDS", (20, 10))
+    monkeypatch.setattr(safe_set, "_POOL_LOG2", 10)
+    monkeypatch.setattr(safe_set, "_ROUNDS", (20, 10))
 
 
 def made(problem, text="scbf", **options):
@@ -69,7 +68,7 @@ def made_bound(problem, text="scbf"):
     return guarantee_of(problem, parse_conditions(text, problem))
 
 
-def findings(env_id, text=None, knowledge="model", samples=safe_set_analysis.SAMPLES, **options):
+def findings(env_id, text=None, knowledge="model", samples=analysis.SAMPLES, **options):
     """What is found of a registered id, once for all tests."""
     problem = problem_of(env_id, **options)
     return verify_once(
@@ -84,7 +83,7 @@ def hurried(env_id):
     return verify_once(problem, parse_conditions(problem.filter, problem), samples=128)
 
 
-def verify_once(problem, conditions, knowledge="model", samples=safe_set_analysis.SAMPLES, seed=0):
+def verify_once(problem, conditions, knowledge="model", samples=analysis.SAMPLES, seed=0):
     """`verify`, once for all tests that ask for the same."""
     start = problem.starts[problem.start]
     of_problem = (

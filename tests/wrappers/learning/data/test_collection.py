@@ -12,12 +12,17 @@ import sympy as sp
 
 from safe_envs import ENV_IDS
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.filters.learning import collection as module
+from safe_envs.filters.learning.collection import (
+    collect,
+    collect_paths,
+    draw_states,
+    env_step,
+    plant_step,
+)
+from safe_envs.problem.problem import Barrier
+from safe_envs.problem.starts import SamplingDomain
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.data import collection as module
-from safe_envs.wrappers.learning.data.collection import collect, collect_paths, draw_states
-from safe_envs.wrappers.learning.data.steps import env_step, plant_step
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SMOOTH = make_problem("safe_envs/CubicSDEDisk-v0", noise=0.0)

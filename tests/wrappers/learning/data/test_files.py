@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.learning import load_learned
+from safe_envs.filters.learning.data import LearnedFileError, Signature, load, save
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning import load_learned
-from safe_envs.wrappers.learning.data.files import load, save
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.values import LearnedFileError
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)

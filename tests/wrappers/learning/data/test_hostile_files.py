@@ -20,12 +20,9 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.filters.learning import load_learned
+from safe_envs.filters.learning.data import LearnedFileError, Signature, Transitions, load, save
 from safe_envs.wrappers import SafetyFilter, parse_conditions
-from safe_envs.wrappers.learning import load_learned
-from safe_envs.wrappers.learning.data.files import load, save
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.data.values import LearnedFileError
 from tests.conftest import problem_of
 from tests.test_bounded_reading import damaged_by
 

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.filters.learning import data
+from safe_envs.filters.learning.collection import collect
+from safe_envs.filters.learning.data import LearnedFileError, Signature, Transitions
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.data import files
-from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.data.values import LearnedFileError
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)
@@ -152,17 +150,17 @@ def test_split_leaves_both_parts_something():
 
 
 def test_saved_and_loaded(tmp_path):
-    for data in (collect(DISK, 5, repetitions=3, seed=8), logged()):
-        data.save(tmp_path / "data.npz")
-        assert_same(Transitions.load(tmp_path / "data.npz"), data)
+    for kept in (collect(DISK, 5, repetitions=3, seed=8), logged()):
+        kept.save(tmp_path / "data.npz")
+        assert_same(Transitions.load(tmp_path / "data.npz"), kept)
 
 
 def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "data.npz"
-    files.save(path, "network", SIGNATURE, {}, {"x": np.zeros(2)})
+    data.save(path, "network", SIGNATURE, {}, {"x": np.zeros(2)})
     with pytest.raises(LearnedFileError, match="holds 'network', not 'transitions'"):
         Transitions.load(path)
-    files.save(path, "transitions", SIGNATURE, {"seed": 0}, {"x": np.zeros((1, 2))})
+    data.save(path, "transitions", SIGNATURE, {"seed": 0}, {"x": np.zeros((1, 2))})
     with pytest.raises(LearnedFileError, match="incomplete: 'u'"):
         Transitions.load(path)
     arrays = {
@@ -171,7 +169,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         "successors": np.zeros((1, 1, 3)),
         "dt": np.ones(1),
     }
-    files.save(path, "transitions", SIGNATURE, {"seed": 0}, arrays)
+    data.save(path, "transitions", SIGNATURE, {"seed": 0}, arrays)
     with pytest.raises(LearnedFileError, match="the shapes do not fit"):
         Transitions.load(path)
 

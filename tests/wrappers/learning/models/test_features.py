@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.learning.models.features import Features
+from safe_envs.filters.learning.models.features import Features
 from tests.conftest import problem_of
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
-from safe_envs.wrappers.learning.checks import Purpose, random_stream
-from safe_envs.wrappers.learning.fit import AdamSettings, train
-from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.filters.learning.checks import Purpose, random_stream
+from safe_envs.filters.learning.models.network import Network
+from safe_envs.filters.learning.residual import AdamSettings, train
 
 pytestmark = pytest.mark.slow
 

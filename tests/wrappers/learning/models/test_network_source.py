@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.compiled import slots
-from safe_envs.compiled.data import Data
-from safe_envs.compiled.formulas import Source
-from safe_envs.compiled.program import Program
-from safe_envs.wrappers.conditions.constraint import terms_source
-from safe_envs.wrappers.learning.models.generator import LearnedGenerator
-from safe_envs.wrappers.learning.models.network import Network
-from safe_envs.wrappers.learning.models.network_source import network_source, slopes_source
-from safe_envs.wrappers.learning.models.residual import LearnedResidual
+from safe_envs.engine import slots
+from safe_envs.engine.formulas import Source
+from safe_envs.engine.program import Program
+from safe_envs.engine.slots import Data
+from safe_envs.filters.conditions.base import terms_source
+from safe_envs.filters.learning.models.generator import LearnedGenerator
+from safe_envs.filters.learning.models.network import Network, network_source, slopes_source
+from safe_envs.filters.learning.models.residual import LearnedResidual
 
 STATES = sp.symbols("position angle speed", real=True)
 COORDINATES = (STATES[0] * STATES[2], sp.sin(STATES[1]), sp.cos(STATES[1]) + STATES[2])

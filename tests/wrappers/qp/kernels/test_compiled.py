@@ -7,7 +7,7 @@ from types import FunctionType
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp.kernels import interval
+from safe_envs.engine.qp.kernels import interval
 from tests.oracles.kernel_problems import random_problems, solve
 
 

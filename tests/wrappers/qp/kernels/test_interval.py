@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import rounding
-from safe_envs.wrappers.qp.kernels import interval as kernel
+from safe_envs.engine.qp import rounding
+from safe_envs.engine.qp.kernels import interval as kernel
 from tests.oracles.kernel_problems import KINDS, random_problems, reference, solve
 
 

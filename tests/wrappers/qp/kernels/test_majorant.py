@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp.kernels import majorant as kernel
-from safe_envs.wrappers.qp.majorant import majorant
+from safe_envs.engine.qp.kernels import second_order as kernel
+from safe_envs.engine.qp.second_order import majorant
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])

@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import rounding
-from safe_envs.wrappers.qp.kernels import many as kernel
-from safe_envs.wrappers.qp.kernels import many_proof
+from safe_envs.engine.qp import rounding
+from safe_envs.engine.qp.kernels import many
+from safe_envs.engine.qp.kernels import many as kernel
 from tests.oracles.kernel_problems import KINDS, random_problems, reference, solve
 
 
@@ -124,10 +124,10 @@ def test_a_multiplier_of_the_wrong_sign_proves_nothing():
     """One constraint may be left, so that the one that is held pulls."""
     a, b, v = np.array([[1.0, 0.0, 0.0]]), np.array([0.5]), np.zeros(3)
     low, high, roots = -np.ones(3), np.ones(3), np.ones(3)
-    u, work = np.empty(3), np.full(many_proof.work_of_proof(3), np.nan)
+    u, work = np.empty(3), np.full(many.work_of_proof(3), np.nan)
 
     def proved(offset, at):
-        return many_proof.prove_binding(
+        return many.prove_binding(
             a, offset, v, low, high, roots, a, np.ones(1), np.ones(1), at, u, work
         )
 
@@ -149,4 +149,4 @@ def test_data_that_are_not_finite_end_in_numbers_that_are_not():
 
 
 def test_tolerance_is_that_of_all_solvers():
-    assert many_proof.ROUNDING == rounding.ROUNDING
+    assert many.ROUNDING == rounding.ROUNDING

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import one_constraint, rounding
-from safe_envs.wrappers.qp.kernels import one_constraint as kernel
+from safe_envs.engine.qp import one_constraint, rounding
+from safe_envs.engine.qp.kernels import one_constraint as kernel
 from tests.oracles.kernel_problems import KINDS, differences, random_problems, reference, solve
 
 

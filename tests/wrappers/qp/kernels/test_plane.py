@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import dispatch, plane, rounding
-from safe_envs.wrappers.qp.kernels import plane as kernel
-from safe_envs.wrappers.qp.kernels import plane_edges, plane_nearest, plane_slack
+from safe_envs.engine.qp import dispatch, plane, rounding
+from safe_envs.engine.qp.kernels import plane as kernel
 from tests.oracles.kernel_problems import KINDS, Problems, random_problems, reference, solve
 
 
@@ -43,7 +42,7 @@ def test_says_what_the_dispatcher_does(k, kind):
 
 @pytest.mark.parametrize("kind", ["plain", "unmet", "integers", "parallel", "flat", "touching"])
 def test_fallback_finds_the_same_minimisers(kind, monkeypatch):
-    monkeypatch.setattr(plane_slack, "NEWTON_STEPS", 0)
+    monkeypatch.setattr(kernel, "NEWTON_STEPS", 0)
     problems = random_problems(np.random.default_rng(8), 100, 3, 2, kind)
     found, expected = solve(kernel.project_plane, length(3), problems), reference(problems)
     np.testing.assert_array_equal(found.feasible, expected.feasible)
@@ -62,8 +61,7 @@ def test_data_that_are_not_finite_end_in_numbers_that_are_not():
 
 
 def test_tolerance_is_that_of_all_solvers():
-    for module in (kernel, plane_nearest, plane_slack, plane_edges):
-        assert module.ROUNDING == rounding.ROUNDING
+    assert kernel.ROUNDING == rounding.ROUNDING
 
 
 def test_lines_that_cross_in_a_point_are_met_there_however_far_the_proposal():

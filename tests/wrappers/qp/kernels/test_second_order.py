@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp import rounding
-from safe_envs.wrappers.qp.kernels import second_order as kernel
-from safe_envs.wrappers.qp.second_order_batch import project_arrays
+from safe_envs.engine.qp import rounding
+from safe_envs.engine.qp.kernels import second_order as kernel
+from safe_envs.engine.qp.second_order import project_arrays
 from tests.wrappers.qp.test_second_order_constraint import HIGH, KINDS, LOW, random_rows
 
 

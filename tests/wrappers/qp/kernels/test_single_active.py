@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from safe_envs.wrappers.qp.kernels import single_active as kernel
+from safe_envs.engine.qp.kernels import one_constraint as kernel
 from tests.oracles.kernel_problems import KINDS, Problems, random_problems, reference, solve
 
 

@@ -1,0 +1,365 @@
+"""Programs that are linked, compiled and loaded."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import logging
+import math
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from safe_envs.engine import plain_natives, slots
+from safe_envs.engine.formulas import Source
+from safe_envs.errors import (
+    ConfigurationError,
+    NotCompilableError,
+    SystemDefinitionError,
+    install_extra,
+    shortened,
+)
+from safe_envs.files import cache_folder, make_room, mark_used, write_atomically
+
+_MATH_FUNCTIONS = {name for name, value in vars(math).items() if not name.startswith("_")}
+
+
+class _Module(NamedTuple):
+    """What a kernel module defines.
+
+    Attributes:
+        functions: by name.
+        constants: assignments of numbers by name.
+        imports: module and original name by name.
+    """
+
+    functions: dict[str, ast.FunctionDef]
+    constants: dict[str, ast.stmt]
+    imports: dict[str, tuple[str, str]]
+
+
+class Definitions(NamedTuple):
+    """What a program consists of, as the kernel modules state it.
+
+    Attributes:
+        functions: by name, with docstrings and annotations.
+        constants: assignments of numbers by name.
+    """
+
+    functions: dict[str, ast.FunctionDef]
+    constants: dict[str, ast.stmt]
+
+
+def definitions(entries: Sequence[Callable[..., Any]], generated: Source) -> Definitions:
+    """Return entry points and all that they call; see `linked`.
+
+    Args:
+        entries: functions of kernel modules.
+        generated: functions of this program alone.
+
+    Raises:
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
+    """
+    link = _Link(generated)
+    for function in (*entries, *generated.uses):
+        link.need(function.__module__, function.__name__)
+    return link.definitions()
+
+
+def linked(entries: Sequence[Callable[..., Any]], generated: Source) -> str:
+    """Return the text of a module with entry points and all that they call.
+
+    Functions that the generated ones define take the place of functions of the same name, which the
+    kernel modules import as a declaration.
+
+    Args:
+        entries: functions of kernel modules; they are marked `@entry`, all others `@kernel`.
+        generated: functions of this program alone.
+
+    Raises:
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
+    """
+    link = _Link(generated)
+    for function in entries:
+        link.need(function.__module__, function.__name__)
+    for function in generated.uses:
+        link.need(function.__module__, function.__name__)
+    return link.text({function.__name__ for function in entries})
+
+
+class _Link:
+    def __init__(self, generated: Source) -> None:
+        self._generated: dict[str, ast.FunctionDef] = {}
+        for node in ast.parse(generated.text).body:
+            if not isinstance(node, ast.FunctionDef) or node.name in self._generated:
+                raise SystemDefinitionError(f"generated twice, or no function: {ast.unparse(node)}")
+            self._generated[node.name] = node
+        self._found: dict[str, tuple[str, ast.stmt]] = {}
+        self._math: set[str] = set()
+        for node in self._generated.values():
+            self._need_math(node)
+
+    def _need_math(self, node: ast.AST) -> None:
+        """Note functions of `math`, which generated code calls without an import."""
+        for each in _names(node):
+            if each in _MATH_FUNCTIONS:
+                self._math.add(each)
+
+    def need(self, module: str, name: str) -> None:
+        """Add a definition of a kernel module, and what it calls."""
+        if name in self._generated:
+            return
+        if module == "math":
+            self._math.add(name)
+            return
+        if module == plain_natives.__name__:
+            return
+        if module == slots.__name__:
+            raise SystemDefinitionError(f"the program needs a function {name!r}, which is missing")
+        known = _parsed(module)
+        if name in known.imports:
+            self.need(*known.imports[name])
+            return
+        node = known.functions.get(name) or known.constants.get(name)
+        if node is None:
+            return
+        if name in self._found:
+            other, found = self._found[name]
+            # A constant of one value may be stated in several modules.
+            if other != module and ast.unparse(found) != ast.unparse(node):
+                raise SystemDefinitionError(
+                    f"two kernels are called {name!r}, in {other} and {module}"
+                )
+            return
+        self._found[name] = module, node
+        for each in _names(_bare(node) if isinstance(node, ast.FunctionDef) else node):
+            self.need(module, each)
+
+    def definitions(self) -> Definitions:
+        """Return what was found."""
+        found = {name: node for name, (_, node) in self._found.items()}
+        functions = {n: d for n, d in found.items() if isinstance(d, ast.FunctionDef)}
+        constants = {n: d for n, d in found.items() if not isinstance(d, ast.FunctionDef)}
+        return Definitions(functions | self._generated, constants)
+
+    def text(self, entries: set[str]) -> str:
+        """Return the module."""
+        functions, constants = self.definitions()
+        parts = [f"from math import {', '.join(sorted(self._math))}"] * bool(self._math)
+        parts += [ast.unparse(constants[name]) for name in sorted(constants)]
+        for name, node in sorted(functions.items()):
+            mark = "entry" if name in entries else "kernel"
+            parts.append(f"@{mark}\n{ast.unparse(_bare(node))}\n")
+        return "\n".join(parts)
+
+
+def _names(node: ast.AST) -> set[str]:
+    return {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+
+
+@lru_cache(maxsize=64)
+def _parsed(module: str) -> _Module:
+    """Read a kernel module."""
+    found: ModuleType = importlib.import_module(module)
+    known = _Module({}, {}, {})
+    for node in ast.parse(inspect.getsource(found)).body:
+        if isinstance(node, ast.FunctionDef):
+            known.functions[node.name] = node
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            known.constants[node.targets[0].id] = node
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            known.imports.update({a.asname or a.name: (node.module, a.name) for a in node.names})
+    return known
+
+
+def _bare(node: ast.FunctionDef) -> ast.FunctionDef:
+    """Return a function without docstring and annotations."""
+    bare = copy.deepcopy(node)
+    bare.returns = None
+    for argument in bare.args.args:
+        argument.annotation = None
+    if ast.get_docstring(bare) is not None:
+        bare.body = bare.body[1:] or [ast.Pass()]
+    return bare
+
+
+ADVICE = f"{install_extra('fast')}, or use the engine 'numpy'"
+
+_LOG = logging.getLogger("safe_envs")
+_FILE = "program.py"
+_DIGITS = 32
+
+FOLDER = "compiled"
+"""Name of the folder of programs in the user's cache."""
+
+Functions = dict[str, Callable[..., Any]]
+"""Entry points by name."""
+
+
+def is_available() -> bool:
+    """Return whether Numba is installed, without importing it."""
+    return importlib.util.find_spec("numba") is not None
+
+
+class Program:
+    """Entry points, linked with the functions that were generated for a problem.
+
+    Args:
+        title: what the program computes, for the message that it is being compiled.
+        entries: functions of kernel modules.
+        generated: functions of this program alone.
+
+    Attributes:
+        text: of the program, in Python.
+
+    Raises:
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
+    """
+
+    def __init__(
+        self, title: str, entries: Sequence[Callable[..., Any]], generated: Source
+    ) -> None:
+        self._title = title
+        self._names = tuple(function.__name__ for function in entries)
+        self.text = linked(entries, generated)
+
+    def plain(self) -> Functions:
+        """Return the entry points as plain Python functions, which are slow."""
+        names: dict[str, Any] = {**vars(plain_natives), "entry": _unchanged, "kernel": _unchanged}
+        exec(self.text, names)
+        return {name: names[name] for name in self._names}
+
+    def compiled(self) -> Functions:
+        """Return the entry points; each is compiled, or read from disk, at its first call.
+
+        Raises:
+            ConfigurationError: Numba is not installed.
+            NotCompilableError: It cannot be used.
+        """
+        if not is_available():
+            raise ConfigurationError(f"the compiled engine needs Numba, which is missing; {ADVICE}")
+        return _loaded(self.text, self._names, self._title)
+
+
+def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
+    return function
+
+
+@lru_cache(maxsize=64)
+def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
+    natives = _natives()
+    stamp = f"{inspect.getsource(natives)}\n{text}"
+    digest = hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
+    folder = cache_folder(FOLDER)
+    try:
+        if folder is not None:
+            program = _KeptProgram(folder / digest, text, title)
+            make_room()
+            return {name: program.entry(name) for name in names}
+    except (OSError, ConfigurationError):  # The disk may be full.
+        pass
+    _LOG.warning("compiling %s; there is no folder of yours to keep it in", title)
+    found = _not_kept(text)
+    return {name: found[name] for name in names}
+
+
+def _natives() -> ModuleType:
+    """Import what needs Numba, which may not suit the other packages."""
+    try:
+        from numba.core import config
+
+        from safe_envs.engine import numba_natives
+    except Exception as error:
+        raise NotCompilableError(f"Numba cannot be imported: {shortened(error)}") from error
+    if getattr(config, "DISABLE_JIT", 0):
+        raise NotCompilableError("Numba compiles nothing, as NUMBA_DISABLE_JIT says")
+    return numba_natives
+
+
+def _not_kept(text: str) -> dict[str, Any]:
+    natives = _natives()
+    names = {**vars(natives), "entry": natives.passing_entry}
+    exec(text, names)
+    return names
+
+
+class _KeptProgram:
+    """A program in a folder of its own, where Numba keeps what it compiles."""
+
+    def __init__(self, folder: Path, text: str, title: str) -> None:
+        self._folder, self._title, self._told = folder, title, False
+        self._text = text
+        self._functions = self._load()
+
+    def entry(self, name: str) -> Callable[..., Any]:
+        """Return an entry point, which says so where it has to be compiled first."""
+        function = self._functions[name]
+        is_new = True
+
+        def call(*arguments: Any) -> Any:
+            nonlocal function, is_new
+            if not is_new:
+                return function(*arguments)
+            # Elsewhere where the user has set NUMBA_CACHE_DIR.
+            place = Path(function.stats.cache_path)
+            is_kept = any(place.glob(f"*.{name}-*.nbi"))
+            if not (is_kept or self._told):
+                _LOG.warning("compiling %s, which takes some seconds once", self._title)
+                self._told = True
+            is_new = False
+            try:
+                return function(*arguments)
+            except OSError:  # The disk may be full.
+                function = _not_kept(self._text)[name]
+            except Exception:
+                if not is_kept:
+                    raise
+                # Kernels raise nothing: what is kept cannot be read.
+                shutil.rmtree(place, ignore_errors=True)
+                function = self._load()[name]
+            return function(*arguments)
+
+        return call
+
+    def _load(self) -> dict[str, Any]:
+        file = self._folder / _FILE
+        text = f"from safe_envs.engine.numba_natives import *\n{self._text}".encode()
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        if not file.is_file() or file.read_bytes() != text:
+            write_atomically(file, lambda path: path.write_bytes(text))
+        mark_used(self._folder)
+        name = f"safe_envs_program_{self._folder.name}"
+        spec: Any = importlib.util.spec_from_file_location(name, file)
+        module = importlib.util.module_from_spec(spec)
+        # Numba finds a function's module by its name.
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        return vars(module)
+
+
+def has_own_source(given: Any, *computing: str) -> bool:
+    """Return whether an object has a method `source` that tells what it computes.
+
+    That of a base tells nothing about a class that computes otherwise.
+
+    Args:
+        given: any object.
+        computing: names of the methods by which it computes in NumPy.
+    """
+    classes = type(given).__mro__
+
+    def place(name: str) -> int:
+        return next((k for k, c in enumerate(classes) if name in vars(c)), len(classes))
+
+    return place("source") < len(classes) and all(
+        place("source") <= place(name) and name not in getattr(given, "__dict__", {})
+        for name in computing
+    )

@@ -1,0 +1,215 @@
+"""Conditions that ignore the noise: CBF, ECBF, HOCBF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from numbers import Number
+from typing import Any
+
+import sympy as sp
+from mpmath.libmp import NoConvergence  # pyright: ignore[reportMissingImports]
+
+from safe_envs.dynamics.lie import derivatives, lie_derivative_f, relative_degree
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened, shown
+from safe_envs.filters.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.filters.conditions.class_k import ClassK, Rate, entries_of, positive_rates, rates
+from safe_envs.filters.conditions.names import ONLY_DEGREE_1
+from safe_envs.problem.problem import Barrier
+
+_STEPS = 100
+"""Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for
+seconds."""
+
+
+@dataclass(frozen=True)
+class CBF(Condition):
+    """L_f h + L_g h u + alpha(h) >= 0, for relative degree 1.
+
+    Attributes:
+        alpha: class-K function; a number is its rate in 1/s.
+
+    Source: thesis Def. 3.1.2.
+    """
+
+    alpha: Rate = 1.0
+    name = "cbf"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "alpha", rates("alpha", (self.alpha,))[0])
+
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint; a relative degree other than 1 is a `RelativeDegreeError`."""
+        try:
+            return AffineConstraint.after(
+                model, *chain_of(model, barrier, (self.alpha,), lie_derivative_f)
+            )
+        except RelativeDegreeError as error:
+            raise RelativeDegreeError(f"{error}. {ONLY_DEGREE_1}") from error
+
+    @classmethod
+    def for_gains(cls, gains: Sequence[float]) -> CBF:
+        """Return the CBF with the first rate."""
+        return cls(gains[0])
+
+    def chain_rates(self, degree: int) -> tuple[float, ...] | None:
+        """Return alpha where it is linear; see `Condition.chain_rates`."""
+        return None if isinstance(self.alpha, ClassK) else (self.alpha,)
+
+
+@dataclass(frozen=True)
+class HOCBF(Condition):
+    """b_0 = h, b_j = L_f b_(j-1) + alpha_j(b_(j-1)), and b_r(x, u) >= 0.
+
+    The set that it keeps is the intersection of {b_j >= 0}, j < r, not C itself: a start in C alone
+    is no guarantee.
+
+    Attributes:
+        p: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate
+            of a linear one in 1/s.
+
+    Source: thesis Eq. (3.7), (3.10).
+    """
+
+    p: tuple[Rate, ...] = (1.0,)
+    name = "hocbf"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "p", rates("p", self.p))
+
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint; see `chain_of` for what it raises."""
+        return AffineConstraint.after(model, *chain_of(model, barrier, self.p, lie_derivative_f))
+
+    @classmethod
+    def for_gains(cls, gains: Sequence[float]) -> HOCBF:
+        """Return the HOCBF with all rates."""
+        return cls(tuple(gains))
+
+    def chain_rates(self, degree: int) -> tuple[float, ...] | None:
+        """Return the rates where all are linear; see `Condition.chain_rates`."""
+        linear = tuple(p for p in self.p if not isinstance(p, ClassK))
+        return linear if len(linear) == len(self.p) else None
+
+
+@dataclass(frozen=True)
+class ECBF(Condition):
+    """L_f^r h + L_g L_f^(r-1) h u + k_0 h + k_1 L_f h + ... + k_(r-1) L_f^(r-1) h >= 0.
+
+    It is the HOCBF whose rates are minus its poles, and keeps the same sets.
+
+    Attributes:
+        k: gains k_0..k_(r-1). The polynomial s^r + k_(r-1) s^(r-1) + ... + k_0 needs real negative
+            roots: stability alone, as thesis Def. 3.1.5 prints it, lets h undershoot below 0.
+        poles: these roots, in 1/s, if they are given in place of the gains.
+
+    Raises:
+        ConfigurationError: a pole is complex or not negative, or both gains and poles are given.
+
+    Source: thesis Eq. (3.6).
+    """
+
+    k: tuple[float, ...] | None = None
+    poles: tuple[float, ...] | None = field(default=None, compare=False)
+    name = "ecbf"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.poles is None:
+            gains = positive_rates("k", (1.0,) if self.k is None else self.k)
+            _real_negative_roots(gains)
+        else:
+            poles = _real_negative_poles(self.poles)
+            gains = gains_of_poles(poles)
+            if self.k not in (None, gains):
+                raise ConfigurationError(
+                    f"ecbf takes gains or poles; k = {self.k} and poles = {poles} were given"
+                )
+            object.__setattr__(self, "poles", poles)
+        object.__setattr__(self, "k", gains)
+
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint.
+
+        Raises:
+            RelativeDegreeError: the number of gains is not the relative degree, or there is none.
+        """
+        gains: tuple[float, ...] = self.k or ()
+        degree = relative_degree(model, barrier.expression)
+        if len(gains) != degree:
+            raise RelativeDegreeError(
+                f"barrier {barrier.name} has relative degree {degree} and needs as many gains;"
+                f" {len(gains)} given"
+            )
+        eta = derivatives(model, barrier.expression, degree, lie_derivative_f)
+        offset = eta[-1] + sum(sp.Float(k, 17) * e for k, e in zip(gains, eta, strict=False))
+        chain, _ = chain_of(model, barrier, self.chain_rates(degree), lie_derivative_f)
+        return AffineConstraint.after(model, chain, offset)
+
+    @classmethod
+    def for_gains(cls, gains: Sequence[float]) -> ECBF:
+        """Return the ECBF with its poles at minus the rates."""
+        return cls(poles=tuple(-rate for rate in gains))
+
+    def chain_rates(self, degree: int) -> tuple[float, ...]:
+        """Return minus the poles, the slowest first; see `Condition.chain_rates`."""
+        return tuple(sorted(-pole for pole in self.poles or _real_negative_roots(self.k or ())))
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The poles where they are given, else the gains."""
+        return {"poles": self.poles} if self.poles else {"k": self.k}
+
+
+_WHY = (
+    "place real negative ones, one for each relative degree; with complex poles h would oscillate"
+    " through 0, and with others it would not come back to the safe set"
+)
+
+
+def gains_of_poles(poles: Sequence[float]) -> tuple[float, ...]:
+    """Return k_0..k_(r-1) of the monic polynomial with the given roots."""
+    s = sp.Symbol("s")
+    polynomial = sp.Poly(sp.Mul(*[s - sp.Rational(repr(p)) for p in poles]), s)
+    return tuple(float(c) for c in reversed(polynomial.all_coeffs()[1:]))
+
+
+def _real_negative_poles(given: Any) -> tuple[float, ...]:
+    entries = entries_of(given)
+    listing = shortened(", ".join(map(str, entries)) or "none")
+    if not all(isinstance(pole, Number) and not isinstance(pole, bool) for pole in entries):
+        raise ConfigurationError(
+            f"poles = {listing}; give numbers in 1/s, one for each relative degree"
+        )
+    poles = [complex(pole) for pole in entries]
+    if not poles or any(pole.imag or not -math.inf < pole.real < 0 for pole in poles):
+        raise ConfigurationError(f"poles = {listing}: {_WHY}")
+    return tuple(pole.real for pole in poles)
+
+
+def _real_negative_roots(gains: Sequence[float]) -> tuple[float, ...]:
+    polynomial = sp.Poly([1, *(sp.Rational(repr(k)) for k in reversed(gains))], sp.Symbol("s"))
+    try:
+        # A factor that is repeated exactly is solved once: the iteration does not converge at
+        # multiple roots.
+        roots = [
+            root
+            for factor, count in polynomial.sqf_list()[1]
+            for root in factor.nroots(n=50, maxsteps=_STEPS) * count
+        ]
+    except NoConvergence as error:
+        raise ConfigurationError(
+            f"the poles of k = {shown(gains)} cannot be computed; give poles in place of gains"
+        ) from error
+    # Rounding of the gains splits a multiple pole into a ring about it: what oscillates so slowly
+    # is real.
+    if any(sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
+        listing = ", ".join(str(sp.N(root, 4)) for root in roots)
+        raise ConfigurationError(
+            f"k = {shown(gains)} has its poles at {shortened(listing)}: {_WHY}"
+        )
+    return tuple(float(sp.re(root)) for root in roots)

@@ -1,1 +1,0 @@
-"""Terminal sets of backup laws, and the proof that they are kept."""

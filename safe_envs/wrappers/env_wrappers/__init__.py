@@ -1,1 +1,0 @@
-"""Gymnasium wrappers: safety filters, monitors of third-party envs, costs returned by `step`."""

@@ -1,1 +1,0 @@
-"""One-step data of a system, and their collection."""

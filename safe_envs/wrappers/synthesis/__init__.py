@@ -1,1 +1,0 @@
-"""Polynomial barriers by linear programs: candidates, whose statements others have to prove."""
