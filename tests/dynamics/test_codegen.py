@@ -99,22 +99,6 @@ class Exactly:
         return self._known[expression].real, max(abs(self._known[e]) for e in parts)
 
 
-@given(cases())
-@settings(max_examples=18)
-def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
-    symbols, expressions, points = case
-    floats, arrays = both(symbols, expressions)
-    with np.errstate(all="ignore"):
-        columns = np.broadcast_arrays(*arrays(*np.array(points).T), np.zeros(len(points)))[:-1]
-    for row, point in enumerate(points):
-        ours, exactly = floats(*point), Exactly(dict(zip(symbols, point, strict=True)))
-        for i, expression in enumerate(expressions):
-            value, largest = exactly(expression)
-            if largest < LARGEST:
-                assert ours[i] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
-                assert columns[i][row] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
-
-
 @pytest.mark.parametrize(
     "names", ["p0 p1", "x0 x1", "_c0 _c1", "a001 a000", "sin None", "lambda x_{1}"]
 )
@@ -284,3 +268,19 @@ def test_functions_that_go_to_a_cluster_know_when_arrays_are_outdated():
         (at,) = settled((np.full(2, value),), (2,))
         assert other(at)[0] is function(at)[0]
         np.testing.assert_array_equal(other(at)[0], np.sin([value, value]))
+
+
+@given(cases())
+@settings(max_examples=18)
+def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
+    symbols, expressions, points = case
+    floats, arrays = both(symbols, expressions)
+    with np.errstate(all="ignore"):
+        columns = np.broadcast_arrays(*arrays(*np.array(points).T), np.zeros(len(points)))[:-1]
+    for row, point in enumerate(points):
+        ours, exactly = floats(*point), Exactly(dict(zip(symbols, point, strict=True)))
+        for i, expression in enumerate(expressions):
+            value, largest = exactly(expression)
+            if largest < LARGEST:
+                assert ours[i] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
+                assert columns[i][row] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
