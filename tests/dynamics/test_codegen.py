@@ -271,7 +271,7 @@ def test_functions_that_go_to_a_cluster_know_when_arrays_are_outdated():
 
 
 @given(cases())
-@settings(max_examples=18)
+@settings(max_examples=14)
 def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
     symbols, expressions, points = case
     floats, arrays = both(symbols, expressions)

@@ -25,7 +25,7 @@ BOXES = 30
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("cases", [2_000, pytest.param(250_000, marks=pytest.mark.oracle)])
 def test_forms_of_random_compositions_hold_exact_values(cases, seed):
     random, looked_at = np.random.default_rng(seed), 0

@@ -64,7 +64,7 @@ def boxes_around(random, polynomial, count):
 
 
 @pytest.mark.parametrize(("n", "degree"), [(1, 3), (1, 16), (2, 5), (2, 16), (3, 4)])
-@pytest.mark.parametrize("polynomials", [3, pytest.param(300, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize("polynomials", [2, pytest.param(300, marks=pytest.mark.oracle)])
 def test_forms_of_derivatives_hold_exact_values(n, degree, polynomials):
     random = np.random.default_rng(degree)
     orders = [o for o in itertools.product(range(3), repeat=n) if sum(o) <= 2]

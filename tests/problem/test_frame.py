@@ -52,7 +52,7 @@ def test_a_vehicle_in_a_disk_has_two_coordinates():
         assert (found.coordinates[1].low, found.coordinates[1].high) == (-math.pi, math.pi)
         assert found.outside == -1
         assert found.note == ""
-    for options in ({"noise": 3.0}, {"noise": 0.01}, {"radius": 0.1}, {"substeps": 5}):
+    for options in ({"noise": 3.0}, {"noise": 0.01}, {"substeps": 5}):
         assert names(disk(**options)) == ("distance", "phi"), options
     assert names(disk("DubinsDisk"), intervals={"v": (0.8, 2.4)}) == ("distance", "phi")
 

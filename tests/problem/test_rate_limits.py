@@ -56,7 +56,7 @@ def test_near_a_bound_the_rates_that_cross_it_are_left_out(own):
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3])
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_inputs_and_rates_stay_within_their_bounds_for_ten_thousand_steps(sigma, substeps):
+def test_inputs_and_rates_stay_within_their_bounds_for_thousands_of_steps(sigma, substeps):
     noisy = ControlAffineSDE((x,), (u, w), [-x], [[1, 1]], [[sigma]])
     problem = state_problem(
         noisy,
@@ -64,7 +64,7 @@ def test_inputs_and_rates_stay_within_their_bounds_for_ten_thousand_steps(sigma,
         box=[(-1.0, 3.0), (0.2, 0.3)],
         start=[0.0],
         dt=0.1,
-        horizon=2000.0,
+        horizon=100.0,
         substeps=substeps,
     ).configured(rate_limit=[(-3.0, 8.0), (-5.0, 5.0)])
     env = SafeVectorEnv(problem, 10, autoreset_mode="Disabled")
@@ -73,7 +73,7 @@ def test_inputs_and_rates_stay_within_their_bounds_for_ten_thousand_steps(sigma,
     rates = np.array(problem.rates)
     rng, before = np.random.default_rng(0), env.state[:, 1:]
     np.testing.assert_array_equal(before, np.tile([0.0, 0.2], (10, 1)))
-    for _ in range(1000):
+    for _ in range(400):
         # Long runs at the ends too.
         actions = np.sign(rng.uniform(-1.0, 1.0, (10, 2))) * rng.choice([0.3, 1.0, 1.0], (10, 2))
         env.step(actions if rng.random() < 0.3 else np.ones((10, 2)) * rng.choice([-1.0, 1.0]))
@@ -121,8 +121,10 @@ def test_what_else_follows():
     assert SafeEnv(given).reset(seed=0)[0][-1] == 1.0
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0])
     assert SafeEnv(given).reset(seed=0)[0][-1] == 0.0
-    several = problem_of("safe_envs/QuadrotorLimits-v0").configured(rate_limit=(-1e5, 1e5))
-    assert [len(gains) for gains in several.gains] == [3, 3, 3]
+    several = state_problem(
+        SYSTEM, [1 - x, 2 - y], box=(-1, 1), start=[0, 0], dt=0.1, horizon=1.0
+    ).configured(rate_limit=(-1, 1))
+    assert [len(gains) for gains in several.gains] == [3, 2]
     acc = problem_of("safe_envs/ACC-v0").configured(rate_limit=(-1e4, 1e4))
     assert (acc.filter, acc.clf) == ("szcbf", None)
 
