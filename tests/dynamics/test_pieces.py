@@ -60,6 +60,7 @@ WHOLE = (
         (sp.Min(sp.Max(x, y), z), [{x, y}, {z}]),
         (sp.Max(sp.Min(x, y), z), [{x, z}, {y, z}]),
         (sp.Min(1 - x**2, 5), [{1 - x**2}]),
+        (sp.Min(x, 0), [{x}]),
         (sp.Piecewise((x, x >= 0), (-x, True)), [{x, -x}]),
         (1 - sp.Piecewise((x, x > y), (y, True)), [{1 - x}, {1 - y}]),
         (1 - sp.Max(x, 0) ** 2 - sp.Abs(y), [{1 - sp.Max(x, 0) ** 2 - s * y} for s in (1, -1)]),
