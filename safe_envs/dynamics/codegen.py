@@ -24,37 +24,9 @@ from sympy.printing.pycode import PythonCodePrinter
 from safe_envs.errors import SystemDefinitionError
 
 SUPPORTED = (
-    *(
-        sp.sin,
-        sp.cos,
-        sp.tan,
-        sp.cot,
-        sp.sec,
-        sp.csc,
-        sp.asin,
-        sp.acos,
-        sp.atan,
-        sp.atan2,
-        sp.acot,
-        sp.asec,
-        sp.acsc,
-        sp.sinc,
-    ),
-    *(
-        sp.sinh,
-        sp.cosh,
-        sp.tanh,
-        sp.coth,
-        sp.sech,
-        sp.csch,
-        sp.asinh,
-        sp.acosh,
-        sp.atanh,
-        sp.exp,
-        sp.log,
-        sp.erf,
-        sp.erfc,
-    ),
+    *(sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.sinc, sp.exp, sp.log, sp.erf, sp.erfc),
+    *(sp.asin, sp.acos, sp.atan, sp.atan2, sp.acot, sp.asec, sp.acsc),
+    *(sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.acosh, sp.atanh),
     *(sp.Abs, sp.sign, sp.Heaviside, sp.Piecewise, sp.floor, sp.ceiling, sp.frac, sp.Mod),
 )
 """Functions that have the same values as floats and as arrays, in addition to sums, products,
@@ -295,7 +267,7 @@ def _shared_subexpressions(
         return expression.func(*arguments, **as_it_is)
 
     for symbol, expression in shared:
-        expanded = expand(expression)
+        expanded = expand(expression)  # which may append too
         replacements.append((symbol, expanded))
     return replacements, type(reduced)(expand(e) for e in reduced)
 
@@ -459,11 +431,7 @@ def _piece_by_piece(
     A subexpression that other pieces share may have no value.
     """
     careful = sp.lambdify(
-        (_OWNER, *names),
-        tuple(formulas),
-        modules=[math],
-        printer=FloatPrinter(),
-        docstring_limit=0,
+        (_OWNER, *names), tuple(formulas), [math], printer=FloatPrinter(), docstring_limit=0
     )
 
     def function(*arguments: Any) -> Components:

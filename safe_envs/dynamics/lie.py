@@ -23,13 +23,7 @@ Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
 
 _STEPS = (sp.floor, sp.ceiling, sp.frac, sp.Mod)
 _KINKED = (
-    sp.Piecewise,
-    sp.Abs,
-    sp.Min,
-    sp.Max,
-    sp.sign,
-    sp.Heaviside,
-    sp.DiracDelta,
+    *(sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta),
     *_STEPS,
 )
 _LARGEST_TIDIED = 100

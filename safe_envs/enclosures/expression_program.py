@@ -1,6 +1,6 @@
 """From SymPy expressions to programs: each operation carried out on values of some arithmetic.
 
-The values are intervals (`intervals`) or first-order forms (`first_order_forms`). Both enclose what
+The values are intervals (`intervals`) or first-order forms (`forms`). Both enclose what
 the expressions are, so that a program encloses them too.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -19,18 +19,10 @@ from safe_envs.errors import SystemDefinitionError
 
 Operation = Callable[..., Any]
 
-_INCREASING = (
-    sp.exp,
-    sp.log,
-    sp.asin,
-    sp.atan,
-    sp.sinh,
-    sp.tanh,
-    sp.asinh,
-    sp.acosh,
-    sp.atanh,
+_FUNCTIONS = (
+    *(sp.exp, sp.log, sp.sin, sp.cos, sp.tan, sp.asin, sp.acos, sp.atan, sp.Abs),
+    *(sp.sinh, sp.cosh, sp.tanh, sp.asinh, sp.acosh, sp.atanh),
 )
-_FUNCTIONS = (*_INCREASING, sp.sin, sp.cos, sp.tan, sp.acos, sp.cosh, sp.Abs)
 _STEPS = (sp.sign, sp.floor, sp.ceiling)
 _INVERSES = {
     sp.sec: sp.cos,
@@ -47,65 +39,13 @@ _EXTREMES: dict[Any, Any] = {
 """Functions in their place while common parts are looked for."""
 
 
-class Arithmetic(Protocol):
-    """Operations on enclosures of numbers: a, b, x and y, a whole number n, a constant exponent."""
-
-    def constant(self, number: Any) -> Any:
-        """Return the enclosure of a real number."""
-        ...
-
-    def size(self, a: Any) -> int:
-        """Return the number of entries of an enclosure."""
-        ...
-
-    def add(self, a: Any, b: Any) -> Any:
-        """Return a + b; see `Arithmetic`."""
-        ...
-
-    def multiply(self, a: Any, b: Any) -> Any:
-        """Return a b; see `Arithmetic`."""
-        ...
-
-    def reciprocal(self, a: Any) -> Any:
-        """Return 1/a."""
-        ...
-
-    def square_root(self, a: Any) -> Any:
-        """Return the root of a."""
-        ...
-
-    def integer_power(self, a: Any, n: int) -> Any:
-        """Return a^n; see `Arithmetic`."""
-        ...
-
-    def real_power(self, a: Any, exponent: Any) -> Any:
-        """Return a^exponent; see `Arithmetic`."""
-        ...
-
-    def function(self, kind: Any) -> Operation:
-        """Return a function of one argument: one of those that have an interval form."""
-        ...
-
-    def step(self, kind: Any) -> Operation:
-        """Return the sign, or a rounding down or up."""
-        ...
-
-    def extreme(self, kind: Any) -> Operation:
-        """Return the larger or the smaller of two."""
-        ...
-
-    def atan2(self, y: Any, x: Any) -> Any:
-        """Return the angle of (x, y); see `Arithmetic`."""
-        ...
-
-
 class ExpressionProgram:
     """Operations in the order in which they are carried out, each on the results of others.
 
     Args:
         symbols: arguments, in the order in which the program takes them.
         expressions: what it returns, in order; every free symbol must be an argument.
-        arithmetic: of the values.
+        arithmetic: operations on values, with the methods of `intervals.IntervalArithmetic`.
 
     Raises:
         SystemDefinitionError: An expression holds a symbol that is no argument, a function without
@@ -113,7 +53,7 @@ class ExpressionProgram:
     """
 
     def __init__(
-        self, symbols: Sequence[sp.Symbol], expressions: Sequence[Any], arithmetic: Arithmetic
+        self, symbols: Sequence[sp.Symbol], expressions: Sequence[Any], arithmetic: Any
     ) -> None:
         for expression in expressions:
             require_computable(expression, tuple(symbols))

@@ -24,7 +24,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.enclosures.expression_program import Operation
-from safe_envs.enclosures.intervals import Interval, IntervalOperations, negative
+from safe_envs.enclosures.intervals import Interval, IntervalArithmetic, negative
 
 EPS = 2.0**-52
 TINY = 1e-300
@@ -156,13 +156,15 @@ def is_finite(a: Interval) -> np.ndarray:
     return np.isfinite(a.low) & np.isfinite(a.high)
 
 
-_INTERVALS = IntervalOperations()
+_INTERVALS = IntervalArithmetic()
+IntervalMap = Callable[[Interval], Interval]
 
 
-class FormArithmetic:
+class FormOperations:
     """Operations on forms a, b, x and y; constants have one entry, which broadcasts over the boxes.
 
-    Powers have a whole number n or a constant exponent.
+    Functions of one argument are named by their SymPy classes. Powers have a whole number n or a
+    constant exponent.
     """
 
     def __init__(self, n: int) -> None:
@@ -195,14 +197,14 @@ class FormArithmetic:
         return int(np.size(a.center))
 
     def add(self, a: Form, b: Form) -> Form:
-        """Return a + b; see `FormArithmetic`."""
+        """Return a + b; see `FormOperations`."""
         center, slopes = a.center + b.center, a.slopes + b.slopes
         error = EPS * (np.abs(center) + np.abs(slopes).sum(axis=0))
         known = _INTERVALS.add(a.range, b.range)
         return with_range(center, slopes, a.radius + b.radius + error, known, a.smooth & b.smooth)
 
     def multiply(self, a: Form, b: Form) -> Form:
-        """Return a b; see `FormArithmetic`."""
+        """Return a b; see `FormOperations`."""
         known = _INTERVALS.multiply(a.range, b.range)
         center = a.center * b.center
         slopes = a.center * b.slopes + b.center * a.slopes
@@ -247,7 +249,7 @@ class FormArithmetic:
         )
 
     def integer_power(self, a: Form, n: int) -> Form:
-        """Return a^n; see `FormArithmetic`."""
+        """Return a^n; see `FormOperations`."""
         if n < 0:
             return self.reciprocal(self.integer_power(a, -n))
         if n == 1:
@@ -263,7 +265,7 @@ class FormArithmetic:
         )
 
     def real_power(self, a: Form, exponent: Form) -> Form:
-        """Return a^exponent, not smooth where a reaches 0; see `FormArithmetic`."""
+        """Return a^exponent, not smooth where a reaches 0; see `FormOperations`."""
         e = Interval(float(exponent.range.low[0]), float(exponent.range.high[0]))
         less = [_INTERVALS.add(e, Interval(-k, -k)) for k in (0.0, 1.0, 2.0)]
         factor = _INTERVALS.multiply(e, less[1])
@@ -279,9 +281,9 @@ class FormArithmetic:
     def composed(
         self,
         a: Form,
-        value: Callable[[Interval], Interval],
-        slope: Callable[[Interval], Interval],
-        curve: Callable[[Interval], Interval],
+        value: IntervalMap,
+        slope: IntervalMap,
+        curve: IntervalMap,
         regular: np.ndarray | None = None,
     ) -> Form:
         """Return a function of a form, by Taylor's formula about its center.
@@ -323,37 +325,6 @@ class FormArithmetic:
         if regular is not None:
             radius = np.where(regular, radius, np.inf)  # Taylor's formula says nothing there.
         return with_range(center + half + moved, slopes, radius, known, smooth)
-
-
-def _mixed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the sum over i < j of |a_i b_j + a_j b_i|, shape (B,)."""
-    found = np.zeros(max(a.shape[1], b.shape[1]))
-    for i in range(1, len(a)):
-        found += np.abs(a[i] * b[:i] + a[:i] * b[i]).sum(axis=0)
-    return found
-
-
-def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a b for nonnegative numbers, 0 where one is 0 and the other infinite."""
-    return np.where((a == 0.0) | (b == 0.0), 0.0, a * b)
-
-
-def _ball(a: Interval) -> tuple[np.ndarray, np.ndarray]:
-    """Return center and radius of intervals."""
-    mid, rad = middle(np.asarray(a.low, dtype=float), np.asarray(a.high, dtype=float))
-    return mid, rad + EPS * (np.abs(mid) + rad)
-
-
-def _scaled(factor: float, a: Interval) -> Interval:
-    """Return a times a number that is a float exactly."""
-    return _INTERVALS.multiply(Interval(factor, factor), a)
-
-
-IntervalMap = Callable[[Interval], Interval]
-
-
-class FormOperations(FormArithmetic):
-    """Arithmetic of forms with the functions of expressions, by their SymPy classes."""
 
     def function(self, kind: Any) -> Operation:
         """Return a function of one argument, with its first two derivatives."""
@@ -432,7 +403,7 @@ class FormOperations(FormArithmetic):
         return larger_one
 
     def atan2(self, y: Form, x: Form) -> Form:
-        """Return the angle of (x, y), by a quotient that is regular; see `FormArithmetic`."""
+        """Return the angle of (x, y), by a quotient that is regular; see `FormOperations`."""
         known = _INTERVALS.atan2(y.range, x.range)
         arctan = self.function(sp.atan)
         by_x = arctan(self.multiply(y, self.reciprocal(x)))
@@ -448,6 +419,30 @@ class FormOperations(FormArithmetic):
                 np.maximum(known.low, found.range.low), np.minimum(known.high, found.range.high)
             )
         )
+
+
+def _mixed(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the sum over i < j of |a_i b_j + a_j b_i|, shape (B,)."""
+    found = np.zeros(max(a.shape[1], b.shape[1]))
+    for i in range(1, len(a)):
+        found += np.abs(a[i] * b[:i] + a[:i] * b[i]).sum(axis=0)
+    return found
+
+
+def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a b for nonnegative numbers, 0 where one is 0 and the other infinite."""
+    return np.where((a == 0.0) | (b == 0.0), 0.0, a * b)
+
+
+def _ball(a: Interval) -> tuple[np.ndarray, np.ndarray]:
+    """Return center and radius of intervals."""
+    mid, rad = middle(np.asarray(a.low, dtype=float), np.asarray(a.high, dtype=float))
+    return mid, rad + EPS * (np.abs(mid) + rad)
+
+
+def _scaled(factor: float, a: Interval) -> Interval:
+    """Return a times a number that is a float exactly."""
+    return _INTERVALS.multiply(Interval(factor, factor), a)
 
 
 def _one_plus(a: Interval) -> Interval:

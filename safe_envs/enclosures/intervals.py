@@ -1,12 +1,10 @@
-"""From SymPy expressions to functions of intervals: their natural interval extensions.
-
-Each operation of an expression is replaced by its operation on intervals, so that the result holds
-all values that the expression takes on intervals of its arguments; it holds more where a symbol
-occurs several times. Results are rounded outwards: see `interval_arithmetic`.
+"""Interval arithmetic, and functions of intervals compiled from SymPy expressions.
 
 An interval [a, b] holds every real number x with a <= x <= b; an infinite end says that there is no
 bound on this side. Each operation returns intervals that hold all values of the exact operation on
 numbers of its arguments. Ends are never NaN: where nothing is known the interval is the whole line.
+A compiled expression carries out each of its operations on intervals (its natural interval
+extension), so that the result holds all of its values, and more where a symbol occurs twice.
 
 Rounding: in floating point s = x + y, and s - c|s| with c = 2^-52 is at most the exact sum, for the
 error of s is at most half of its last place, c|s| at least one, and sums below 2^-1021 are exact. A
@@ -84,11 +82,30 @@ def _without_bounds_at(where: Any, a: Interval) -> Interval:
     return Interval(np.where(where, -np.inf, a.low), np.where(where, np.inf, a.high))
 
 
+_HALF_PI = math.nextafter(math.pi / 2, 2)
+_PI = math.nextafter(math.pi, 4)
+_ALL = (-np.inf, np.inf)
+
+_INCREASING: dict[Any, tuple[Callable[..., Any], tuple[float, float]]] = {
+    sp.exp: (np.exp, (0.0, np.inf)),
+    sp.log: (np.log, _ALL),
+    sp.asin: (np.arcsin, (-_HALF_PI, _HALF_PI)),
+    sp.atan: (np.arctan, (-_HALF_PI, _HALF_PI)),
+    sp.sinh: (np.sinh, _ALL),
+    sp.tanh: (np.tanh, (-1.0, 1.0)),
+    sp.asinh: (np.arcsinh, _ALL),
+    sp.acosh: (np.arccosh, (0.0, np.inf)),
+    sp.atanh: (np.arctanh, _ALL),
+}
+_STEPS = {sp.sign: np.sign, sp.floor: np.floor, sp.ceiling: np.ceil}
+IntervalFunction = Callable[[Sequence[Any]], tuple[Interval, ...]]
+
+
 class IntervalArithmetic:
     """Operations on intervals, whose ends broadcast against each other.
 
-    The letters a, b, x and y stand for intervals, n for a whole number, e for a point or an
-    interval of two adjacent floats.
+    Functions of one argument are named by their SymPy classes. The letters a, b, x and y stand for
+    intervals, n for a whole number, e for a point or an interval of two adjacent floats.
 
     Args:
         rounded: whether ends are rounded outwards. Without it they have the errors of floating
@@ -289,51 +306,6 @@ class IntervalArithmetic:
         angle = self._outward(low, high, _ULPS_OF_FUNCTIONS, _SMALLEST, (-_PI, _PI))
         return Interval(np.where(cut, -_PI, angle.low), np.where(cut, _PI, angle.high))
 
-
-def _repeated_product(base: Any, n: int) -> Any:
-    result: Any = None
-    while n:
-        if n % 2:
-            result = base if result is None else np.multiply(result, base)
-        n //= 2
-        base = np.multiply(base, base) if n else base
-    return result
-
-
-def _holds(a: Interval, period: float, phase: float) -> Any:
-    """Return whether a holds one of (k + phase) period, or nearly so."""
-    first, last = np.divide(a.low, period), np.divide(a.high, period)
-    # Four roundings; a point that is this near changes the sine by less than the last place.
-    first = np.ceil(first - phase - 4 * _LAST_PLACE * (np.abs(first) + 1))
-    last = np.floor(last - phase + 4 * _LAST_PLACE * (np.abs(last) + 1))
-    return ~np.greater(first, last)
-
-
-__all__ = ["Interval", "IntervalOperations", "interval_function"]
-
-_HALF_PI = math.nextafter(math.pi / 2, 2)
-_PI = math.nextafter(math.pi, 4)
-_ALL = (-np.inf, np.inf)
-
-_INCREASING: dict[Any, tuple[Callable[..., Any], tuple[float, float]]] = {
-    sp.exp: (np.exp, (0.0, np.inf)),
-    sp.log: (np.log, _ALL),
-    sp.asin: (np.arcsin, (-_HALF_PI, _HALF_PI)),
-    sp.atan: (np.arctan, (-_HALF_PI, _HALF_PI)),
-    sp.sinh: (np.sinh, _ALL),
-    sp.tanh: (np.tanh, (-1.0, 1.0)),
-    sp.asinh: (np.arcsinh, _ALL),
-    sp.acosh: (np.arccosh, (0.0, np.inf)),
-    sp.atanh: (np.arctanh, _ALL),
-}
-_STEPS = {sp.sign: np.sign, sp.floor: np.floor, sp.ceiling: np.ceil}
-
-IntervalFunction = Callable[[Sequence[Any]], tuple[Interval, ...]]
-
-
-class IntervalOperations(IntervalArithmetic):
-    """Interval arithmetic with the functions of expressions, by their SymPy classes."""
-
     def constant(self, number: Any) -> Interval:
         """Return the floats around a real number, or a point if it is one.
 
@@ -367,7 +339,9 @@ class IntervalOperations(IntervalArithmetic):
             sp.sin: partial(self.wave, np.sin, peak=0.25),
             sp.cos: partial(self.wave, np.cos, peak=0.0),
             sp.tan: self.tan,
-            sp.acos: lambda a: negative(self.increasing(_negative_arccos, a, (-_PI, 0.0))),
+            sp.acos: lambda a: negative(
+                self.increasing(lambda v: np.negative(np.arccos(v)), a, (-_PI, 0.0))
+            ),
             sp.cosh: lambda a: self.increasing(np.cosh, self.absolute(a), (1.0, np.inf)),
             sp.Abs: self.absolute,
         }
@@ -382,6 +356,25 @@ class IntervalOperations(IntervalArithmetic):
         """Return the larger or the smaller of two."""
         chosen = np.maximum if kind is sp.Max else np.minimum
         return lambda a, b: Interval(chosen(a.low, b.low), chosen(a.high, b.high))
+
+
+def _repeated_product(base: Any, n: int) -> Any:
+    result: Any = None
+    while n:
+        if n % 2:
+            result = base if result is None else np.multiply(result, base)
+        n //= 2
+        base = np.multiply(base, base) if n else base
+    return result
+
+
+def _holds(a: Interval, period: float, phase: float) -> Any:
+    """Return whether a holds one of (k + phase) period, or nearly so."""
+    first, last = np.divide(a.low, period), np.divide(a.high, period)
+    # Four roundings; a point that is this near changes the sine by less than the last place.
+    first = np.ceil(first - phase - 4 * _LAST_PLACE * (np.abs(first) + 1))
+    last = np.floor(last - phase + 4 * _LAST_PLACE * (np.abs(last) + 1))
+    return ~np.greater(first, last)
 
 
 def interval_function(
@@ -423,7 +416,7 @@ class _IntervalProgram:
         self, symbols: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], rounded: bool
     ) -> None:
         self._source = symbols, expressions, rounded
-        self._program = ExpressionProgram(symbols, expressions, IntervalOperations(rounded))
+        self._program = ExpressionProgram(symbols, expressions, IntervalArithmetic(rounded))
 
     def __call__(self, values: Sequence[Any]) -> tuple[Interval, ...]:
         return self._program([_interval(v) for v in values])
@@ -433,10 +426,6 @@ class _IntervalProgram:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> _IntervalProgram:
         return self
-
-
-def _negative_arccos(values: Any) -> Any:
-    return np.negative(np.arccos(values))
 
 
 def _interval(value: Any) -> Interval:

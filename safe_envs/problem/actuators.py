@@ -173,11 +173,13 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
         SystemDefinitionError: a feature or a symbol has the name that an input or its rate is to
             have.
     """
-    ranges = tuple(_as_state(v) for v in problem.inputs)
+    wider = [(v, _ROUNDING * (v.high - v.low)) for v in problem.inputs]
+    ranges = tuple(replace(v, low=v.low - more, high=v.high + more) for v, more in wider)
     rates = tuple(_rate_of(v, ends) for v, ends in zip(problem.inputs, limits, strict=True))
     _require_free_names(problem, rates)
-    maps = [
-        _map(v.symbol, v, ends, problem.dt) for v, ends in zip(problem.inputs, limits, strict=True)
+    maps = [_map(v, ends, problem.dt) for v, ends in zip(problem.inputs, limits, strict=True)]
+    sensors = [
+        Channel(v.symbol.name, v.symbol, _INPUT_NOISE * (v.high - v.low)) for v in problem.inputs
     ]
     rest = tuple(sp.Float(u, 17) for u in resting_input(problem.box))
     seen = tuple(Feature(v.symbol.name, v.symbol, v.low, v.high) for v in problem.inputs)
@@ -198,7 +200,7 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
         "filter": problem.filter if problem.filter in _DEGREE_FREE else suitable,
         "clf": None,
         "backup": None,
-        "sensors": problem.sensors and (*problem.sensors, *map(_input_sensor, problem.inputs)),
+        "sensors": problem.sensors and (*problem.sensors, *sensors),
         "sampling": _sampling(problem.sampling, ranges),
         "frame": _framed(problem.frame, problem.inputs),
         "rates": limits,
@@ -249,15 +251,6 @@ def require_apart(given: ProblemOptions, problem: Any) -> None:
         )
 
 
-def _as_state(v: Variable) -> Variable:
-    wider = _ROUNDING * (v.high - v.low)
-    return replace(v, low=v.low - wider, high=v.high + wider)
-
-
-def _input_sensor(v: Variable) -> Channel:
-    return Channel(v.symbol.name, v.symbol, _INPUT_NOISE * (v.high - v.low))
-
-
 def _rate_of(v: Variable, ends: tuple[float, float]) -> Variable:
     unit = f"{v.unit}/s" if v.unit else "1/s"
     return Variable(sp.Symbol(f"{v.symbol.name}_rate", real=True), *ends, unit)
@@ -283,9 +276,9 @@ def _allowed(
     return sp.Max(ends[0], (low - u) / period), sp.Min(ends[1], (high - u) / period)
 
 
-def _map(u: sp.Expr, v: Variable, ends: tuple[float, float], dt: float) -> tuple[sp.Expr, sp.Expr]:
+def _map(v: Variable, ends: tuple[float, float], dt: float) -> tuple[sp.Expr, sp.Expr]:
     """Return a(u) and b(u)."""
-    least, most = _allowed(u, v, ends, dt)
+    least, most = _allowed(v.symbol, v, ends, dt)
     effect = (most - least) / sp.Float(ends[1] - ends[0], 17)
     return least - effect * sp.Float(ends[0], 17), effect
 

@@ -154,7 +154,7 @@ class SamplingDomain:
     Attributes:
         region: (low, high) of each state. States are drawn uniformly from it, where every barrier
             is positive.
-        inputs: input vectors that are tried, in physical units; clipped to the box.
+        inputs: input vectors that are tried, in physical units; clipped to the input bounds.
         coordinates: expressions of the states that a learned function depends on: cosines and sines
             of angles, relative positions.
     """

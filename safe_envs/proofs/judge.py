@@ -22,7 +22,7 @@ import sympy as sp
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.enclosures.expression_program import ExpressionProgram
 from safe_envs.enclosures.forms import ContinuousOperations, Form, FormOperations, points, variables
-from safe_envs.enclosures.intervals import Interval, IntervalOperations
+from safe_envs.enclosures.intervals import Interval, IntervalArithmetic
 from safe_envs.enclosures.polynomial_forms import ExpandedPolynomial, Order
 from safe_envs.errors import SystemDefinitionError
 
@@ -275,7 +275,7 @@ def _enclosure(end: Any) -> Interval:
     number = sp.sympify(end)
     if number in (sp.oo, -sp.oo):
         return Interval(float(number), float(number))
-    return IntervalOperations().constant(number)
+    return IntervalArithmetic().constant(number)
 
 
 _BATCH = 4096

@@ -19,43 +19,9 @@ from hypothesis import strategies as st
 from safe_envs import SystemDefinitionError
 from safe_envs.dynamics.codegen import compile_function, settled
 
-NAMES = (
-    *(
-        "x",
-        "p0",
-        "p1",
-        "x0",
-        "x1",
-        "a000",
-        "a001",
-        "_c0",
-        "_c1",
-        "t",
-        "h",
-        "_w0",
-        "nan",
-        "pi",
-        "e",
-        "I",
-    ),
-    *(
-        "sin",
-        "cos",
-        "sqrt",
-        "pow",
-        "abs",
-        "max",
-        "select",
-        "array",
-        "math",
-        "print",
-        "lambda",
-        "None",
-        "def",
-        "_lambdifygenerated",
-    ),
-    *("x_{1}", "a b", "θ", "1", "", "x.y", "a,b", "#", "'"),
-)
+WORDS = """x p0 p1 x0 x1 a000 a001 _c0 _c1 t h _w0 nan pi e I sin cos sqrt pow abs max select array
+math print lambda None def _lambdifygenerated x_{1} θ 1 x.y a,b # '"""
+NAMES = (*WORDS.split(), "a b", "")
 LARGEST = 1e6
 VALUES = st.floats(-2.0, 2.0, allow_subnormal=False).map(lambda v: round(v, 3) + 1e-4)
 
@@ -66,45 +32,38 @@ def symbol(name):
 
 def grown(parts):
     """Expressions of expressions: smooth functions, kinks, and powers of either sign."""
-    pair = st.tuples(parts, parts)
+    exponents = [sp.Rational(1, 2), sp.Rational(-3, 2), sp.Rational(1, 3), sp.Float(0.7)]
+    functions = [sp.sin, sp.cos, sp.tanh, sp.atan, sp.erf, sp.Abs, lambda e: sp.exp(-abs(e))]
     return st.one_of(
-        pair.map(lambda p: p[0] + p[1]),
-        pair.map(lambda p: p[0] * p[1]),
-        pair.map(lambda p: p[0] - sp.Rational(3, 7) * p[1]),
-        st.tuples(parts, st.integers(2, 3)).map(lambda p: p[0] ** p[1]),
-        st.tuples(parts, st.integers(-3, -1)).map(lambda p: (2 + p[0] ** 2) ** p[1]),
-        st.tuples(
-            parts,
-            st.sampled_from(
-                [sp.Rational(1, 2), sp.Rational(-3, 2), sp.Rational(1, 3), sp.Float(0.7)]
-            ),
-        ).map(lambda p: (1 + p[0] ** 2) ** p[1]),
-        st.tuples(
-            parts, st.sampled_from([sp.sin, sp.cos, sp.tanh, sp.atan, sp.erf, sp.Abs, sp.exp])
-        ).map(lambda p: p[1](-abs(p[0]) if p[1] is sp.exp else p[0])),
-        pair.map(lambda p: sp.Max(*p, evaluate=False)),
-        st.tuples(parts, parts, parts).map(lambda p: sp.Min(*p)),
+        st.builds(lambda a, b: a + b, parts, parts),
+        st.builds(lambda a, b: a * b, parts, parts),
+        st.builds(lambda a, b: a - sp.Rational(3, 7) * b, parts, parts),
+        st.builds(lambda a, n: a**n, parts, st.integers(2, 3)),
+        st.builds(lambda a, n: (2 + a**2) ** n, parts, st.integers(-3, -1)),
+        st.builds(lambda a, e: (1 + a**2) ** e, parts, st.sampled_from(exponents)),
+        st.builds(lambda f, a: f(a), st.sampled_from(functions), parts),
+        st.builds(lambda a, b: sp.Max(a, b, evaluate=False), parts, parts),
+        st.builds(sp.Min, parts, parts, parts),
     )
+
+
+# Jumps are taken of single symbols only, where no rounding moves a value across one.
+JUMPS = (
+    sp.sign,
+    lambda s: sp.Heaviside(s - 1),
+    sp.floor,
+    lambda s: sp.Mod(s, 2),
+    lambda s: sp.Piecewise((s**2, s < 0), (sp.log(1 + s), True)),
+    lambda s: sp.Piecewise((1 / s, sp.And(s > 1, s < 3)), (sp.S.Half, s <= 1), (s, True)),
+)
 
 
 def formulas(symbols):
-    """Jumps are taken of single symbols only, where no rounding moves a value across one."""
-    jump = st.sampled_from(
-        [
-            lambda s: sp.sign(s),
-            lambda s: sp.Heaviside(s - 1),
-            lambda s: sp.floor(s),
-            lambda s: sp.Mod(s, 2),
-            lambda s: sp.Piecewise((s**2, s < 0), (sp.log(1 + s), True)),
-            lambda s: sp.Piecewise((1 / s, sp.And(s > 1, s < 3)), (sp.S.Half, s <= 1), (s, True)),
-        ]
-    )
     leaf = st.sampled_from(symbols)
-    power = st.tuples(leaf, st.integers(4, 10)).map(lambda p: p[0] ** p[1])
     leaves = st.one_of(
         leaf,
-        power,
-        st.tuples(jump, leaf).map(lambda p: p[0](p[1])),
+        st.builds(lambda s, n: s**n, leaf, st.integers(4, 10)),
+        st.builds(lambda jump, s: jump(s), st.sampled_from(JUMPS), leaf),
         st.integers(-3, 3).map(sp.Integer),
     )
     return st.recursive(leaves, grown, max_leaves=6)
@@ -112,17 +71,17 @@ def formulas(symbols):
 
 @st.composite
 def cases(draw):
-    symbols = tuple(
-        symbol(name)
-        for name in draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=4, unique=True))
-    )
+    names = draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=4, unique=True))
+    symbols = tuple(map(symbol, names))
     shared = draw(formulas(symbols))
     expressions = [shared, draw(formulas(symbols)), (shared + 1) * draw(formulas(symbols)) + shared]
-    return (
-        symbols,
-        expressions,
-        draw(st.lists(st.tuples(*[VALUES for _ in symbols]), min_size=2, max_size=2)),
-    )
+    points = st.lists(st.tuples(*[VALUES for _ in symbols]), min_size=2, max_size=2)
+    return symbols, expressions, draw(points)
+
+
+def both(symbols, expressions):
+    """Compile expressions for floats and for arrays."""
+    return [compile_function(symbols, expressions, flavour) for flavour in ("floats", "arrays")]
 
 
 class Exactly:
@@ -140,103 +99,54 @@ class Exactly:
         return self._known[expression].real, max(abs(self._known[e]) for e in parts)
 
 
-@given(cases())
-@settings(max_examples=18)
-def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
-    symbols, expressions, points = case
-    floats, arrays = (
-        compile_function(symbols, expressions, flavour) for flavour in ("floats", "arrays")
-    )
-    with np.errstate(all="ignore"):
-        columns = np.broadcast_arrays(*arrays(*np.array(points).T), np.zeros(len(points)))[:-1]
-    for row, point in enumerate(points):
-        ours, exactly = floats(*point), Exactly(dict(zip(symbols, point, strict=True)))
-        for i, expression in enumerate(expressions):
-            value, largest = exactly(expression)
-            if largest < LARGEST:
-                assert ours[i] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
-                assert columns[i][row] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
-
-
-@pytest.mark.parametrize("flavour", ["floats", "arrays"])
 @pytest.mark.parametrize(
-    "names",
-    [
-        ("p0", "p1"),
-        ("x0", "x1"),
-        ("_c0", "_c1"),
-        ("a001", "a000"),
-        ("sin", "None"),
-        ("lambda", "x_{1}"),
-    ],
+    "names", ["p0 p1", "x0 x1", "_c0 _c1", "a001 a000", "sin None", "lambda x_{1}"]
 )
-def test_names_change_nothing(names, flavour):
-    def read(first, second):
-        both = first + second
-        return compile_function(
-            (first, second), [both**2 + 3 * first * sp.sin(both) + 5 * sp.sin(both)], flavour
-        )
+def test_names_change_nothing(names):
+    def values(first, second):
+        total = first + second
+        formula = total**2 + 3 * first * sp.sin(total) + 5 * sp.sin(total)
+        return [function(1.0, 2.0)[0] for function in both((first, second), [formula])]
 
     expected = 3.0**2 + 3.0 * math.sin(3.0) + 5.0 * math.sin(3.0)
-    assert read(*map(symbol, names))(1.0, 2.0)[0] == pytest.approx(expected, rel=1e-15)
-    assert (
-        read(*map(symbol, sorted(names)))(1.0, 2.0)[0]
-        == read(symbol("a"), symbol("b"))(1.0, 2.0)[0]
-    )
+    assert values(*map(symbol, names.split())) == pytest.approx([expected] * 2, rel=1e-15)
+    ordered = values(*map(symbol, sorted(names.split())))
+    assert ordered == values(symbol("a"), symbol("b"))
 
 
-@pytest.mark.parametrize("flavour", ["floats", "arrays"])
-@pytest.mark.parametrize("power", range(-9, 10))
-def test_powers_of_either_sign(power, flavour):
-    x = symbol("x")
-    for base in (x, x + 2, sp.sin(x)):
-        given = np.array([0.7]) if flavour == "arrays" else 0.7
-        value = compile_function((x,), [base**power], flavour)(given)[0]
-        expected = float((base**power).subs(x, sp.Rational(0.7)).evalf(30))
-        assert value == pytest.approx(expected, rel=1e-14)
+X, Y = symbol("x"), symbol("y")
+KINKS = (sp.Max(X, Y), X + sp.Min(X, Y, 2), sp.Abs(X - 5) * sp.Max(X, Y))
+POWERS = (sp.Rational(1, 2), sp.Rational(-1, 2), -1, -3, sp.Rational(3, 2), 9, sp.Float(0.7), sp.pi)
 
 
 @pytest.mark.parametrize(
-    "power",
-    [sp.Rational(1, 2), sp.Rational(-1, 2), -1, -3, sp.Rational(3, 2), 9, sp.Float(0.7), sp.pi],
+    ("base", "powers"),
+    [*((base, range(-9, 10)) for base in (X, X + 2, sp.sin(X))), *((e, POWERS) for e in KINKS)],
 )
-@pytest.mark.parametrize(
-    "base",
-    [
-        lambda x, y: sp.Max(x, y),
-        lambda x, y: x + sp.Min(x, y, 2),
-        lambda x, y: sp.Abs(x - 5) * sp.Max(x, y),
-    ],
-)
-def test_powers_of_kinks(base, power):
-    x, y = symbol("x"), symbol("y")
-    points = [(1.0, 3.0), (2.0, 1.0)]
-    arrays = compile_function((x, y), [base(x, y) ** power], "arrays")(*np.array(points).T)[0]
-    for value, point in zip(arrays, points, strict=True):
-        assert value == pytest.approx(
-            float((base(x, y) ** power).subs(dict(zip((x, y), point, strict=True)))), rel=1e-14
-        )
+def test_powers(base, powers):
+    points, expressions = [(0.7, 3.0), (2.0, 1.0)], [base**power for power in powers]
+    floats, arrays = both((X, Y), expressions)
+    columns = np.broadcast_arrays(*arrays(*np.array(points).T), np.zeros(2))
+    for i, (x, y) in enumerate(points):
+        exact = {X: sp.Rational(x), Y: sp.Rational(y)}
+        expected = [float(e.subs(exact).evalf(30)) for e in expressions]
+        assert floats(x, y) == pytest.approx(expected, rel=1e-14)
+        assert [c[i] for c in columns[:-1]] == pytest.approx(expected, rel=1e-14)
 
 
 @pytest.mark.parametrize("flavour", ["floats", "arrays"])
 def test_constants_have_all_their_digits(flavour):
-    x = symbol("x")
     numbers = [sp.pi, sp.Rational(1, 3), sp.sqrt(2), sp.Float(0.1, 17), sp.exp(1)]
     expected = [math.pi, 1 / 3, math.sqrt(2), 0.1, math.e]
     assert [float(v) for v in compile_function((), numbers, flavour)()] == expected
-    inside = [
-        float(v) for v in compile_function((x,), [x * number for number in numbers], flavour)(1.0)
-    ]
-    assert inside == pytest.approx(expected, rel=2.3e-16, abs=0.0)
+    inside = compile_function((X,), [X * number for number in numbers], flavour)(1.0)
+    assert [float(v) for v in inside] == pytest.approx(expected, rel=2.3e-16, abs=0.0)
 
 
 def test_a_piece_without_a_value_elsewhere_counts_where_it_applies_only():
-    x = symbol("x")
-    shared = sp.log(x) * sp.sin(sp.log(x)) + 1 / x
-    pieces = sp.Piecewise((shared, x > 0), (-1, True))
-    floats, arrays = (
-        compile_function((x,), [pieces, pieces**2], flavour) for flavour in ("floats", "arrays")
-    )
+    shared = sp.log(X) * sp.sin(sp.log(X)) + 1 / X
+    pieces = sp.Piecewise((shared, X > 0), (-1, True))
+    floats, arrays = both((X,), [pieces, pieces**2])
     assert floats(-1.0) == (-1.0, 1.0)
     assert floats(0.0) == (-1.0, 1.0)
     assert floats(1.0) == pytest.approx((1.0, 1.0))
@@ -245,15 +155,10 @@ def test_a_piece_without_a_value_elsewhere_counts_where_it_applies_only():
 
 
 def test_what_has_no_real_value_is_no_number_in_either_flavour():
-    x = symbol("x")
-    unfinished = sp.Piecewise((x, x > 0))
-    floats, arrays = (
-        compile_function((x,), [unfinished], flavour) for flavour in ("floats", "arrays")
-    )
+    floats, arrays = both((X,), [sp.Piecewise((X, X > 0))])
     assert math.isnan(floats(-1.0)[0])
     assert np.isnan(arrays(np.array([-1.0]))[0]).all()
-    root = x ** sp.Rational(3, 2) + x ** sp.Float(0.4)
-    floats, arrays = (compile_function((x,), [root], flavour) for flavour in ("floats", "arrays"))
+    floats, arrays = both((X,), [X ** sp.Rational(3, 2) + X ** sp.Float(0.4)])
     with pytest.raises(ValueError, match="domain"):
         floats(-1.0)
     with np.errstate(all="ignore"):
@@ -262,29 +167,25 @@ def test_what_has_no_real_value_is_no_number_in_either_flavour():
 
 @pytest.mark.parametrize("flavour", ["floats", "arrays"])
 @pytest.mark.parametrize(
-    ("expression", "message"),
+    ("symbols", "expression", "fragment"),
     [
-        (symbol("y") + 1, "holds y"),
-        (sp.Symbol("x") + 1, "holds x"),
-        (sp.Function("exec")(symbol("x")), "holds exec"),
-        (sp.diff(sp.sign(symbol("x")), symbol("x")), "DiracDelta"),
-        (sp.gamma(symbol("x")), "holds gamma"),
-        (sp.Function("f")(symbol("x")).diff(symbol("x")), "holds f"),
-        (sp.I * symbol("x"), "not real"),
-        (sp.zoo * symbol("x"), "division by 0"),
-        (sp.Integer(10) ** 400 * symbol("x"), "largest of floats"),
-        (sp.Integer(10) ** 9000 * symbol("x"), "largest of floats"),
-        (sp.Integral(sp.exp(symbol("x") ** 2), (symbol("x"), 0, symbol("x"))), "numerical form"),
+        ((X,), Y + 1, "y"),
+        ((X,), sp.Symbol("x") + 1, "holds x"),
+        ((X,), sp.Function("exec")(X), "exec"),
+        ((X,), sp.diff(sp.sign(X), X), "DiracDelta"),
+        ((X,), sp.gamma(X), "gamma"),
+        ((X,), sp.Function("f")(X).diff(X), "holds f"),
+        ((X,), sp.I * X, "not real"),
+        ((X,), sp.zoo * X, "division by 0"),
+        ((X,), sp.Integer(10) ** 400 * X, "largest of floats"),
+        ((X,), sp.Integer(10) ** 9000 * X, "largest of floats"),
+        ((X,), sp.Integral(sp.exp(X**2), (X, 0, X)), "numerical form"),
+        ((X, X), X, "two arguments"),
     ],
 )
-def test_formulas_without_a_number_are_refused(expression, message, flavour):
-    with pytest.raises(SystemDefinitionError, match=message):
-        compile_function((symbol("x"),), [expression], flavour)
-
-
-def test_a_symbol_is_one_argument():
-    with pytest.raises(SystemDefinitionError, match="stands for two arguments"):
-        compile_function((symbol("x"), symbol("x")), [symbol("x")], "floats")
+def test_formulas_without_a_number_are_refused(symbols, expression, fragment, flavour):
+    with pytest.raises(SystemDefinitionError, match=fragment):
+        compile_function(symbols, [expression], flavour)
 
 
 @given(
@@ -293,8 +194,7 @@ def test_a_symbol_is_one_argument():
 )
 @settings(max_examples=40)
 def test_arrays_that_change_in_place_are_read_anew(changes, views):
-    x, y = symbol("x"), symbol("y")
-    read = compile_function((x, y), [sp.sin(x) + sp.cos(y), sp.cos(x)], "arrays")
+    read = compile_function((X, Y), [sp.sin(X) + sp.cos(Y), sp.cos(X)], "arrays")
     settled(np.zeros((2, 3)), (3,))
     memory = np.zeros((2, 3))
     first, second = (memory[0], memory[1]) if views else (memory[0].copy(), memory[1].copy())
@@ -308,8 +208,7 @@ def test_arrays_that_change_in_place_are_read_anew(changes, views):
 
 
 def test_settled_arrays_are_remembered_and_cannot_be_changed():
-    x, y = symbol("x"), symbol("y")
-    read = compile_function((x, y), [sp.sin(x), sp.cos(y)], "arrays")
+    read = compile_function((X, Y), [sp.sin(X), sp.cos(Y)], "arrays")
     a, b = settled((np.ones(3), 2.0), (3,))
     np.testing.assert_array_equal(b, [2.0] * 3)
     read(np.zeros(3), np.zeros(3))
@@ -337,32 +236,22 @@ print([[float(value).hex() for value in values] for values in found])
 
 
 def test_functions_are_pickled_as_the_expressions_that_they_are_made_of():
-    x, y = sp.symbols("x y", real=True)
     hidden = sp.Dummy("x", real=True)
-    expressions = [
-        sp.sin(x * y) ** 3 / 7,
-        sp.sqrt(x**2 + y**2),
-        sp.erf(hidden) + x,
-        sp.Rational(1, 3),
-    ]
-    pieces = [sp.Piecewise((sp.log(x), x > 0), (1 / y, True))]
+    rest = [sp.sqrt(X**2 + Y**2), sp.Rational(1, 3)]
+    pieces = [sp.Piecewise((sp.log(X), X > 0), (1 / Y, True))]
     functions = [
-        compile_function((x, y), [e.subs(hidden, y) for e in expressions], "floats"),
-        compile_function((x, hidden), expressions[2:], "arrays"),
-        compile_function((x, y), pieces, "floats"),
+        compile_function((X, Y), [sp.sin(X * Y) ** 3 / 7, sp.erf(Y) + X, *rest, *pieces], "floats"),
+        compile_function((X, hidden), [sp.erf(hidden) + X, sp.Rational(1, 3)], "arrays"),
     ]
     pickled = pickle.dumps(functions)
     for copies in (pickle.loads(pickled), copy.deepcopy(functions)):
         for function, other in zip(functions, copies, strict=True):
             assert other(0.3, 0.7) == function(0.3, 0.7)
-    # There no function is at hand, and hashes of symbols are others.
+    # In a new process there is no function yet, and hashes of symbols are others.
     script = NEW_PROCESS.format(path=sys.path, pickled=pickled)
-    told = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    assert told.stdout.strip() == str(
-        [[float(value).hex() for value in function(0.3, 0.7)] for function in functions]
-    )
+    answer = subprocess.check_output([sys.executable, "-c", script], text=True)
+    expected = [[float(value).hex() for value in each(0.3, 0.7)] for each in functions]
+    assert answer.strip() == str(expected)
 
 
 def test_unpickling_a_function_reads_no_text_as_code():
@@ -372,11 +261,26 @@ def test_unpickling_a_function_reads_no_text_as_code():
 
 
 def test_functions_that_go_to_a_cluster_know_when_arrays_are_outdated():
-    x = sp.Symbol("x", real=True)
-    function = compile_function((x,), [sp.sin(x)], "arrays")
+    function = compile_function((X,), [sp.sin(X)], "arrays")
     # By cloudpickle generated code goes along as it is.
     other = pickle.loads(cloudpickle.dumps(function))
     for value in (0.3, 0.4):
         (at,) = settled((np.full(2, value),), (2,))
         assert other(at)[0] is function(at)[0]
         np.testing.assert_array_equal(other(at)[0], np.sin([value, value]))
+
+
+@given(cases())
+@settings(max_examples=14)
+def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
+    symbols, expressions, points = case
+    floats, arrays = both(symbols, expressions)
+    with np.errstate(all="ignore"):
+        columns = np.broadcast_arrays(*arrays(*np.array(points).T), np.zeros(len(points)))[:-1]
+    for row, point in enumerate(points):
+        ours, exactly = floats(*point), Exactly(dict(zip(symbols, point, strict=True)))
+        for i, expression in enumerate(expressions):
+            value, largest = exactly(expression)
+            if largest < LARGEST:
+                assert ours[i] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))
+                assert columns[i][row] == pytest.approx(value, rel=1e-10, abs=1e-10 * (1 + largest))

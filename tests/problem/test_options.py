@@ -43,12 +43,10 @@ def test_texts_become_values(name, text, value):
         ("noise", "a", "--noise 'a'"),
         ("noise", "", "--noise ''"),
         ("start", "1,b", "--start '1,b'"),
-        ("box", ["1"], "--box '1' has 1 numbers; give LO,HI"),
+        ("box", ["1"], "--box '1' has 1 numbers"),
         ("box", ["1,2,3"], "--box '1,2,3' has 3 numbers"),
         ("box", ["a,b"], "--box 'a,b'"),
-        ("plant", ["v"], "--plant 'v' is not of this form; give NAME=VALUE"),
-        ("plant", ["=1"], "NAME=VALUE"),
-        ("plant", ["v="], "NAME=VALUE"),
+        *(("plant", [text], "NAME=VALUE") for text in ("v", "=1", "v=")),
         ("plant", ["v=1", "v=2"], "comes twice"),
         ("model", ["v=fast"], "'fast' is not a number"),
     ],
@@ -78,13 +76,18 @@ def test_every_option_can_be_varied_by_a_sweep():
 def test_arguments_of_the_barrier_go_to_its_function():
     problem = make_problem("Scalar-v0", noise=0.0, limit=2.0)
     assert problem == make_problem("Scalar-v0", barrier={"limit": 2.0}).configured(noise=0.0)
-    with pytest.raises(ConfigurationError, match="no barrier argument"):
-        problem.configured(barrier={"limit": 1.0})
-    with pytest.raises(ConfigurationError, match="did you mean 'noise'"):
-        problem.configured(nois=0.0)
 
 
-@pytest.mark.parametrize("options", [{"dt": "fast"}, {"horizon": float("nan")}, {"plant": 3}])
-def test_values_of_another_kind_are_refused(options):
-    with pytest.raises(ConfigurationError, match=f"{next(iter(options))} = "):
-        ProblemOptions(**options)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt": "fast"}, "dt = "),
+        ({"horizon": float("nan")}, "horizon = "),
+        ({"plant": 3}, "plant = "),
+        ({"barrier": {"limit": 1.0}}, "no barrier argument"),
+        ({"nois": 0.0}, "did you mean 'noise'"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        make_problem("Scalar-v0").configured(**options)

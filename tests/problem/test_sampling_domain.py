@@ -35,29 +35,19 @@ def test_what_is_given_is_kept():
     assert bare(sampling=given).sampling_domain == given
 
 
-def test_an_angle_is_explored_over_a_whole_turn():
-    found = SamplingDomain().completed(
-        (Variable(x, -1.0, 3.0), Variable(theta, -math.inf, math.inf, "rad")), ((-1.0, 1.0),)
-    )
+def test_unbounded_radians_are_angles_and_are_explored_over_a_whole_turn():
+    angle = Variable(theta, -math.inf, math.inf, "rad")
+    found = SamplingDomain().completed((Variable(x, -1.0, 3.0, "rad"), angle), ((-1.0, 1.0),))
     assert found.region == ((-1.0, 3.0), (-math.pi, math.pi))
     assert found.coordinates == (x, sp.cos(theta), sp.sin(theta))
 
 
-def test_only_unbounded_radians_are_angles():
+@pytest.mark.parametrize(("low", "unit"), [(-math.inf, "m"), (0.0, "rad")])
+def test_other_states_without_bounds_cannot_be_explored(low, unit):
     x_1, x_2 = DISK.plant.states
-    turning = bare(
-        states=(Variable(x_1, -1.0, 1.0, "rad"), Variable(x_2, -math.inf, math.inf, "rad"))
-    )
-    assert turning.sampling_domain.region == ((-1.0, 1.0), (-math.pi, math.pi))
-    assert turning.sampling_domain.coordinates == (x_1, sp.cos(x_2), sp.sin(x_2))
-    with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[-inf, inf\]"):
-        _ = bare(
-            states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m"))
-        ).sampling_domain
-    with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[0\.0, inf\]"):
-        _ = bare(
-            states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad"))
-        ).sampling_domain
+    states = (Variable(x_1, -1.0, 1.0), Variable(x_2, low, math.inf, unit))
+    with pytest.raises(SystemDefinitionError, match=rf"cannot explore x_2 in \[{low}, inf\]"):
+        _ = bare(states=states).sampling_domain
 
 
 def test_each_input_goes_halfway_with_the_others_at_the_centre():
@@ -68,28 +58,19 @@ def test_each_input_goes_halfway_with_the_others_at_the_centre():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (SamplingDomain(region=((0.0, 1.0),)), "has 1 ranges for 2 states"),
-        (SamplingDomain(region=((0.0, 1.0),) * 3), "has 3 ranges for 2 states"),
-        (
-            SamplingDomain(region=((0.0, math.inf), (0.0, 1.0))),
-            r"cannot explore x_1 in \[0\.0, inf\]; give SamplingDomain\(region",
-        ),
-        (SamplingDomain(region=((0.0, 1.0), (math.nan, 1.0))), "cannot explore x_2"),
-        (SamplingDomain(region=((0.0, 1.0), (1.0, 1.0))), r"cannot explore x_2 in \[1\.0, 1\.0\]"),
-        (
-            SamplingDomain(inputs=((1.0, 2.0),)),
-            "an input of a sampling domain needs 1 finite numbers",
-        ),
-        (
-            SamplingDomain(inputs=((1.0,), ())),
-            "an input of a sampling domain needs 1 finite numbers",
-        ),
-        (SamplingDomain(coordinates=(w,)), r"(?s)a coordinate of the sampling domain.*w"),
+        ({"region": ((0.0, 1.0),)}, "1 ranges for 2 states"),
+        ({"region": ((0.0, 1.0),) * 3}, "3 ranges for 2 states"),
+        ({"region": ((0.0, math.inf), (0.0, 1.0))}, r"x_1 in \[0\.0, inf\]"),
+        ({"region": ((0.0, 1.0), (math.nan, 1.0))}, "cannot explore x_2"),
+        ({"region": ((0.0, 1.0), (1.0, 1.0))}, r"x_2 in \[1\.0, 1\.0\]"),
+        ({"inputs": ((1.0, 2.0),)}, "needs 1 finite numbers"),
+        ({"inputs": ((1.0,), ())}, "needs 1 finite numbers"),
+        ({"coordinates": (w,)}, r"(?s)coordinate of the sampling domain.*w"),
     ],
 )
 def test_what_does_not_fit_is_refused(given, message):
     with pytest.raises(SystemDefinitionError, match=message):
-        _ = bare(sampling=given).sampling_domain
+        _ = bare(sampling=SamplingDomain(**given)).sampling_domain
 
 
 def test_every_problem_can_be_explored(env_id):

@@ -15,6 +15,8 @@ from safe_envs.testing.condition import check_condition
 from safe_envs.wrappers import AffineConstraint, Condition
 from tests.conftest import problem_of
 
+DISK = problem_of("safe_envs/CubicSDEDisk-v0")
+
 
 @pytest.mark.parametrize(
     ("text", "env_id"),
@@ -26,11 +28,15 @@ from tests.conftest import problem_of
         ("ecbf:sampling_margin=first-order", "StochasticDubins-v0"),
         ("szcbf:sampling_margin=first-order", "ACCGap-v0"),
         ("scbf:sampling_margin=0.1", "QuadrotorLimits-v0"),
-        ("hocbf", "DubinsObstacles-v0"),
+        pytest.param("hocbf", "DubinsObstacles-v0", marks=pytest.mark.oracle),
     ],
 )
 def test_the_conditions_of_this_package_pass(text, env_id):
     check_condition(text, env_id)
+
+
+def test_a_condition_of_ones_own_passes():
+    check_condition(Right(), DISK)
 
 
 @dataclass(frozen=True)
@@ -44,18 +50,34 @@ class Right(Condition):
         return AffineConstraint.after(model, (h,), lie_derivative_f(model, h) + self.gain * h**3)
 
 
-@dataclass(frozen=True)
-class WrongCoefficient(Right):
+def changed(name, **changes):
+    """Return a class of conditions whose constraint has some parts changed."""
+
     def derived(self, model, barrier):
-        found = super().derived(model, barrier)
-        return replace(found, coefficient=tuple(1.01 * a for a in found.coefficient))
+        found = Right.derived(self, model, barrier)
+        parts = {key: change(found, model, barrier) for key, change in changes.items()}
+        return replace(found, **parts)
+
+    return dataclass(frozen=True)(
+        type(name, (Right,), {"derived": derived, "__module__": __name__})
+    )
 
 
-@dataclass(frozen=True)
-class WrongDrift(Right):
-    def derived(self, model, barrier):
-        found = super().derived(model, barrier)
-        return replace(found, offset=found.offset - 2 * lie_derivative_f(model, barrier.expression))
+WrongCoefficient = changed(
+    "WrongCoefficient", coefficient=lambda found, *_: tuple(1.01 * a for a in found.coefficient)
+)
+WrongDrift = changed(
+    "WrongDrift",
+    offset=lambda found, model, b: found.offset - 2 * lie_derivative_f(model, b.expression),
+)
+WrongMargin = changed("WrongMargin", change=lambda *_: sp.Integer(1))
+TooManyCoefficients = changed(
+    "TooManyCoefficients", coefficient=lambda found, *_: found.coefficient * 2
+)
+WithoutChain = changed("WithoutChain", chain=lambda *_: ())
+WithoutValue = changed(
+    "WithoutValue", offset=lambda found, _, b: found.offset + sp.log(b.expression - 0.5)
+)
 
 
 @dataclass(frozen=True)
@@ -65,43 +87,13 @@ class WrongRates(Right):
 
 
 @dataclass(frozen=True)
-class HalfOfIto(Right):
+class HalfOfIto(WrongRates):
     stochastic = True
 
     def derived(self, model, barrier):
         h = barrier.expression
         half = (generator(model, h) + lie_derivative_f(model, h)) / 2
         return AffineConstraint.after(model, (h,), half + self.gain * h)
-
-    def chain_rates(self, degree):
-        return (self.gain,)
-
-
-@dataclass(frozen=True)
-class WrongMargin(Right):
-    def derived(self, model, barrier):
-        found = super().derived(model, barrier)
-        return replace(found, change=sp.Integer(1))
-
-
-@dataclass(frozen=True)
-class TooManyCoefficients(Right):
-    def derived(self, model, barrier):
-        found = super().derived(model, barrier)
-        return replace(found, coefficient=found.coefficient * 2)
-
-
-@dataclass(frozen=True)
-class WithoutChain(Right):
-    def derived(self, model, barrier):
-        return replace(super().derived(model, barrier), chain=())
-
-
-@dataclass(frozen=True)
-class WithoutValue(Right):
-    def derived(self, model, barrier):
-        found = super().derived(model, barrier)
-        return replace(found, offset=found.offset + sp.log(barrier.expression - 0.5))
 
 
 @dataclass(frozen=True)
@@ -129,26 +121,18 @@ class Forgetful(Right):
         (WrongRates(2.0), "derivatives: the offset of WrongRates"),
         (HalfOfIto(), "derivatives: the offset of HalfOfIto"),
         (WrongMargin(), "derivatives: the change of WrongMargin"),
-        (TooManyCoefficients(), "derived: TooManyCoefficients .*2 coefficients for 1 inputs"),
-        (WithoutChain(), "chain: WithoutChain on h has none"),
-        (WithoutValue(), "finite: WithoutValue on h has no value"),
-        (WithList(), "parameters: WithList cannot be hashed"),
-        (Unreadable(), "text: Unreadable writes .* cannot be read"),
-        (Forgetful(3.0), "text: Forgetful writes .*gain=1.0"),
+        (TooManyCoefficients(), "derived: TooManyCoefficients .*2 coefficients"),
+        (WithoutChain(), "chain: WithoutChain on h"),
+        (WithoutValue(), "finite: WithoutValue on h"),
+        (WithList(), "parameters: WithList"),
+        (Unreadable(), "text: Unreadable"),
+        (Forgetful(3.0), "text: Forgetful .*gain=1.0"),
     ],
     ids=lambda part: type(part).__name__ if isinstance(part, Condition) else "",
 )
 def test_what_is_broken_is_named(condition, broken):
-    disk = problem_of("safe_envs/CubicSDEDisk-v0")
-    check_condition(Right(), disk)
     with pytest.raises(AssertionError, match=broken):
-        check_condition(condition, disk)
-
-
-def broken_filter(monkeypatch, change):
-    """Let decisions be changed, as by a condition whose constraint is not what is compiled."""
-    decide = SafetyFilter.filter
-    monkeypatch.setattr(SafetyFilter, "filter", lambda *args: change(decide(*args)))
+        check_condition(condition, DISK)
 
 
 @pytest.mark.parametrize(
@@ -161,9 +145,11 @@ def broken_filter(monkeypatch, change):
     ],
 )
 def test_decisions_that_are_broken_are_named(monkeypatch, change, broken):
-    broken_filter(monkeypatch, change)
+    # As by a condition whose constraint is not what is compiled.
+    decide = SafetyFilter.filter
+    monkeypatch.setattr(SafetyFilter, "filter", lambda *args: change(decide(*args)))
     with pytest.raises(AssertionError, match=broken):
-        check_condition("cbf", problem_of("safe_envs/CubicSDEDisk-v0"))
+        check_condition("cbf", DISK)
 
 
 def test_what_does_not_suit_the_problem_is_no_broken_property():

@@ -20,7 +20,10 @@ from safe_envs import (
     SystemDefinitionWarning,
     state_problem,
 )
+from safe_envs.problem.clf import CLF
+from safe_envs.problem.signals import TIME, Feature
 from safe_envs.problem.validation import require_sound
+from safe_envs.wrappers import SafetyFilter
 
 x, v, u, w, k, sigma = sp.symbols("x v u w k sigma", real=True)
 SYSTEM = ControlAffineSDE.from_rate(
@@ -31,6 +34,16 @@ NUMBERS = {"box": (-5.0, 5.0), "start": [(-0.5, 0.5), 0.0], "dt": 0.05, "horizon
 
 def stated(system: ControlAffineSDE = SYSTEM, barriers: object = 1 - x**2, **numbers):
     return state_problem(system, barriers, **{**NUMBERS, **numbers})
+
+
+def features(*names):
+    return tuple(Feature(n, state, -5.0, 5.0) for n, state in zip(names, (x, v), strict=True))
+
+
+IDLE = ControlAffineSDE((x, v), (u, w), [v, 0], [[0, 0], [1, 0]], [0, 0])
+BY_NO_INPUT = ControlAffineSDE((x, v), (u,), [-x, 0], [0, 1], [0, 0])
+BY_K = ControlAffineSDE((x, v), (u,), [v, 0], [0, 1 / k], [0, 0], {k: 1.0})
+TWO_GAINS = ((1.0, 1.0), (1.0, 1.0))
 
 
 def test_what_is_left_out_gets_what_suits():
@@ -59,103 +72,49 @@ def test_starts_are_drawn_from_the_ranges_where_all_barriers_are_positive():
     assert position.std() > 0.4
 
 
-def test_scalar_and_vector_envs_agree():
-    problem = stated(nominal=-v, reward=-(x**2), workspace={x: (-2.0, 2.0)})
-    env, envs = SafeEnv(problem), SafeVectorEnv(problem, 3)
-    env.reset(seed=7)
-    envs.reset(seed=7)
-    for _ in range(20):
-        one, many = env.step([0.3]), envs.step(np.full((3, 1), 0.3))
-    assert np.array_equal(one[0], many[0][0])
-    assert one[1] == pytest.approx(many[1][0])
-
-
-def test_from_rate_takes_a_rate_apart():
-    system = ControlAffineSDE.from_rate(
-        (x, v), (u, w), [v + w, sp.cos(x) * (u + 3) - (x + u) ** 2 + u**2 + 2 * x * u]
-    )
-    assert system.drift.equals(sp.Matrix([v, 3 * sp.cos(x) - x**2]))
-    assert system.input_matrix.equals(sp.Matrix([[0, 1], [sp.cos(x), 0]]))
-    assert not any(system.diffusion)
-
-
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
         ({"barriers": x**2 - 1}, SystemDefinitionError, "wrong sign"),
         ({"start": [2.0, 0.0]}, SystemDefinitionError, "every start is unsafe"),
         ({"barriers": [1 - x**2, x - 3]}, SystemDefinitionError, "every start is unsafe: h_2"),
+        ({"barriers": [x - 0.1, -0.2 - x]}, SystemDefinitionError, "all barriers at once"),
         ({"barriers": sp.Integer(1)}, RelativeDegreeError, "no relative degree"),
-        ({"barriers": 1 - w**2}, SystemDefinitionError, "unknown symbol w"),
-        ({"barriers": 1 - sp.sqrt(x - 5)}, SystemDefinitionError, "no finite value at the start"),
-        ({"workspace": {x: (2.0, 3.0)}}, SystemDefinitionError, "outside the workspace"),
-        (
-            {"barriers": [x - 0.1, -0.2 - x]},
-            SystemDefinitionError,
-            "no start is safe for all barriers at once",
-        ),
-        ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
-        ({"barriers": 1 - x**2 > 0}, SystemDefinitionError, "give the expression itself"),
-        ({"barriers": "1 - x**2"}, SystemDefinitionError, "give a sympy expression"),
         ({"barriers": sp.Min(1 - x, 1 - v)}, RelativeDegreeError, "different relative degrees"),
+        ({"barriers": 1 - w**2}, SystemDefinitionError, "symbol w"),
+        ({"barriers": 1 - sp.sqrt(x - 5)}, SystemDefinitionError, "no finite value at the start"),
+        ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
+        ({"barriers": 1 - x**2 > 0}, SystemDefinitionError, "the expression itself"),
+        ({"barriers": "1 - x**2"}, SystemDefinitionError, "give a sympy expression"),
         ({"nominal": lambda state: -state}, SystemDefinitionError, "nominal is a function"),
-        (
-            {"nominal": sp.log(x - 5)},
-            SystemDefinitionError,
-            "the nominal controller has no finite value",
-        ),
-        ({"gains": (1.0,)}, SystemDefinitionError, "its relative degree is 2"),
-        ({"gains": (1.0, -1.0)}, SystemDefinitionError, "as many positive numbers"),
-        ({"gains": 2.0}, ConfigurationError, "give a tuple of rates"),
-        ({"noise": 0.1}, ConfigurationError, "it names parameters of the diffusion"),
-        ({"plane": ("x", "y")}, ConfigurationError, "it names states"),
-        ({"states": (x,)}, ConfigurationError, "no further 'states'"),
+        ({"nominal": sp.log(x - 5)}, SystemDefinitionError, "nominal controller has no finite"),
+        ({"nominal": [u, u]}, SystemDefinitionError, "nominal expression for each of the 1"),
+        ({"gains": (1.0,)}, SystemDefinitionError, "relative degree is 2"),
+        ({"gains": (1.0, -1.0)}, SystemDefinitionError, "positive numbers"),
+        ({"gains": 2.0}, ConfigurationError, "tuple of rates"),
+        ({"barriers": [1 - x**2, 2 - v], "gains": TWO_GAINS}, SystemDefinitionError, "of h_2"),
+        ({"noise": 0.1}, ConfigurationError, "parameters of the diffusion"),
+        ({"plane": ("x", "y")}, ConfigurationError, "names states"),
+        ({"states": (x,)}, ConfigurationError, "'states'"),
         ({"filters": "scbf"}, ConfigurationError, "did you mean 'filter'"),
-        ({"workspace": {"x": (-2.0, 3.0)}}, SystemDefinitionError, "give the symbol itself"),
+        ({"workspace": {x: (2.0, 3.0)}}, SystemDefinitionError, "outside the workspace"),
+        ({"workspace": {"x": (-2.0, 3.0)}}, SystemDefinitionError, "the symbol itself"),
         ({"start": [0.0]}, SystemDefinitionError, "2 states: x, v"),
         ({"start": [(0.0, math.inf), 0.0]}, ConfigurationError, "not finite"),
-        ({"box": (1.0, -1.0)}, ConfigurationError, "the lower one below the upper"),
+        ({"box": (1.0, -1.0)}, ConfigurationError, "lower one below the upper"),
         ({"box": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "give \\(low, high\\)"),
         ({"box": 3.0}, ConfigurationError, "give \\(low, high\\)"),
-        ({"nominal": [u, u]}, SystemDefinitionError, "nominal expression for each of the 1 inputs"),
+        ({"system": IDLE}, SystemDefinitionError, "input w never appears"),
+        ({"system": BY_NO_INPUT}, RelativeDegreeError, "no action can keep it positive"),
+        ({"model": SYSTEM.with_parameters(k=0)}, SystemDefinitionError, "input u never appears"),
+        ({"system": BY_K, "model": BY_K.with_parameters(k=0)}, ConfigurationError, "by 0"),
+        ({"features": features("x", "x")}, SystemDefinitionError, "named twice.*: x"),
+        ({"features": features("x", "k")}, SystemDefinitionError, "like a parameter: k"),
     ],
 )
 def test_mistakes_are_found_and_explained(change, error, says):
     with pytest.raises(error, match=says):
         stated(**change)
-
-
-def test_an_input_that_does_nothing_is_found():
-    system = ControlAffineSDE((x, v), (u, w), [v, 0], [[0, 0], [1, 0]], [0, 0])
-    with pytest.raises(SystemDefinitionError, match="input w never appears"):
-        stated(system)
-
-
-def test_a_barrier_that_no_input_reaches_is_found():
-    system = ControlAffineSDE((x, v), (u,), [-x, 0], [0, 1], [0, 0])
-    with pytest.raises(RelativeDegreeError, match="no action can keep it positive"):
-        stated(system)
-
-
-@pytest.mark.parametrize("rate", [sp.sin(u), u**2, x * sp.Abs(u), 1 / (u + 2)])
-def test_a_rate_that_is_not_affine_in_the_input_is_found(rate):
-    with pytest.raises(SystemDefinitionError, match="the rate of v is not affine in the input u"):
-        ControlAffineSDE.from_rate((x, v), (u,), [v, rate])
-
-
-@pytest.mark.parametrize("rate", [sp.Piecewise((u + 1, u > 0), (u - 1, True)), x + sp.Heaviside(u)])
-def test_a_rate_of_pieces_is_not_affine(rate):
-    with pytest.raises(SystemDefinitionError, match="the rate of v is not affine in the input"):
-        ControlAffineSDE.from_rate((x, v), (u,), [v, rate])
-
-
-def test_a_rate_that_cannot_be_taken_apart_is_told_so():
-    with pytest.raises(SystemDefinitionError, match="cancel what divides by an input"):
-        ControlAffineSDE.from_rate((x,), (u,), [(u**2 + u) / u])
-    with pytest.raises(SystemDefinitionError, match="give lists of symbols"):
-        ControlAffineSDE.from_rate(x, u, [v])  # pyright: ignore[reportArgumentType]
-    with pytest.raises(SystemDefinitionError, match="is no symbol"):
-        ControlAffineSDE(("x",), (u,), [0], [1], [0])  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(
@@ -209,13 +168,6 @@ def test_arrays_are_taken_for_start_and_box():
     )
 
 
-def test_a_missing_parameter_and_a_symbol_of_other_assumptions_are_told_apart():
-    with pytest.raises(SystemDefinitionError, match="gets its value in parameters"):
-        ControlAffineSDE((x,), (u,), [k * x], [1], [0])
-    with pytest.raises(SystemDefinitionError, match="x has other assumptions there"):
-        ControlAffineSDE((x,), (u,), [sp.Symbol("x")], [1], [0])
-
-
 def test_what_is_given_is_what_the_problem_has():
     model = SYSTEM.with_parameters(k=1.5)
     noise_in_drift = ControlAffineSDE(
@@ -228,17 +180,6 @@ def test_what_is_given_is_what_the_problem_has():
     assert [s.unit for s in (*problem.states, *problem.inputs)] == ["m", "", "N"]
     assert (problem.reward, problem.filter, problem.gains) == (3 - v, "scbf", (3.0, 4.0))
     assert stated(noise_in_drift).noise == ("k",)
-
-
-def test_a_mistake_in_the_model_alone_is_found():
-    system = ControlAffineSDE((x, v), (u,), [v, 0], [0, 1 / k], [0, 0], {k: 1.0})
-    with pytest.raises(ConfigurationError, match="division by 0"):
-        stated(system, model=system.with_parameters(k=0.0))
-
-
-def test_gains_of_each_barrier_are_its_own():
-    with pytest.raises(SystemDefinitionError, match="gains of h_2"):
-        stated(barriers=[1 - x**2, 2 - v], gains=((1.0, 1.0), (1.0, 1.0)))
 
 
 def test_boxes_without_zero_and_several_inputs_are_weighed_rightly():
@@ -255,3 +196,61 @@ def test_boxes_without_zero_and_several_inputs_are_weighed_rightly():
             horizon=1.0,
             nominal=[0, 0],
         )
+
+
+def test_a_root_of_a_square_is_the_size_of_a_real_state():
+    assert stated(barriers=1 - sp.sqrt(x**2)).barriers[0].expression == 1 - sp.Abs(x)
+
+
+@pytest.mark.parametrize("name", ["t", "sin", "x_{1}", "_c0"])
+def test_names_of_symbols_are_free_and_scalar_and_vector_envs_agree(name):
+    def episode(state, force, rate):
+        system = ControlAffineSDE(
+            (state, v), (force,), [sp.sin(v) * rate, 0], [0, 1], [0, sigma], {rate: 2.0, sigma: 0.3}
+        )
+        problem = state_problem(
+            system,
+            1 - state**2 - sp.sin(state) ** 2,
+            **{**NUMBERS, "box": (-1, 1)},
+            nominal=-state,
+            reward=state * force * sp.cos(TIME),
+        )
+        scalar, batch = SafeEnv(problem), SafeVectorEnv(problem, 2)
+        scalar.reset(seed=0)
+        batch.reset(seed=0)
+        one = [scalar.step([0.5]) for _ in range(3)][-1]
+        many = [batch.step(np.full((2, 1), 0.5)) for _ in range(3)][-1]
+        np.testing.assert_array_equal(one[0], many[0][0])
+        assert one[1] == pytest.approx(many[1][0])
+        filtered = SafetyFilter.for_problem(problem, "hocbf").filter([0.3, 0.9], [1.0])
+        return [*one[0], one[1], many[1][1], *filtered.action, *filtered.barrier]
+
+    plain, other = episode(x, u, k), sp.Symbol(name, real=True)
+    for symbols in ((other, u, k), (x, other, k), (x, u, other)):
+        assert episode(*symbols) == pytest.approx(plain, rel=1e-12)
+
+
+@pytest.mark.parametrize("h", [1 - sp.Abs(x), sp.Min(1 - x, 1 + x), sp.Max(0.5 - x, 1 - x**2)])
+def test_a_barrier_with_kinks_under_noise_is_kept_by_its_pieces_or_refused(h):
+    system = ControlAffineSDE((x,), (u,), [0], [1], [sigma], {sigma: 0.3})
+    problem = stated(system, h, box=(-1, 1), start=[0.1])
+    env = SafeEnv(problem)
+    env.reset(seed=0)
+    env.step([1.0])
+    assert SafetyFilter.for_problem(problem, "cbf").filter([0.9], [1.0]).feasible
+    if isinstance(h, sp.Max):
+        with pytest.raises(SystemDefinitionError, match="is a maximum, which scbf cannot keep"):
+            SafetyFilter.for_problem(problem, "scbf")
+        return
+    found, listed = (
+        SafetyFilter(system, each, "scbf", (-1, 1)).filter([0.9], [1.0])
+        for each in (h, [1 - x, 1 + x])
+    )
+    assert found.action == listed.action
+
+
+@pytest.mark.parametrize("given", [{"V": "x**2"}, {"V": x**2, "input_weight": "1 + 1"}])
+def test_a_text_is_no_function(given):
+    # Sympy reads texts by Python's eval.
+    with pytest.raises(SystemDefinitionError, match="is a text"):
+        CLF(**given)

@@ -15,14 +15,7 @@ from safe_envs.problem.named_sets import NamedSets, set_expressions, set_names
 from tests.conftest import problem_of
 
 x, y, u, k = sp.symbols("x y u k", real=True)
-SYSTEM = ControlAffineSDE(
-    states=(x, y),
-    inputs=(u,),
-    drift=[y, -k * x],
-    input_matrix=[0, 1],
-    diffusion=[[0], [0]],
-    parameters={k: 2.0},
-)
+SYSTEM = ControlAffineSDE((x, y), (u,), [y, -k * x], [0, 1], [[0], [0]], {k: 2.0})
 
 
 def own_problem(**rest) -> SafetyProblem:
@@ -51,15 +44,11 @@ def test_regions_outlive_other_numbers_and_pickle() -> None:
     assert pickle.loads(pickle.dumps(problem)).regions == problem.regions
 
 
-@pytest.mark.parametrize("name", ["safe", "goal", "until", "not", "2nd", "a b", "", "ä", 3])
-def test_names_that_a_specification_could_not_read_are_refused(name: object) -> None:
-    with pytest.raises(SystemDefinitionError, match="a region is named"):
-        own_problem(regions={name: x})
-
-
 @pytest.mark.parametrize(
     ("regions", "message"),
     [
+        *(({name: x}, "region is named") for name in ("safe", "goal", "until", "not", "2nd")),
+        *(({name: x}, "region is named") for name in ("a b", "", "ä", 3)),
         ({"gate": "x > 0"}, "region gate is a text"),
         ({"gate": x > 0}, "true or false"),
         ({"gate": sp.Symbol("x")}, "region gate uses the unknown symbol x"),
@@ -68,18 +57,25 @@ def test_names_that_a_specification_could_not_read_are_refused(name: object) -> 
         ({f"r{i}": x for i in range(21)}, "up to 20 names"),
     ],
 )
-def test_regions_are_expressions_of_the_states(regions: object, message: str) -> None:
+def test_regions_are_expressions_of_the_states_with_names_for_specifications(
+    regions: object, message: str
+) -> None:
     with pytest.raises(SystemDefinitionError, match=message):
         own_problem(regions=regions)
 
 
-def test_sets_that_are_not_there_are_refused() -> None:
-    with pytest.raises(ConfigurationError, match="has no set 'gat'; did you mean 'gate'"):
-        NamedSets(own_problem(regions={"gate": x}), ["gat"])
-    with pytest.raises(ConfigurationError, match="has no set 'goal'; allowed: safe"):
-        set_expressions(own_problem(), "goal")
-    with pytest.raises(ConfigurationError, match="the goal of problem depends on u"):
-        set_expressions(own_problem(goal=x - u), "goal")
+@pytest.mark.parametrize(
+    ("parts", "name", "message"),
+    [
+        ({"regions": {"gate": x}}, "gat", "no set 'gat'; did you mean 'gate'"),
+        ({}, "goal", "no set 'goal'; allowed: safe"),
+        ({"goal": x - u}, "goal", "goal of problem depends on u"),
+    ],
+)
+def test_sets_that_are_not_there_are_refused(parts, name, message) -> None:
+    for read in (set_expressions, lambda problem, name: NamedSets(problem, [name])):
+        with pytest.raises(ConfigurationError, match=message):
+            read(own_problem(**parts), name)
 
 
 def test_a_set_without_a_value_is_reported() -> None:
