@@ -147,8 +147,7 @@ def test_learners_come_near_the_best_policy(kind, settings, steps):
 @pytest.mark.oracle
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
-    ("kind", "settings", "steps"),
-    [(PPOLagrangian, PPO, 500_000), (SACLagrangian, SAC, 400_000)],
+    ("kind", "settings", "steps"), [(PPOLagrangian, PPO, 500_000), (SACLagrangian, SAC, 400_000)]
 )
 def test_learners_find_the_best_policy_within_two_percent(kind, settings, steps, seed):
     # The settings were chosen on these seeds. On seeds 2 and 3 the returns of PPO-Lagrangian are

@@ -171,11 +171,7 @@ def test_infos_without_costs_are_refused(infos, message):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"limit": -1.0}, "limit"),
-        ({"limit": 0.0, "unit": 0.0}, "unit"),
-    ],
+    ("arguments", "message"), [({"limit": -1.0}, "limit"), ({"limit": 0.0, "unit": 0.0}, "unit")]
 )
 def test_arguments_out_of_range_are_refused(arguments, message):
     with pytest.raises(ConfigurationError, match=message):

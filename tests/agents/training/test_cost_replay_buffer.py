@@ -8,10 +8,7 @@ import pytest
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.replay_buffer import (
-    FilteredNStepReplayBuffer,
-    FilteredReplayBuffer,
-)
+from safe_envs.agents.training.replay_buffer import FilteredNStepReplayBuffer, FilteredReplayBuffer
 from safe_envs.agents.training.sac_lagrangian import (
     CostReplayBuffer,
     FilteredCostReplayBuffer,

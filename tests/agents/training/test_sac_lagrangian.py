@@ -222,6 +222,5 @@ def test_cost_critics_learn_features_of_their_own():
     model = learned(SACLagrangian, policy_kwargs=kwargs)
     assert not torch.equal(model.cost_critic.features_extractor.scale, torch.ones(1))
     assert_same(
-        learned(SAC, policy_kwargs=kwargs),
-        learned(SACLagrangian, policy_kwargs=kwargs, **NO_GAINS),
+        learned(SAC, policy_kwargs=kwargs), learned(SACLagrangian, policy_kwargs=kwargs, **NO_GAINS)
     )
