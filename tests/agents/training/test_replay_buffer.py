@@ -333,7 +333,10 @@ def test_options_of_a_problem_and_of_any_env_of_it():
 
 BOXES = [(0.0, 4.0), ((0.0, 4.0),), ((0.0, 4.0), (5.0, -3.0)), ((0.0, 4.0), (0.0, np.inf))]
 SMALL = {"optimize_memory_usage": True, "handle_timeout_termination": False}
-OTHERS = DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))])
+
+
+def of_several_bounds():
+    return DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))])
 
 
 @pytest.mark.parametrize(
@@ -352,7 +355,10 @@ OTHERS = DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))])
         (lambda: replay_options(gym.make("CartPole-v1")), "not one of this project's envs"),
         (lambda: replay_options(DummyVecEnv([lambda: gym.make("CartPole-v1")])), "not one of"),
         (lambda: replay_options(None), "not one of this project's envs"),
-        (lambda: replay_options(OTHERS), r"\[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]"),
+        (
+            lambda: replay_options(of_several_bounds()),
+            r"\[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(call, fragment):
@@ -468,8 +474,7 @@ class Inputs(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("options", [True, False], ids=["options", "class alone"])
-@pytest.mark.parametrize("saved_filtered", [True, False])
+@pytest.mark.parametrize(("options", "saved_filtered"), [(True, False), (False, True)])
 def test_the_env_of_a_learner_may_be_exchanged(tmp_path, options, saved_filtered):
     env = make(filtered=saved_filtered)
     arguments = replay_options(env) if options else {"replay_buffer_class": FilteredReplayBuffer}

@@ -1,22 +1,29 @@
-"""The native VecEnv does what DummyVecEnv does over the scalar envs."""
+"""The native VecEnv does what DummyVecEnv does over the scalar envs, and infos are made as far as
+they are read."""
 
 from __future__ import annotations
 
+import copy
+import json
+import pickle
 import sys
 from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
 
 from safe_envs import ConfigurationError, InvalidInputError
-from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
-from safe_envs.engine.program import Program
+from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env, speeds
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
-from tests.wrappers.value.guesses import SCALAR, guess
 
 pytestmark = pytest.mark.slow
 
@@ -84,51 +91,40 @@ def test_equals_dummy_vec_env(env_id, filtered):
     assert sum(dones.sum() for dones, _ in shown) >= 2 * NUM_ENVS
 
 
-def test_equals_dummy_vec_env_when_episodes_end_at_different_steps():
-    ours, theirs = pair("safe_envs/Scalar-v0", "scbf", noise=6.0, horizon=0.3)
-    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
-    ends = [
-        info["TimeLimit.truncated"]
+def ends_of(shown):
+    return [
+        (info["TimeLimit.truncated"], info["violation"])
         for dones, infos in shown
         for done, info in zip(dones, infos, strict=True)
         if done
     ]
-    assert {True, False} == set(ends)
+
+
+SCALAR_ID = "safe_envs/Scalar-v0"
+EARLY = {"start": [0.8], "noise": 1.0, "horizon": 0.1, "terminate_on_violation": True}
+
+
+@pytest.mark.parametrize(
+    ("filter_text", "options", "wanted"),
+    [
+        ("scbf", {"noise": 6.0, "horizon": 0.3}, {True, False}),
+        (None, EARLY, {(True, False), (False, True)}),
+        ("scbf", EARLY, {(True, False), (False, True)}),
+    ],
+)
+def test_equals_dummy_vec_env_when_episodes_end_at_different_steps(filter_text, options, wanted):
+    ours, theirs = pair(SCALAR_ID, filter_text, **options)
+    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
+    found = ends_of(shown)
+    assert {(end if "start" in options else end[0]) for end in found} == wanted
     assert any(dones.any() and not dones.all() for dones, _ in shown)
-
-
-@pytest.mark.parametrize("filter_text", [None, "scbf"])
-def test_equals_dummy_vec_env_when_violations_end_episodes(filter_text):
-    ours, theirs = pair(
-        "safe_envs/Scalar-v0",
-        filter_text,
-        start=[0.8],
-        noise=1.0,
-        horizon=0.1,
-        terminate_on_violation=True,
-    )
-    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
-    ends = [
-        (info["TimeLimit.truncated"], info["violation"], info["cost"])
-        for dones, infos in shown
-        for done, info in zip(dones, infos, strict=True)
-        if done
-    ]
-    assert {(True, False, 0.0), (False, True, 1.0)} == set(ends)
-    assert not any(
-        info["violation"]
-        for dones, infos in shown
-        for done, info in zip(dones, infos, strict=True)
-        if not done
-    )
 
 
 def test_an_end_in_the_last_control_period_is_no_truncation():
     dt = problem_of(DUBINS).dt
     ours, theirs = pair(DUBINS, None, start=[6.0, 0.0, 0.0], noise=0.0, horizon=dt)
-    ((dones, infos),) = assert_same_steps(ours, theirs, drawn_actions(ours, 1))
-    assert dones.all()
-    assert not any(info["TimeLimit.truncated"] for info in infos)
+    shown = assert_same_steps(ours, theirs, drawn_actions(ours, 1))
+    assert [truncated for truncated, _ in ends_of(shown)] == [False] * NUM_ENVS
 
 
 def test_infos_of_an_end_are_those_of_the_episode():
@@ -401,39 +397,37 @@ def test_filters_are_texts_conditions_or_nothing(given):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "fragment"),
     [
-        ({"env_id": "StochasticDubin-v0"}, "did you mean 'safe_envs/StochasticDubins-v0'"),
-        ({"env_id": "CartPole-v1"}, "not one of this project's envs"),
-        ({"num_envs": 0}, "num_envs = 0; give a whole number from 1"),
-        ({"num_envs": 2.0}, "num_envs = 2.0"),
+        ({"env_id": "StochasticDubin-v0"}, "'safe_envs/StochasticDubins-v0'"),
+        ({"env_id": "CartPole-v1"}, "CartPole-v1"),
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"num_envs": 2.0}, r"num_envs = 2\.0"),
         ({"filter": "scfb"}, "scbf"),
-        ({"filter": 3}, "condition = 3"),
+        ({"filter": 3}, "3"),
         ({"filter": "scbf", "knowledge": "oracle"}, "oracle"),
         ({"filter": "scbf", "objective": "fastest"}, "fastest"),
-        (
-            {"filter": "scbf", "intervention_penalty": -0.1},
-            "intervention_penalty = -0.1; give a finite number from 0",
-        ),
+        ({"filter": "scbf", "intervention_penalty": -0.1}, r"intervention_penalty = -0\.1"),
         ({"filter": "scbf", "intervention_penalty": float("nan")}, "intervention_penalty = nan"),
         ({"filter": "scbf", "intervention_penalty": "1"}, "intervention_penalty = '1'"),
         ({"intervention_penalty": 0.1}, "without a filter"),
+        ({"filter": "scbf", "estimator": "ekf"}, "measurement"),
         ({"seed": -1}, "seed = -1"),
-        ({"horizn": 1.0}, "did you mean 'horizon'"),
+        ({"horizn": 1.0}, "'horizon'"),
         ({"render_mode": "human"}, "render_mode = 'human'"),
+        ({"engine": "fast"}, "engine = 'fast'"),
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_wrong_arguments_are_errors(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
+def test_wrong_arguments_are_errors(arguments, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
         make_sb3_env(**{"env_id": DUBINS, "num_envs": 2, **arguments})
 
 
 def test_other_envs_are_errors():
-    with pytest.raises(ConfigurationError, match="neither one of this project's vector envs"):
-        SafeVecEnv(gym.make_vec("CartPole-v1", num_envs=2))
-    with pytest.raises(ConfigurationError, match="make it with 'SameStep'"):
-        SafeVecEnv(gym.make_vec(DUBINS, num_envs=2))
+    for env, fragment in (("CartPole-v1", "vector envs"), (DUBINS, "'SameStep'")):
+        with pytest.raises(ConfigurationError, match=fragment):
+            SafeVecEnv(gym.make_vec(env, num_envs=2))
 
 
 def test_wrong_actions_are_errors():
@@ -447,34 +441,194 @@ def test_wrong_actions_are_errors():
         env.step(np.array([[0.0], [np.nan]], dtype=np.float32))
 
 
-@pytest.mark.parametrize("condition", [None, "scbf"])
-def test_engines_give_the_same_steps_to_rounding(condition, monkeypatch):
-    monkeypatch.setattr(Program, "compiled", Program.plain)
-    ours, theirs = (
-        make_sb3_env("Scalar-v0", 3, condition, seed=7, engine=engine, horizon=0.04)
-        for engine in ("compiled", "numpy")
-    )
-    shown = assert_same_steps(ours, theirs, drawn_actions(ours, 10))
-    assert sum(dones.sum() for dones, _ in shown) >= 3
-
-
 def test_agents_learn_behind_the_promise_filter_and_may_observe_p():
     env = SafetyFilterVectorWrapper(
-        gym.make_vec(SCALAR, num_envs=4, autoreset_mode="SameStep", horizon=0.06),
-        guess(horizon=0.06),
+        gym.make_vec(SCALAR_ID, num_envs=4, autoreset_mode="SameStep", horizon=0.2),
+        "promise:p=0.97",
         observe_promise=True,
     )
     envs = SafeVecEnv(env, intervention_penalty=0.1)
     assert envs.observation_space.shape == (2,)
     seen = envs.reset()
     rng = np.random.default_rng(0)
-    for k in range(13):
-        levels = [info["promise"] for info in envs.reset_infos] if k % 6 == 0 else None
-        if levels is not None:
-            np.testing.assert_array_equal(seen[:, 1], np.float32(levels))
+    for k in range(41):
+        if k % 20 == 0:
+            levels = np.float32([info["promise"] for info in envs.reset_infos])
+            np.testing.assert_array_equal(seen[:, 1], levels)
         seen, _, dones, infos = envs.step(rng.uniform(-1.0, 1.0, (4, 1)).astype(np.float32))
         for i in np.flatnonzero(dones):
             assert infos[i]["terminal_observation"][1] == np.float32(infos[i]["promise"])
-    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, device="cpu", seed=0)
-    model.learn(32)
+    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, device="cpu", seed=0).learn(32)
     assert model.predict(seen)[0].shape == (4, 1)
+
+
+def test_with_an_estimator_the_features_are_those_at_the_estimate_and_filters_act_there():
+    given = {"measurement": "default", "estimator": "ekf", "seed": 0}
+    env = make_sb3_env(DUBINS, 3, "scbf", **given)
+    observation = env.reset()
+    assert observation.shape == (3, len(problem_of(DUBINS).features))
+    for _ in range(5):
+        observation, _, _, infos = env.step(np.zeros((3, 1), dtype=np.float32))
+    for seen, info in zip(observation, infos, strict=True):
+        x, y, theta = info["estimate"]
+        np.testing.assert_allclose(seen, [x, y, np.cos(theta), np.sin(theta)], rtol=1e-5)
+        assert not np.allclose(info["estimate"], info["state"])
+        assert info["nees_dof"] == 3
+    measured = make_sb3_env(DUBINS, 3, "scbf", observe="measurement", **given)
+    assert measured.reset().shape == (3, 3)
+
+
+def test_monitor_reports_the_last_step_of_an_episode(tmp_path):
+    native = make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=4)
+    env = VecMonitor(native, str(tmp_path), info_keywords=("episode_cost",))
+    env.reset()
+    total = np.zeros(2)
+    for action in drawn_actions(env, 4):
+        _, rewards, dones, infos = env.step(action)
+        total += rewards
+    assert dones.all()
+    for info, wanted in zip(infos, total, strict=True):
+        assert info["episode"]["r"] == pytest.approx(wanted)
+        assert (info["episode"]["l"], info["episode"]["episode_cost"]) == (4, info["episode_cost"])
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [
+        (PPO, {"n_steps": 32, "batch_size": 64, "n_epochs": 2}),
+        (SAC, {"learning_starts": 100, "batch_size": 32}),
+    ],
+)
+def test_algorithms_learn_behind_the_wrappers_of_stable_baselines3(algorithm, settings):
+    native = make_sb3_env(DUBINS, 4, "scbf", intervention_penalty=0.1, max_episode_steps=10)
+    env = VecNormalize(VecMonitor(native, info_keywords=("episode_cost", "episode_interventions")))
+    model = algorithm("MlpPolicy", env, device="cpu", seed=0, **settings).learn(300)
+    assert len(model.ep_info_buffer) >= 28
+    assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
+    assert native.get_attr("np_random_seed") == [0, 1, 2, 3]
+
+
+def test_speeds_are_of_both():
+    measured = speeds(DUBINS, num_envs=2, filter="scbf", steps=3, rounds=1)
+    assert set(measured) == {"SafeVecEnv", "DummyVecEnv"}
+    assert min(measured.values()) > 0.0
+
+
+READINGS = {
+    "keys": lambda info: {key: info[key] for key in info.keys()},  # noqa: SIM118
+    "items": lambda info: dict(info.items()),
+    "values": lambda info: dict(zip(info, info.values(), strict=True)),
+    "iteration": lambda info: {key: info[key] for key in info},
+    "reversed": lambda info: {key: info[key] for key in reversed(info)},
+    "dict": dict,
+    "unpacked": lambda info: {**info},
+    "or": lambda info: info | {},
+    "reflected or": lambda info: {} | info,
+    "update": lambda info: [target := {}, target.update(info)][0],
+    "copy": lambda info: info.copy(),
+    "pickle": lambda info: pickle.loads(pickle.dumps(info)),
+    "deepcopy": copy.deepcopy,
+    "setdefault": lambda info: {key: info.setdefault(key, None) for key in tuple(info)},
+    "pop": lambda info: {key: info.pop(key) for key in tuple(info)},
+    "popitem": lambda info: dict([info.popitem() for _ in range(len(info))]),
+    "repr": lambda info: eval(repr(info), {"array": np.array, "float32": np.float32}),
+}
+
+
+def test_infos_are_made_as_far_as_they_are_read():
+    env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
+    env.reset()
+    info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
+    assert info.batch is env.batch_info
+    assert info.index == 1
+    assert dict.keys(info) == set()
+    assert "cost" in info
+    assert "terminal_observation" not in info
+    assert info.get("episode") is None
+    assert info.get("episode", 3) == 3
+    with pytest.raises(KeyError, match="episode"):
+        info["episode"]
+    assert dict.keys(info) == set()
+    assert isinstance(info["cost"], float)
+    assert info.get("barrier") is info["barrier"]
+    assert dict.keys(info) == {"barrier"}
+    twin = info.copy()
+    assert (twin.batch, twin.index) == (info.batch, info.index)
+    assert twin["barrier"] is info["barrier"]
+    assert dict.keys(twin) == {"barrier"}
+    assert copy.copy(info).batch is info.batch
+
+
+@pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
+def test_every_way_to_read_an_info_gives_all_of_it(reading):
+    env = make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=1)
+    env.reset()
+    info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
+    wanted = {
+        **{key: values[1] for key, values in env.batch_info.items()},
+        "terminal_observation": dict.get(info, "terminal_observation"),
+    }
+    read = reading(info)
+    assert len(read) == len(wanted) == 18
+    for key, value in wanted.items():
+        # The text of an array has eight digits.
+        np.testing.assert_allclose(read[key], value, rtol=1e-7, err_msg=key)
+
+
+def test_infos_are_equal_if_their_entries_are():
+    # An array of several barriers has no truth value of its own.
+    envs = [make_sb3_env("safe_envs/QuadrotorLimits-v0", 2, "hocbf", seed=0) for _ in range(2)]
+    for env in envs:
+        env.reset()
+    info, twin = (env.step(np.ones((2, 4), dtype=np.float32))[3][1] for env in envs)
+    changed = [info.copy() for _ in range(4)]
+    changed[0]["cost"] = 7.0
+    changed[1]["barrier"][1] += 1.0
+    changed[2]["another"] = 1
+    del changed[3]["cost"]
+    # A copy of a lazy one is lazy, so that no comparison can rely on an earlier one.
+    for other, same in (
+        (twin, True),
+        (info, True),
+        (dict(twin.copy()), True),
+        *((other, False) for other in changed),
+    ):
+        for a, b in (
+            (info.copy(), other),
+            (other, info.copy()),
+            (info.copy(), other.copy()),
+            (other.copy(), info.copy()),
+        ):
+            assert ((a == b), (a != b)) == (same, not same)
+    assert info.copy() != 3
+
+
+def test_a_dict_of_an_info_is_written_as_json():
+    env = make_sb3_env(DUBINS, 2, seed=0)
+    env.reset()
+    info = env.reset_infos[1]
+    assert set(json.loads(json.dumps(dict(info), default=list))) == set(env.batch_info)
+
+
+def test_infos_can_be_changed_without_changing_the_batch():
+    env = make_sb3_env(DUBINS, 2, seed=0)
+    env.reset()
+    info, other = env.reset_infos
+    unchanged = info.copy()
+    info["cost"] = 7.0
+    info["barrier"][:] = 7.0
+    del info["h_min"]
+    assert info.get("cost") == info["cost"] == 7.0
+    assert "h_min" not in info
+    assert info.get("h_min") is None
+    assert info != unchanged
+    assert unchanged == {key: values[0] for key, values in env.batch_info.items()}
+    assert (len(info), len(other)) == (4, 5)
+    assert other["cost"] == 0.0
+    assert env.batch_info["barrier"][0] != 7.0
+    copied = pickle.loads(pickle.dumps(info))
+    assert type(copied) is dict
+    assert type(copy.deepcopy(info)) is dict
+    info.clear()
+    assert "violation" not in info
