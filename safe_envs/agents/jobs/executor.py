@@ -202,10 +202,13 @@ def run(
     # as failed.
     while missing:
         try:
-            _persistently(
-                lambda: take(list(missing.values())),
-                _MOST_LOSSES if backend.backend == "local" else 1,
-            )
+            for left in reversed(range(_MOST_LOSSES if backend.backend == "local" else 1)):
+                try:
+                    take(list(missing.values()))
+                    break
+                except _LossError:
+                    if not left:
+                        raise
         except _LossError as loss:
             under_way = [job for job in loss.jobs if job.key in missing] if any_computed else []
             # A job that was alone need not be tried again; Dask names one of several.
@@ -225,17 +228,6 @@ def run(
                     " Look for the reason, such as too little memory or another installation on"
                     " the workers, and start again"
                 ) from error
-
-
-def _persistently(take: Callable[[], None], times: int) -> None:
-    """Repeat a call as long as a worker ends during it; raise _LossError at the last loss."""
-    for attempt in range(1, times + 1):
-        try:
-            return take()
-        except _LossError:
-            if attempt == times:
-                raise
-    return None
 
 
 def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> _LossError | None:

@@ -180,10 +180,6 @@ class Planned:
     versions: dict[str, str]
     agents: Path = Path()
 
-    def in_folder(self, agents: Path) -> Planned:
-        """Return the same with the folder of all agents."""
-        return replace(self, agents=agents)
-
     @property
     def in_loop(self) -> str:
         """Text of the filter of the training."""
@@ -523,7 +519,7 @@ def _plans(
             except SafeEnvsError as error:
                 missing[env_id, variant.name, None] = str(error)
                 continue
-            yield from (each.in_folder(out / _AGENTS) for each in of_seeds)
+            yield from (replace(each, agents=out / _AGENTS) for each in of_seeds)
 
 
 def _planned(study: Study, env_id: str, variant: Variant, k: int, default: str) -> Planned:
