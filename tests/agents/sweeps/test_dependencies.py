@@ -84,6 +84,9 @@ def test_paths_mean_the_same_in_every_process(folder: Path, monkeypatch: pytest.
     assert (cell.settings["filter"], cell.settings["policy"]) == (far, str(folder / "ppo"))
     read = ["a.npz", "near/b.npz", "ppo/policy.npz", *FILES.keys() - {"near/unused.py"}]
     assert set(cell.files) == {str(folder / name) for name in read}
+    own = cell_of({**SMALL, "policy": "other.py:x"})
+    assert own.settings["policy"] == f"{folder / 'other.py'}:x"
+    assert str(folder / "other.py") in own.files
     monkeypatch.chdir("/")
     assert cell_of({"env": "Scalar-v0", "filter": far, "policy": str(folder / "ppo")}) == cell
 

@@ -155,12 +155,15 @@ def test_both_stores_each_step_with_either_action(count):
         assert rows[0::2].tobytes() == rows[1::2].tobytes()
 
 
-@pytest.mark.parametrize(("algorithm", "action"), [(SAC, "executed"), (TD3, "proposed")])
+@pytest.mark.parametrize(
+    ("algorithm", "action"), [(SAC, "executed"), (TD3, "proposed"), (SAC, "the class alone")]
+)
 def test_without_a_filter_nothing_changes(algorithm, action):
+    free, arguments = several(filtered=False), {"replay_buffer_class": FilteredReplayBuffer}
+    if action != "the class alone":
+        arguments = replay_options(free, action)
     plain, _ = learned(algorithm, several(filtered=False))
-    ours, _ = learned(
-        algorithm, several(filtered=False), **replay_options(several(filtered=False), action)
-    )
+    ours, _ = learned(algorithm, free, **arguments)
     assert type(ours.replay_buffer) is FilteredReplayBuffer
     assert_same_learning(plain, ours)
 
@@ -230,22 +233,18 @@ def test_a_file_of_plain_ppo_needs_nothing_of_this_package(tmp_path):
     assert not [key for key, content in pickles.items() if b"safe_envs" in content]
 
 
-@pytest.mark.parametrize("action", ["executed", "both"])
-def test_saving_and_loading(tmp_path, action):
-    model, _ = learned(SAC, several(), **replay_options(several(), action))
+def test_saving_and_loading(tmp_path):
+    model, _ = learned(SAC, several(), **replay_options(several(), "both"))
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     again = SAC.load(tmp_path / "model.zip", env=several(), device="cpu")
     assert again.replay_buffer.size() == 0
-    assert again.replay_buffer.action == action
+    assert again.replay_buffer.action == "both"
     again.load_replay_buffer(tmp_path / "buffer.pkl")
     assert stored(again).tobytes() == stored(model).tobytes()
     before = again.replay_buffer.size()
     again.learn(30, callback=(witness := Witness()), reset_num_timesteps=False)
-    assert (
-        stored(again)[before :: 2 if action == "both" else 1].tobytes()
-        == witness.actions()[1].tobytes()
-    )
+    assert stored(again)[before::2].tobytes() == witness.actions()[1].tobytes()
 
 
 def buffer_of(envs=3, action="executed", kind=FilteredReplayBuffer, box=TWO_INPUTS, **arguments):
@@ -405,15 +404,6 @@ class Recording(FilteredReplayBuffer):
         self.proposals.append(action.copy())
         self.unit.append([(info["safe_action"] - center) / half for info in infos])
         super().add(obs, next_obs, action, reward, done, infos)
-
-
-def test_the_class_alone_learns_as_with_the_options():
-    alone, _ = learned(SAC, several(), replay_buffer_class=FilteredReplayBuffer)
-    options, _ = learned(SAC, several(), **replay_options(several()))
-    assert_same_learning(alone, options)
-    free, _ = learned(SAC, several(filtered=False), replay_buffer_class=FilteredReplayBuffer)
-    plain, _ = learned(SAC, several(filtered=False))
-    assert_same_learning(free, plain)
 
 
 class Halved(gym.ActionWrapper):

@@ -127,26 +127,6 @@ def test_an_end_in_the_last_control_period_is_no_truncation():
     assert [truncated for truncated, _ in ends_of(shown)] == [False] * NUM_ENVS
 
 
-def test_infos_of_an_end_are_those_of_the_episode():
-    env = make_sb3_env(DUBINS, 4, "scbf", seed=0, max_episode_steps=5)
-    env.reset()
-    resets = list(env.reset_infos)
-    for action in drawn_actions(env, 5):
-        observations, _, dones, infos = env.step(action)
-    assert dones.all()
-    # Before the first step nothing was proposed: that info must not stand in for the last one.
-    assert all(
-        info["nominal_action"] == 10.0 * a
-        for info, a in zip(infos, action[:, 0].astype(float), strict=True)
-    )
-    assert all(info["nominal_action"] == 0.0 for info in env.reset_infos)
-    assert all(a is not b for a, b in zip(resets, env.reset_infos, strict=True))
-    assert all(
-        not np.array_equal(info["terminal_observation"], row)
-        for info, row in zip(infos, observations, strict=True)
-    )
-
-
 def test_infos_stay_as_they_were():
     envs = [make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=3) for _ in range(2)]
     for env in envs:
@@ -204,101 +184,71 @@ def test_options_that_do_not_fit_are_refused(options):
         env.reset()
 
 
-def test_attributes_are_rows_or_shared():
+def test_attributes_and_methods_are_those_of_dummy_vec_env():
+    ours, theirs = pair("safe_envs/QuadrotorLimits-v0", "hocbf", noise=0.05)
+    (action,) = drawn_actions(ours, 1)
+    for env in (ours, theirs):
+        env.reset()
+        env.step(action)
+    for name in ("state", "executed", "components"):
+        values = ours.get_attr(name)
+        np.testing.assert_allclose(values, theirs.get_attr(name), rtol=1e-6)
+        np.testing.assert_array_equal(ours.get_attr(name, [2]), values[2:])
+        assert name == "state" or {type(u) for value in values for u in value} == {float}
+    for name in ("observation_space", "action_space"):
+        assert ours.get_attr(name) == theirs.get_attr(name)
+    assert ours.get_attr("spec", 0)[0].id == theirs.get_attr("spec", 0)[0].id
+    assert ours.get_attr("np_random")[0] is not ours.get_attr("np_random")[1]
+    for name in ("executed", "nothing"):
+        found = [env.env_method("has_wrapper_attr", name) for env in (ours, theirs)]
+        assert found[0] == found[1] == [ours.has_attr(name)] * NUM_ENVS
+    with pytest.raises(AttributeError, match="'nothing'"):
+        ours.get_attr("nothing")
+    # Once for the batch.
+    wanted = [env.unwrapped.physical_action(a) for env, a in zip(theirs.envs, action, strict=True)]
+    np.testing.assert_allclose(ours.env_method("physical_action", action), wanted, rtol=1e-6)
+    (found,) = ours.env_method("physical_action", action, indices=1)
+    np.testing.assert_allclose(found, wanted[1], rtol=1e-6)
+    with pytest.raises(ConfigurationError, match="'reset'"):
+        ours.env_method("reset", indices=[0])
+    for kind, wrapped in ((SafetyFilterWrapper, True), (gym.wrappers.TimeLimit, False)):
+        assert ours.env_is_wrapped(kind) == [wrapped] * NUM_ENVS
+    assert ours.env_is_wrapped(SafetyFilterVectorWrapper, 0) == [True]
+    assert make_sb3_env(DUBINS, 2).env_is_wrapped(SafetyFilterWrapper) == [False, False]
+
+
+def test_attributes_are_rows_of_arrays_or_shared_and_are_set_for_all_envs():
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
     env.reset()
-    problems, filters = env.get_attr("problem"), env.get_attr("safety_filter")
-    assert problems[0] is problems[1] is env.env.unwrapped.problem
-    assert filters[0] is filters[1] is env.env.safety_filter
-    np.testing.assert_array_equal(env.get_attr("state"), env.env.unwrapped.state)
-    np.testing.assert_array_equal(env.get_attr("state", [1]), env.env.unwrapped.state[[1]])
-    assert env.get_attr("observation_space", 0) == [env.observation_space]
-    assert env.get_attr("action_space") == [env.action_space] * 2
-    assert env.get_attr("np_random")[0] is not env.get_attr("np_random")[1]
-    assert env.get_attr("spec", 0)[0].id == DUBINS
-    assert env.has_attr("executed")
-    assert not env.has_attr("nothing")
-    with pytest.raises(AttributeError, match="'nothing'"):
-        env.get_attr("nothing")
-
-
-def test_attributes_are_set_for_all_envs():
-    env = make_sb3_env(DUBINS, 2, "scbf")
-    env.set_attr("note", "read")
-    assert env.get_attr("note") == ["read", "read"]
+    for name, holder in (("problem", env.env.unwrapped), ("safety_filter", env.env)):
+        values = [*env.get_attr(name), *env.env_method("get_wrapper_attr", name, indices=[0])]
+        assert all(value is getattr(holder, name) for value in values)
+    for shared in ("read", (), [], (np.zeros(2), 1.0), (np.zeros(3),)):
+        env.set_attr("note", shared)
+        assert all(value is shared for value in env.get_attr("note"))
+    env.set_attr("of_matrices", [np.arange(4.0).reshape(2, 2)])
+    ((row,),) = env.get_attr("of_matrices", 1)
+    np.testing.assert_array_equal(row, [2.0, 3.0])
     env.set_attr("safety_filter", "another", indices=[0, 1])
     assert env.env.safety_filter == "another"
     with pytest.raises(ConfigurationError, match="'note' is shared by all 2 envs"):
         env.set_attr("note", "changed", indices=0)
     with pytest.raises(AttributeError):
         env.set_attr("components", np.zeros((2, 3)))
-    env.reset()
     env.set_attr("state", [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     np.testing.assert_array_equal(env.get_attr("state"), [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
 
 
-def test_methods_are_called_once_for_the_batch():
-    env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
-    env.reset()
-    assert env.env_method("get_wrapper_attr", "problem", indices=[0]) == [
-        env.get_attr("problem")[0]
-    ]
-    assert [env.env_method("has_wrapper_attr", name) for name in ("problem", "nothing")] == [
-        [True, True],
-        [False, False],
-    ]
-    rows = env.env_method("normalized_action", [np.array([5.0, -10.0])])
-    np.testing.assert_array_equal(rows, [[0.5], [-1.0]])
-    np.testing.assert_array_equal(
-        env.env_method("normalized_action", [np.array([5.0, -10.0])], indices=1), [[-1.0]]
-    )
-    with pytest.raises(ConfigurationError, match="'reset', which acts on all envs"):
-        env.env_method("reset", indices=[0])
-
-
-def test_components_are_handed_out_by_env():
-    env_id = "safe_envs/QuadrotorLimits-v0"
-    ours, theirs = pair(env_id, "hocbf", noise=0.05)
-    (action,) = drawn_actions(ours, 1)
-    for env in (ours, theirs):
-        env.reset()
-        env.step(action)
-    for name in ("executed", "components"):
-        values = ours.get_attr(name)
-        np.testing.assert_allclose(
-            values, [getattr(env.unwrapped, name) for env in theirs.envs], rtol=1e-6
-        )
-        assert all(type(u) is float for value in values for u in value)
-        assert ours.get_attr(name, [2]) == [values[2]]
-    wanted = [env.unwrapped.physical_action(a) for env, a in zip(theirs.envs, action, strict=True)]
-    np.testing.assert_allclose(ours.env_method("physical_action", action), wanted, rtol=1e-6)
-    ours.set_attr("of_matrices", [np.arange(6.0).reshape(NUM_ENVS, 2)])
-    ((row,),) = ours.get_attr("of_matrices", 1)
-    np.testing.assert_array_equal(row, [2.0, 3.0])
-    for shared in ((), [], (np.zeros(NUM_ENVS), 1.0), (np.zeros(NUM_ENVS + 1),)):
-        ours.set_attr("shared", shared)
-        assert all(value is shared for value in ours.get_attr("shared"))
-
-
-def test_wrappers_are_found():
-    env = make_sb3_env(DUBINS, 2, "scbf")
-    assert env.env_is_wrapped(SafetyFilterVectorWrapper) == [True, True]
-    assert env.env_is_wrapped(SafetyFilterWrapper, 0) == [True]
-    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
-    assert make_sb3_env(DUBINS, 2).env_is_wrapped(SafetyFilterWrapper) == [False, False]
-    env.close()
-
-
-def test_nothing_is_drawn_without_a_render_mode():
+def test_render_of_each_env_is_its_picture():
     env = make_sb3_env(DUBINS, 2)
     assert env.render_mode is None
-    with pytest.warns(UserWarning, match="no images"):
-        assert env.get_images() == [None, None]
-    with pytest.warns(UserWarning, match="no `render_mode`"):
-        assert env.render() is None
-
-
-def test_render_of_each_env_is_its_picture():
+    for call, found in (
+        (env.get_images, [None, None]),
+        (env.render, None),
+        (lambda: env.env_method("render"), [None, None]),
+    ):
+        with pytest.warns(UserWarning, match="render.mode"):
+            assert call() == found
     env = make_sb3_env(DUBINS, 3, "scbf", seed=1, render_mode="rgb_array")
     env.reset()
     pictures = env.env_method("render")
@@ -308,8 +258,6 @@ def test_render_of_each_env_is_its_picture():
     (last,) = env.env_method("render", indices=2)
     np.testing.assert_array_equal(last, pictures[2])
     assert (last != pictures[0]).any()
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert make_sb3_env(DUBINS, 2).env_method("render") == [None, None]
 
 
 def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
@@ -540,24 +488,18 @@ def test_infos_are_made_as_far_as_they_are_read():
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
     env.reset()
     info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
-    assert info.batch is env.batch_info
-    assert info.index == 1
-    assert dict.keys(info) == set()
-    assert "cost" in info
-    assert "terminal_observation" not in info
-    assert info.get("episode") is None
-    assert info.get("episode", 3) == 3
+    assert (info.batch is env.batch_info, info.index) == (True, 1)
+    assert ("cost" in info, "terminal_observation" in info) == (True, False)
+    assert (info.get("episode"), info.get("episode", 3)) == (None, 3)
     with pytest.raises(KeyError, match="episode"):
         info["episode"]
     assert dict.keys(info) == set()
     assert isinstance(info["cost"], float)
     assert info.get("barrier") is info["barrier"]
-    assert dict.keys(info) == {"barrier"}
-    twin = info.copy()
-    assert (twin.batch, twin.index) == (info.batch, info.index)
-    assert twin["barrier"] is info["barrier"]
-    assert dict.keys(twin) == {"barrier"}
-    assert copy.copy(info).batch is info.batch
+    for twin in (info.copy(), copy.copy(info)):
+        assert (twin.batch is info.batch, twin.index) == (True, info.index)
+        assert twin["barrier"] is info["barrier"]
+        assert dict.keys(twin) == {"barrier"}
 
 
 @pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
