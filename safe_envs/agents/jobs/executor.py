@@ -116,11 +116,7 @@ _IDLE = 30
 
 
 class _LossError(Exception):
-    """A worker ended.
-
-    Attributes:
-        jobs: those that it may have been computing.
-    """
+    """A worker ended, which may have been computing `jobs`."""
 
     def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
         super().__init__(reason)
@@ -249,11 +245,7 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 def _outcomes(
     jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[JobOutcome, None, None]:
-    """Yield outcomes in the order of completion.
-
-    Raises:
-        _LossError: a worker ended.
-    """
+    """Yield outcomes in the order of completion; raise _LossError where a worker ends."""
     from joblib import Parallel, delayed
 
     begun: list[Job] = []
