@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from safe_envs import ConfigurationError, InvalidInputError
-from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env, speeds
+from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 
@@ -455,12 +455,6 @@ def test_algorithms_learn_behind_the_wrappers_of_stable_baselines3(algorithm, se
     assert len(model.ep_info_buffer) >= 28
     assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
     assert native.get_attr("np_random_seed") == [0, 1, 2, 3]
-
-
-def test_speeds_are_of_both():
-    measured = speeds(DUBINS, num_envs=2, filter="scbf", steps=3, rounds=1)
-    assert set(measured) == {"SafeVecEnv", "DummyVecEnv"}
-    assert min(measured.values()) > 0.0
 
 
 READINGS = {
