@@ -229,7 +229,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
 
 def _vec_envs(engine: str) -> Figures:
     """Return the speed of the native VecEnv over that of DummyVecEnv, with 64 envs each."""
-    from safe_envs.agents.training.vec_env import speeds
+    from benchmarks.vec_envs import speeds
 
     found = {}
     for name, text in (("unfiltered", None), ("filtered", "scbf")):

@@ -171,10 +171,8 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
 
 
 def _require_listener(address: str) -> None:
-    """Raise OSError unless something listens at HOST:PORT, and ValueError for another form.
-
-    The clients of the clusters would try for minutes.
-    """
+    """Raise OSError unless something listens at HOST:PORT, and ValueError for another form."""
+    # The clients of the clusters would try for minutes.
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and "/" not in host):
         raise ValueError("this is not of the form HOST:PORT")

@@ -116,11 +116,7 @@ _IDLE = 30
 
 
 class _LossError(Exception):
-    """A worker ended.
-
-    Attributes:
-        jobs: those that it may have been computing.
-    """
+    """A worker ended, which may have been computing `jobs`."""
 
     def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
         super().__init__(reason)
@@ -202,10 +198,13 @@ def run(
     # as failed.
     while missing:
         try:
-            _persistently(
-                lambda: take(list(missing.values())),
-                _MOST_LOSSES if backend.backend == "local" else 1,
-            )
+            for left in reversed(range(_MOST_LOSSES if backend.backend == "local" else 1)):
+                try:
+                    take(list(missing.values()))
+                    break
+                except _LossError:
+                    if not left:
+                        raise
         except _LossError as loss:
             under_way = [job for job in loss.jobs if job.key in missing] if any_computed else []
             # A job that was alone need not be tried again; Dask names one of several.
@@ -227,17 +226,6 @@ def run(
                 ) from error
 
 
-def _persistently(take: Callable[[], None], times: int) -> None:
-    """Repeat a call as long as a worker ends during it; raise _LossError at the last loss."""
-    for attempt in range(1, times + 1):
-        try:
-            return take()
-        except _LossError:
-            if attempt == times:
-                raise
-    return None
-
-
 def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> _LossError | None:
     """Compute a job while no other is computed; return how its worker ended, if it did."""
     try:
@@ -257,11 +245,7 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 def _outcomes(
     jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[JobOutcome, None, None]:
-    """Yield outcomes in the order of completion.
-
-    Raises:
-        _LossError: a worker ended.
-    """
+    """Yield outcomes in the order of completion; raise _LossError where a worker ends."""
     from joblib import Parallel, delayed
 
     begun: list[Job] = []

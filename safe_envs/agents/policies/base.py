@@ -253,12 +253,7 @@ class ObservedState:
 
 
 def _solved(problem: SafetyProblem, given: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    """Return the states that features determine, as expressions of the features' values.
-
-    Args:
-        problem: whose states they are.
-        given: expressions of the states, with the symbols of their values.
-    """
+    """Return the states that features determine, as expressions of the features' values."""
     found: dict[Any, Any] = {s: value for s, value in given if s.is_Symbol}
     of = dict(given)
     for s in problem.plant.states:

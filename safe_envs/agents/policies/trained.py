@@ -185,10 +185,7 @@ class _Below(gym.Env[Any, Any]):
 
 
 def _apart(layer: Any) -> Any:
-    """Return a copy of a wrapper over an env of which only the spaces are known.
-
-    What the training goes on with stays as it is.
-    """
+    """Return a copy of a wrapper over an env of which only the spaces are known."""
     twin, below = copy.copy(layer), _Below(layer.env)
     memo, env = {id(layer.unwrapped): below}, layer.env
     while isinstance(env, gym.Wrapper):

@@ -702,13 +702,8 @@ def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
 
 
 def _check(sweep: Sweep, what: str) -> None:
-    """Make the problem, filter and policy of each cell with a value, or a pair, that is new.
-
-    The others would repeat it, and the problem of a large system takes a second.
-
-    Raises:
-        SafeEnvsError: one cannot be made; the message names the cell.
-    """
+    """Make the problem, filter and policy of each cell with a value, or a pair, that is new."""
+    # The others would repeat it, and the problem of a large system takes a second.
     seen: set[str] = set()
     for cell in sweep.cells:
         together = {

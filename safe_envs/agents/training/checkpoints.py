@@ -200,11 +200,7 @@ def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
 
 
 def _arrays(path: Path, most: int) -> Arrays:
-    """Return the arrays of a file with at most so many bytes of numbers.
-
-    Raises:
-        OSError: it is no regular file, or larger.
-    """
+    """Return the arrays of a file, or raise OSError where it is none, or has more bytes of them."""
     open_regular(path, most + _HEADER).close()
     return load_file(path)
 

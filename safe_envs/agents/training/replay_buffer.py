@@ -89,14 +89,7 @@ def _fitting(
     told: np.ndarray | None,
     bounds: np.ndarray | None,
 ) -> np.ndarray:
-    """Return the inputs at the ends of the learner's action space.
-
-    Args:
-        proposed: in [-1, 1], shape (rows, m).
-        nominal: the same as inputs, as the filter got them, shape (rows, m); None if unknown.
-        told: inputs at the ends of the filter's action space, (rows, m, 2); None if unknown.
-        bounds: see `executed_actions`.
-    """
+    """Return the inputs at the ends of the learner's action space, shape (rows, m, 2)."""
     known = [each for each in (told, bounds) if each is not None]
     if told is not None and nominal is not None:
         known = [each for each in known if _stand_for(proposed, nominal, each)]

@@ -180,10 +180,6 @@ class Planned:
     versions: dict[str, str]
     agents: Path = Path()
 
-    def in_folder(self, agents: Path) -> Planned:
-        """Return the same with the folder of all agents."""
-        return replace(self, agents=agents)
-
     @property
     def in_loop(self) -> str:
         """Text of the filter of the training."""
@@ -309,10 +305,8 @@ def _row(planned: Planned, policy: str, learned: dict[str, Any]) -> StudyRow:
 
 
 def _told(training: Training) -> dict[str, Any]:
-    """Return the attributes that are not the defaults, and the checksums of the filter's files.
-
-    A new attribute leaves earlier results valid.
-    """
+    """Return the attributes that are not the defaults, and the checksums of the filter's files."""
+    # So a new attribute leaves earlier results valid.
     defaults = {
         each.name: each.default if each.default_factory is MISSING else each.default_factory()
         for each in fields(training)
@@ -523,7 +517,7 @@ def _plans(
             except SafeEnvsError as error:
                 missing[env_id, variant.name, None] = str(error)
                 continue
-            yield from (each.in_folder(out / _AGENTS) for each in of_seeds)
+            yield from (replace(each, agents=out / _AGENTS) for each in of_seeds)
 
 
 def _planned(study: Study, env_id: str, variant: Variant, k: int, default: str) -> Planned:
@@ -703,14 +697,8 @@ def _parsed(path: Path) -> Any:
 
 
 def _require_few(document: Any, path: Path) -> None:
-    """Check the nodes of a YAML file, before any value is made of them.
-
-    Aliases and merges ("<<") make a short file a very large study.
-
-    Raises:
-        ConfigurationError: there are too many values, or a mapping has a name twice, of which only
-            the last value would count.
-    """
+    """Refuse the nodes of a YAML file with too many values, or with a name twice in a mapping."""
+    # Before any value is made of them: aliases and merges make a short file a very large study.
     count, nodes = 1, [document] if document is not None else []
     while nodes:
         node = nodes.pop()

@@ -1,5 +1,4 @@
-"""Sweeps over real processes, some of which end in the middle: on this machine, on a Dask
-scheduler, and on a Ray cluster."""
+"""Jobs in processes, some of which end in the middle: of this machine, of Dask, and of Ray."""
 
 from __future__ import annotations
 
@@ -11,123 +10,194 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from safe_envs.agents.jobs import clusters, executor
-from safe_envs.agents.jobs.executor import Backend, end_with_parent, run
-from safe_envs.agents.sweeps.spec import sweep_of
-from safe_envs.agents.sweeps.store import Store, read
-from safe_envs.errors import ConfigurationError
+from safe_envs.agents.jobs.executor import Backend, run
+from safe_envs.agents.jobs.job import Job, JobOutcome
+from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow
 
-# With "ends", the first process that simulates it is killed, in the middle of the cell; with
-# "kills", every one but that of the tests.
-SYSTEM = """
-import os, signal
-from pathlib import Path
-from safe_envs.registry import make_problem
-
-def problem(kind="plain"):
-    marker = Path(__file__).with_suffix(".ended")
-    if kind == "fails":
-        raise OSError("no such thing")
-    if kind == "kills" or (kind == "ends" and not marker.exists()):
-        marker.touch()
-        assert os.getpid() != SPARED
-        os.kill(os.getpid(), signal.SIGKILL)
-    return make_problem("Scalar-v0", horizon=0.2)
-"""
-
-# The sweep of a file, told where: in a process of its own, which may be made to end after some
-# cells.
-DRIVER = """
-import json, os, signal, sys
-from pathlib import Path
-from safe_envs.agents.jobs import clusters
-from safe_envs.agents.sweeps.spec import sweep_of
-from safe_envs.agents.jobs.executor import Backend, run
-from safe_envs.agents.sweeps.store import Store
-
-clusters._RETRIES = 1
-spec, out, backend, address, jobs, last = sys.argv[1:]
-store = Store(Path(out), sweep_of(json.loads(Path(spec).read_text())))
-left = int(last)
-
-def keep(outcome):
-    global left
-    store.keep(outcome)
-    left -= 1
-    if left == 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-run(store.missing, Backend(backend, address or None, int(jobs)), keep)
-"""
-
 LONG = 240
-"""Seconds that nothing here takes, on whatever machine."""
-
-Document = dict[str, Any]
+"""Seconds that no cluster takes, on whatever machine."""
 
 
-@pytest.fixture
-def document(tmp_path: Path) -> Document:
-    # In the file, not in the environment: workers that another test has started have that one's.
-    (tmp_path / "system.py").write_text(f"SPARED = {os.getpid()}\n{SYSTEM}")
-    fixed = {"system": f"{tmp_path / 'system.py'}:problem", "filter": "scbf", "episodes": 20}
-    return {
-        "fixed": fixed,
-        "grid": {"noise": [0.1, 0.3], "seed": [0, 1, 2]},
-        "cells": [{"barrier.kind": "fails"}],
-    }
+@dataclass(frozen=True)
+class Task:
+    """Computes a square: "ends" with the first process that computes it, "kills" every one."""
+
+    key: str
+    folder: Path = Path()
+    how: str = "plain"
+    spared: int = field(default_factory=os.getpid)
+
+    def compute(self) -> tuple[int, bool]:
+        marker = self.folder / "ended"
+        if self.how == "fails":
+            raise OSError("no such thing")
+        if self.how == "kills" or (self.how == "ends" and not marker.exists()):
+            marker.touch()
+            assert os.getpid() != self.spared
+            os.kill(os.getpid(), signal.SIGKILL)
+        watched = "end_with_parent" in {thread.name for thread in threading.enumerate()}
+        return int(self.key) ** 2, watched
 
 
-def killing(document: Document) -> Document:
-    """A cell that ends every process that computes it."""
-    return {"fixed": {**document["fixed"], "barrier.kind": "kills"}}
+def computed(tasks: Sequence[Job], place: Backend) -> dict[str, JobOutcome]:
+    outcomes: list[JobOutcome] = []
+    run(tasks, place, outcomes.append)
+    assert len(outcomes) == len(tasks)
+    return {outcome.key: outcome for outcome in outcomes}
 
 
-def with_end(document: Document) -> Document:
-    """The same, and a cell in front that ends the first process that computes it."""
-    return {**document, "grid": {"barrier.kind": ["ends", "plain"], **document["grid"]}}
+def mixed(folder: Path) -> list[Task]:
+    return [
+        Task(str(k), folder, {0: "ends", 4: "fails"}.get(k, "plain"), os.getpid()) for k in range(7)
+    ]
 
 
-def computed(document: Document, folder: Path, place: Backend) -> list[dict[str, Any]]:
-    store = Store(folder, sweep_of(document))
-    run(store.missing, place, store.keep)
-    return rows(folder)
+def require_squares(found: dict[str, JobOutcome]) -> None:
+    """Check that of `mixed` only the one that fails has no result."""
+    failed = found.pop("4")
+    assert "no such thing" in str(failed.error)
+    for key, outcome in found.items():
+        assert (outcome.error, outcome.result[0]) == (None, int(key) ** 2)
 
 
-def rows(folder: Path) -> list[dict[str, Any]]:
-    """What must be the same wherever it is computed."""
-    return read(folder).drop_columns(["seconds"]).to_pylist()
+def test_a_killed_worker_and_a_failing_job_cost_no_other(tmp_path: Path):
+    # A single job, too, has a process of its own, and each of these ends with this one.
+    (single,) = computed([Task("3", tmp_path, "ends")], Backend(jobs=2)).values()
+    assert single.result == (9, True)
+    (tmp_path / "ended").unlink()
+    require_squares(computed(mixed(tmp_path), Backend(jobs=2)))
+    assert (tmp_path / "ended").exists()
+    require_squares(computed(mixed(tmp_path), Backend(jobs=1)))
 
 
-def driver(
-    document: Document, folder: Path, place: Backend, last: int = -1
-) -> subprocess.CompletedProcess[str]:
-    spec = folder.with_suffix(".json")
-    spec.write_text(json.dumps(document))
-    words = [str(spec), str(folder), place.backend, place.address or "", str(place.jobs), str(last)]
-    return subprocess.run(
-        [sys.executable, "-c", DRIVER, *words],
-        capture_output=True,
-        text=True,
-        timeout=LONG,
-        check=False,
-    )
+JOBS = [Task(str(k)) for k in range(8)]
+ENDED = "the process that computed it ended: it went away"
 
 
-def local_answer(document: Document, folder: Path) -> list[dict[str, Any]]:
-    """In this process; what ends a process once has done so already."""
-    Path(document["fixed"]["system"].rpartition(":")[0]).with_suffix(".ended").touch()
-    return computed(document, folder, Backend(jobs=1))
+class Pretended:
+    """Two workers, which compute jobs in pairs, and end at the pairs that are said."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, ends: Callable[[set[int]], Any]) -> None:
+        self.given: list[int] = []
+        self.kept: dict[int, str | None] = {}
+        self._ends = ends
+        monkeypatch.setattr(executor, "_outcomes", self._outcomes)
+
+    def compute(self) -> None:
+        run(JOBS, Backend(), lambda outcome: self.kept.update({int(outcome.key): outcome.error}))
+
+    def _outcomes(self, jobs: Sequence[Job], *_: Any) -> Iterator[JobOutcome]:
+        self.given.append(len(jobs))
+        for k in range(0, len(jobs), 2):
+            pair = jobs[k : k + 2]
+            if self._ends({int(job.key) for job in pair}):
+                raise executor._LossError("it went away", jobs[: k + 2])
+            yield from (JobOutcome(job.key, None, None, 0.0) for job in pair)
+
+
+@pytest.mark.parametrize(
+    ("ends", "failed", "alone"),
+    [
+        *(
+            (killing.intersection, killing, None)
+            for killing in ({0, 1, 2}, {5, 6, 7}, {0, 2, 4, 6})
+        ),
+        # What is too much together is computed by itself; the others go on side by side.
+        ({2, 3}.issubset, set(), 2),
+        ({4}.intersection, {4}, 1),
+    ],
+)
+def test_jobs_that_end_every_worker_are_found_wherever_they_stand(
+    ends, failed, alone, monkeypatch: pytest.MonkeyPatch
+):
+    workers = Pretended(monkeypatch, ends)
+    workers.compute()
+    assert workers.kept == {k: ENDED if k in failed else None for k in range(8)}
+    assert alone in (None, workers.given.count(1))
+
+
+def test_workers_that_end_whatever_they_compute(monkeypatch: pytest.MonkeyPatch):
+    workers = Pretended(monkeypatch, lambda pair: True)
+    with pytest.raises(WorkersLostError, match="it went away"):
+        workers.compute()
+    # Some count as failed, so that the next run begins with others.
+    assert workers.kept == dict.fromkeys([0, 7, 1, 3, 5], ENDED)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragment"),
+    [
+        (("rai", "127.0.0.1:1"), "'ray'"),
+        (("dask",), "address"),
+        (("local", "127.0.0.1:1"), "address"),
+        (("local", None, 0), "jobs = 0"),
+    ],
+)
+def test_places_that_are_none(arguments: tuple[Any, ...], fragment: str):
+    with pytest.raises(ConfigurationError, match=fragment):
+        Backend(*arguments)
+
+
+def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(executor, "find_spec", lambda name: None if name == "distributed" else name)
+    with pytest.raises(ConfigurationError, match=r"distributed.*\.\[dask\]"):
+        Backend("dask", "tcp://127.0.0.1:1")
+
+
+@pytest.mark.parametrize(
+    ("backend", "address"),
+    [
+        *(("dask", x) for x in ("foo", "", "http://127.0.0.1:8786", "tcp://127.0.0.1:9")),
+        *(("ray", x) for x in ("auto", "ray://127.0.0.1:10001", ":6379", "127.0.0.1:9")),
+    ],
+)
+def test_addresses_where_nobody_answers(backend: str, address: str):
+    with pytest.raises(ConfigurationError, match=f"answers at {address} "):
+        run(JOBS, Backend(backend, address), print)
+
+
+class Scheduler:
+    """What a look at a scheduler finds, one look after the other."""
+
+    def __init__(self, *found: int | Exception) -> None:
+        self._found = list(found)
+
+    def nthreads(self) -> dict[str, int]:
+        """As of Dask's client."""
+        found = self._found.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return {"worker": 1} if found else {}
+
+
+def test_a_scheduler_that_has_lost_its_workers(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(clusters, "_LOOK", 0.001)
+    monkeypatch.setattr(clusters, "_MOST_LOOKS", 3)
+    told, raised, ended = [], [], threading.Event()
+
+    def give_up(error: Exception) -> None:
+        raised.append(error)
+        ended.set()
+
+    scheduler: Any = Scheduler(1, 0, OSError("busy"), 0, 1, 0, 0, 0)
+    clusters._watch(scheduler, "tcp://HOST:PORT", told.append, give_up, ended)
+    # Once each time that they went.
+    assert len(told) == 2
+    assert all("tcp://HOST:PORT has no workers" in each for each in told)
+    assert [type(each) for each in raised] == [ConfigurationError]
 
 
 @contextmanager
@@ -166,8 +236,8 @@ def wait_for(process: subprocess.Popen[bytes], log: Path, path: Path, text: str)
 
 @contextmanager
 def limited() -> Iterator[None]:
-    """What would wait for an answer that never comes ends, by what is no error that a sweep could
-    take for one of its workers."""
+    """What would wait for an answer that never comes ends, by what is no error that the runner
+    could take for one of its workers."""
 
     def stop(*_: Any) -> None:
         pytest.fail(f"no answer in {LONG} s")
@@ -188,79 +258,26 @@ def free_port() -> int:
         return found.getsockname()[1]
 
 
-def test_a_killed_worker_and_a_failing_cell_cost_no_other(tmp_path: Path, document: Document):
-    document = with_end(document)
-    # By itself, too, it has a process of its own; in a file of its own, as a process may remember
-    # the system that it has read.
-    (tmp_path / "alone.py").write_text((tmp_path / "system.py").read_text())
-    alone = {"system": f"{tmp_path / 'alone.py'}:problem", "barrier.kind": "ends"}
-    single = {"fixed": {**document["fixed"], **alone}}
-    assert [row["error"] for row in computed(single, tmp_path / "single", Backend(jobs=2))] == [
-        None
-    ]
-    assert (tmp_path / "alone.ended").exists()
-    found = computed(document, tmp_path / "two", Backend(jobs=2))
-    assert (tmp_path / "system.ended").exists()
-    *errors, last = [row["error"] for row in found]
-    assert errors == [None] * 12
-    assert "no such thing" in last
-    assert found == local_answer(document, tmp_path / "one")
-
-
-def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, document: Document):
-    folder = tmp_path / "out"
-    assert driver(document, folder, Backend(jobs=1), last=3).returncode == -signal.SIGKILL
-    before = {path: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
-    assert len(before) == 3
-    seen: list[str] = []
-    store = Store(folder, sweep_of(document))
-    run(
-        store.missing,
-        Backend(jobs=1),
-        lambda outcome: (seen.append(outcome.key), store.keep(outcome))[0],
-    )
-    assert len(seen) == 4
-    assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert rows(folder) == local_answer(document, tmp_path / "one")
-
-
-def test_the_processes_of_a_sweep_watch_their_parent():
-    with executor._settings(Backend(jobs=2), 3, print) as settings:
-        assert settings["n_jobs"] == 2
-        assert settings["backend"].backend_kwargs["initializer"] is end_with_parent
-        assert settings["backend"].backend_kwargs["initargs"] == (os.getpid(),)
-
-
 @pytest.mark.cluster
-def test_dask_with_a_killed_worker_and_with_none(
-    tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch
-):
-    document = with_end(document)
+def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     file, log = tmp_path / "scheduler.json", tmp_path / "log"
     common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
     scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", *common]
-    worker = [
-        sys.executable,
-        "-m",
-        "distributed.cli.dask_worker",
-        "--nthreads",
-        "1",
-        "--no-nanny",
-        *common,
-    ]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-nanny", *common]
+    worker += ["--nthreads", "1"]
     with started(scheduler, log=log) as (process,):
         place = Backend("dask", json.loads(wait_for(process, log, file, "\n}"))["address"])
+        killing = [Task("1", tmp_path, "kills")]
         with started(worker, worker, worker, log=tmp_path / "log-of-workers") as workers, limited():
-            found = computed(document, tmp_path / "dask", place)
+            require_squares(computed(mixed(tmp_path), place))
             assert sorted(process.poll() is None for process in workers) == [False, True, True]
             # Among others, and by itself.
-            (killed,) = computed(killing(document), tmp_path / "killed", place)
-            assert killed["error"].startswith("the process that computed it ended: KilledWorker")
+            error = computed(killing, place)["1"].error
+            assert str(error).startswith("the process that computed it ended: KilledWorker")
         monkeypatch.setattr(clusters, "_PATIENCE", 1)
         with pytest.raises(ConfigurationError, match="has no workers"):
-            computed(killing(document), tmp_path / "killed", place)
-    assert found == local_answer(document, tmp_path / "one")
+            computed(killing, place)
 
 
 @pytest.fixture
@@ -281,64 +298,25 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield Path(folder)
 
 
+def compute_on_ray(folder: str, address: str) -> None:
+    """Run in a process of its own, since Ray leaves much in the one that connects to it."""
+    clusters._RETRIES = 1
+    path = Path(folder)
+    found = computed([*mixed(path), Task("9", path, "kills")], Backend("ray", address))
+    error = found.pop("9").error
+    assert str(error).startswith("the process that computed it ended: ")
+    require_squares(found)
+
+
 @pytest.mark.cluster
-def test_ray_with_a_killed_worker(tmp_path: Path, document: Document, ray_folder: Path):
-    document = with_end(document)
-    log = tmp_path / "log"
-    where = [
-        "--head",
-        "--block",
-        "--node-ip-address=127.0.0.1",
-        "--port=0",
-        f"--ray-client-server-port={free_port()}",
-    ]
-    size = [
-        "--num-cpus=2",
-        "--object-store-memory=100000000",
-        "--include-dashboard=false",
-        "--disable-usage-stats",
-    ]
-    with started(
-        [sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log
-    ) as (process,):
+def test_ray_with_a_killed_worker(tmp_path: Path, ray_folder: Path):
+    log, words = tmp_path / "log", [sys.executable, "-m", "ray.scripts.scripts", "start", "--head"]
+    words += ["--block", "--node-ip-address=127.0.0.1", "--port=0", "--num-cpus=2"]
+    words += [f"--ray-client-server-port={free_port()}", "--object-store-memory=100000000"]
+    words += ["--include-dashboard=false", "--disable-usage-stats"]
+    with started(words, log=log) as (process,):
         wait_for(process, log, log, "Ray runtime started")
         address = wait_for(process, log, ray_folder / "ray" / "ray_current_cluster", ":").strip()
-        both = {**document, "cells": [*document["cells"], {"barrier.kind": "kills"}]}
-        ended = driver(both, tmp_path / "ray", Backend("ray", address))
-        assert ended.returncode == 0, ended.stderr
-    assert (tmp_path / "system.ended").exists()
-    *others, killed = rows(tmp_path / "ray")
-    assert killed["error"].startswith("the process that computed it ended: ")
-    assert others == local_answer(document, tmp_path / "one")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("rai", "127.0.0.1:1"), "did you mean 'ray'"),
-        (("dask",), "needs the address"),
-        (("local", "127.0.0.1:1"), "takes no address"),
-        (("local", None, 0), "give a whole number from 1"),
-    ],
-)
-def test_places_that_are_none(arguments: tuple[Any, ...], message: str):
-    with pytest.raises(ConfigurationError, match=message):
-        Backend(*arguments)
-
-
-def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(executor, "find_spec", lambda name: None if name == "distributed" else name)
-    with pytest.raises(ConfigurationError, match=r"distributed is not installed.*\.\[dask\]"):
-        Backend("dask", "tcp://127.0.0.1:1")
-
-
-def test_an_address_where_nobody_listens(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(clusters, "_PATIENCE", 1)
-    dask, ray = "tcp://127.0.0.1:9", "127.0.0.1:9"
-    with (
-        pytest.raises(ConfigurationError, match=f"answers at {dask}"),
-        clusters.dask_settings(dask, print),
-    ):
-        pass
-    with pytest.raises(ConfigurationError, match=f"answers at {ray}"), clusters.ray_settings(ray):
-        pass
+        code = f"import {__name__} as module\nmodule.compute_on_ray({str(tmp_path)!r}, {address!r})"
+        subprocess.run([sys.executable, "-c", code], timeout=LONG, check=True)
+    assert (tmp_path / "ended").exists()

@@ -19,107 +19,76 @@ from safe_envs.errors import ConfigurationError, InvalidInputError, WorkersLostE
 
 pytestmark = pytest.mark.slow
 
+ROOT = Path(__file__).parents[3]
 
-def test_the_answer_does_not_depend_on_the_number_of_processes():
+
+def test_the_answer_does_not_depend_on_the_number_of_processes(tmp_path):
     told = []
-    arguments = {
-        "filters": ["none", "scbf"],
-        "episodes": 30,
-        "num_envs": 3,
-        "monitoring": "continuous",
-    }
+    arguments = {"filters": ["none", "scbf"], "episodes": 30, "num_envs": 3}
+    arguments["monitoring"] = "continuous"
     one = evaluate("CubicSDEDisk-v0", "random", **arguments)
     two = evaluate("CubicSDEDisk-v0", "random", jobs=2, progress=told.append, **arguments)
-    assert one.rows == two.rows
-    assert one.comparisons == two.comparisons
-    assert one.config == two.config
+    assert (one.rows, one.comparisons, one.config) == (two.rows, two.comparisons, two.config)
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
-
-
-class _Stuck(Policy):
-    """Holds what no other process can have."""
-
-    def __init__(self) -> None:
-        self.generator = (i for i in range(3))
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        return observation[:, :1] * 0.0, state
-
-
-def test_functions_of_a_file_go_along(tmp_path):
+    # Functions of a file go along.
     place = tmp_path / "mine.py"
-    place.write_text((Path(__file__).parents[3] / "examples" / "pendulum_v1.py").read_text())
-    arguments = {
-        "filters": ["hocbf"],
-        "episodes": 4,
-        "bounds": False,
-        "filter_spec": f"{place}:spec",
-    }
-    assert (
-        evaluate("Pendulum-v1", jobs=2, **arguments).rows
-        == evaluate("Pendulum-v1", **arguments).rows
-    )
+    place.write_text((ROOT / "examples" / "pendulum_v1.py").read_text())
+    arguments = {"filters": ["hocbf"], "episodes": 4, "bounds": False}
+    arguments["filter_spec"] = f"{place}:spec"
+    one, two = (evaluate("Pendulum-v1", jobs=jobs, **arguments).rows for jobs in (1, 2))
+    assert one == two
 
 
-class _Failing(Policy):
-    """Fails in its own code, which is no question of processes."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        raise TypeError("of the policy's own")
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_of_a_policy_is_told_as_its_own(jobs):
-    with pytest.raises(
-        InvalidInputError, match=r"_Failing failed .*TypeError: of the policy's own"
-    ):
-        evaluate("Scalar-v0", _Failing(), filters=["none"], episodes=4, jobs=jobs)
-
-
-class _Watched(Policy):
-    """Fails in a process that would outlive the one that started it."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        assert "end_with_parent" in {thread.name for thread in threading.enumerate()}
-        return observation[:, :1] * 0.0, state
-
-
-def test_the_processes_of_an_evaluation_watch_their_parent():
-    assert evaluate(
-        "Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=2
-    ).rows
-    with pytest.raises(InvalidInputError, match="AssertionError"):
-        evaluate("Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=1)
-
-
-class _Ending(Policy):
-    """Ends its process, as the operating system does when memory runs out."""
+class Still(Policy):
+    """Does nothing, and more in another process."""
 
     def __init__(self) -> None:
         self.parent = os.getpid()
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         if os.getpid() != self.parent:
-            os.kill(os.getpid(), signal.SIGKILL)
+            self.elsewhere()
         return observation[:, :1] * 0.0, state
 
-
-def test_a_lost_process_is_told():
-    with pytest.raises(WorkersLostError, match="ended from outside"):
-        evaluate("Scalar-v0", _Ending(), filters=["none"], episodes=4, jobs=2)
+    def elsewhere(self):
+        assert "end_with_parent" in {thread.name for thread in threading.enumerate()}
 
 
-def test_what_cannot_be_sent_is_explained():
-    with pytest.raises(ConfigurationError, match="use jobs=1"):
-        evaluate("Scalar-v0", _Stuck(), filters=["none"], episodes=4, jobs=2)
+class Stuck(Still):
+    """Holds what no other process can have."""
+
+    def __init__(self) -> None:
+        self.generator = (i for i in range(3))
 
 
-def test_pictures_are_of_one_process():
-    with pytest.raises(ConfigurationError, match="leave jobs out"):
-        evaluate("Scalar-v0", episodes=4, jobs=2, record=True)
-    with pytest.raises(ConfigurationError, match="jobs = 0"):
-        evaluate("Scalar-v0", episodes=4, jobs=0)
+class Failing(Still):
+    """Fails in its own code, which is no question of processes."""
+
+    def elsewhere(self):
+        raise TypeError("of the policy's own")
+
+
+class Ending(Still):
+    """Ends its process, as the operating system does when memory runs out."""
+
+    def elsewhere(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("policy", "arguments", "error", "fragment"),
+    [
+        (Failing(), {"jobs": 2}, InvalidInputError, r"Failing.*TypeError: of the policy's own"),
+        (Ending(), {"jobs": 2}, WorkersLostError, "jobs = 2"),
+        (Stuck(), {"jobs": 2}, ConfigurationError, "jobs=1"),
+        ("zero", {"jobs": 2, "record": True}, ConfigurationError, "jobs"),
+        ("zero", {"jobs": 0}, ConfigurationError, "jobs = 0"),
+    ],
+)
+def test_what_ends_an_evaluation_is_told(policy, arguments, error, fragment):
+    with pytest.raises(error, match=fragment):
+        evaluate("Scalar-v0", policy, filters=["none"], episodes=4, **arguments)
 
 
 PARENT = """
@@ -147,13 +116,13 @@ if __name__ == "__main__":
 
 
 def test_workers_of_a_parent_that_was_killed_end(tmp_path):
+    evaluate("Scalar-v0", Still(), filters=["none"], episodes=4, bounds=False, jobs=2)
     script, folder = tmp_path / "parent.py", tmp_path / "workers"
     script.write_text(PARENT)
     folder.mkdir()
-    root = Path(__file__).parents[3]
     parent = subprocess.Popen(
         [sys.executable, str(script), str(folder)],
-        env={**os.environ, "PYTHONPATH": str(root)},
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
         start_new_session=True,
     )
     try:

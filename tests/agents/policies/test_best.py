@@ -21,6 +21,7 @@ from safe_envs.registry import make_problem
 from safe_envs.values.tables import ValueSettings
 from safe_envs.wrappers import FilterSpec
 from tests.agents.policies.coarse import COARSE, SHORT
+from tests.conftest import EVERY_ENV
 
 DISK = "StochasticDubins-v0"
 
@@ -46,13 +47,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(best, "LookAhead", Asked)
 
 
-@pytest.mark.parametrize(
-    "env_id",
-    [
-        *("DubinsDisk-v0", "DubinsObstacle-v0", "DubinsObstacles-v0", DISK, "Quadrotor-v0"),
-        *("QuadrotorAltitude-v0", "QuadrotorLimits-v0", "ACC-v0", "ACCGap-v0", "Pendulum-v0"),
-    ],
-)
+@pytest.mark.parametrize("env_id", [*EVERY_ENV, "safe_envs/DubinsObstacle-v0"])
 def test_states_are_read_off_observations(env_id):
     problem = make_problem(env_id)
     env = SafeVectorEnv(problem, 16)

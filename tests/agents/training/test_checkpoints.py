@@ -19,110 +19,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.trainer import train
+from tests.agents.training.small import SCALAR, evaluations, outcome, stopped, training
 from tests.oracles.full_disk import no_file_larger_than
 
 pytestmark = pytest.mark.slow
-
-DUBINS = "safe_envs/StochasticDubins-v0"
-SAC = {
-    "learning_starts": 16,
-    "batch_size": 16,
-    "train_freq": 4,
-    "gradient_steps": 1,
-    "policy_kwargs": {"net_arch": [8]},
-}
-PPO = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
-
-
-def training(algorithm="ppo", changes=None, **arguments):
-    """Two parts of a few steps; episodes of 10 steps do not end where they do."""
-    known = {"ppo": PPO, "ppo-lag": PPO, "a2c": {"policy_kwargs": {"net_arch": [8]}}}.get(
-        algorithm, SAC
-    )
-    given = {
-        "filter": "scbf",
-        "num_envs": 2,
-        "n_timesteps": 96,
-        "eval_freq": 32,
-        "eval_episodes": 2,
-        "options": {"horizon": 0.5},
-    }
-    return Training.of(DUBINS, algorithm, settings=known | (changes or {}), **given | arguments)
-
-
-def stopped(wanted, folder, steps=64):
-    """Train up to a checkpoint, and some steps more."""
-
-    def stop(part):
-        if part * wanted.n_timesteps > steps:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(wanted, folder, progress=stop)
-    (checkpoint,) = folder.glob("checkpoint_*")
-    return checkpoint
-
-
-def outcome(folder):
-    """All that a training leaves but for the clock."""
-    lines = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
-    logged = [{k: v for k, v in line.items() if not k.startswith("time/")} for line in lines]
-    return (
-        logged,
-        json.loads((folder / "evaluations.json").read_text()),
-        (folder / "policy.npz").read_bytes(),
-    )
-
-
-@pytest.mark.parametrize(
-    ("algorithm", "changes", "arguments"),
-    [
-        ("ppo", {"normalize": True}, {}),
-        ("ppo", {"normalize": {"norm_obs": False}, "stats_window_size": 3}, {"filter": None}),
-        ("a2c", {"use_sde": True}, {}),
-        ("sac", {"normalize": True}, {"action": "both", "intervention_penalty": 0.1}),
-        ("sac", {"n_steps": 3, "buffer_size": 40}, {}),
-        (
-            "sac",
-            {
-                "optimize_memory_usage": True,
-                "replay_buffer_kwargs": {"handle_timeout_termination": False},
-                "ent_coef": 0.1,
-            },
-            {"filter": None},
-        ),
-        (
-            "td3",
-            {
-                "noise_type": "ornstein-uhlenbeck",
-                "noise_std": 0.3,
-                "policy_kwargs": {"optimizer_kwargs": {"amsgrad": True}},
-            },
-            {},
-        ),
-        ("ppo-lag", {"normalize": True}, {"filter": None}),
-        ("ppo-lag", {"use_sde": True, "multiplier_smoothing": 0.5}, {"cost_limit": 0.5}),
-    ],
-    ids=[
-        "normalised",
-        "rewards-normalised",
-        "gsde",
-        "both-actions",
-        "n-step-full-buffer",
-        "small-memory",
-        "noise",
-        "violation-limit",
-        "cost-limit",
-    ],
-)
-def test_a_stopped_training_ends_as_one_that_was_not(algorithm, changes, arguments, tmp_path):
-    wanted = training(algorithm, changes, **arguments)
-    train(wanted, tmp_path / "whole")
-    stopped(wanted, tmp_path / "run")
-    train(wanted, tmp_path / "run", resume=True)
-    assert outcome(tmp_path / "run") == outcome(tmp_path / "whole")
 
 
 @pytest.fixture(scope="module")
@@ -194,20 +95,6 @@ def test_code_in_what_is_read_is_not_run(name, copied, trap):
     assert not trace.exists()
 
 
-def test_a_checkpoint_with_a_pickle_is_of_another_version(copied):
-    folder, checkpoint = copied
-    (checkpoint / "state.json").write_text('{"timesteps": 64, "counts": {}, "seconds": 1.0}')
-    with pytest.raises(ConfigurationError, match="written by another version"):
-        train(WHOLE, folder, resume=True)
-
-
-def test_a_state_that_is_a_list_is_refused_in_words(copied):
-    folder, checkpoint = copied
-    (checkpoint / "state.json").write_text("[]")
-    with pytest.raises(ConfigurationError, match=r"state.json holds no names with values"):
-        train(WHOLE, folder, resume=True)
-
-
 @pytest.mark.parametrize("name", READ)
 def test_files_that_are_not_there_or_endless_or_too_large_are_refused_before_they_are_read(
     name, copied
@@ -251,6 +138,18 @@ def test_an_altered_checkpoint_is_refused_or_a_checkpoint(data, run, tmp_path_fa
     shutil.rmtree(folder)
 
 
+@pytest.fixture(scope="module")
+def limited(tmp_path_factory):
+    """The folder of a finished training with a limit."""
+    folder = tmp_path_factory.mktemp("limited") / "run"
+    train(LIMITED, folder)
+    return folder
+
+
+LIMITED = training("ppo-lag", env_id=SCALAR, filter=None)
+MISSING = object()
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -263,18 +162,55 @@ def test_an_altered_checkpoint_is_refused_or_a_checkpoint(data, run, tmp_path_fa
         ("buffer", {"pos": 1, "full": False}),
         ("buffer", None),
         ("seconds", "long"),
+        ("format", 1),
+        (None, "[]"),
+        ("constraint", None),
+        ("constraint", MISSING),
+        ("constraint", {"ended": [0.0]}),
+        ("constraint", {"multiplier": {"value": 1.0}}),
     ],
 )
-def test_a_state_of_another_shape_is_refused(name, value, copied):
-    folder, checkpoint = copied
+def test_a_state_of_another_shape_is_refused(name, value, run, limited, tmp_path):
+    wanted, source = (LIMITED, limited) if name == "constraint" else (WHOLE, run)
+    folder = shutil.copytree(source, tmp_path / "copy")
+    (checkpoint,) = folder.glob("checkpoint_*")
     state = json.loads((checkpoint / "state.json").read_text())
-    (checkpoint / "state.json").write_text(json.dumps({**state, name: value}))
-    with pytest.raises(ConfigurationError, match="cannot be read"):
-        train(WHOLE, folder, resume=True)
+    if name == "constraint" and isinstance(value, dict):
+        value = state[name] | value
+    state |= {name: value}
+    if value is MISSING:
+        del state[name]
+    text = value if name is None else json.dumps(state)
+    (checkpoint / "state.json").write_text(text)
+    with pytest.raises(ConfigurationError, match=r"cannot be read|another version"):
+        train(wanted, folder, resume=True)
 
 
 @pytest.mark.parametrize(
-    "text", ["[1]", "[" * 20_000, '[{"timesteps": 32}]', "null", '[{"timesteps": "a"}]', "\udcff"]
+    "changes",
+    [
+        None,
+        [],
+        {"high": MISSING},
+        {"mean": "much"},
+        {"saturated": float("inf")},
+        {"met": 1},
+        {"kind": "speed"},
+    ],
+)
+def test_an_altered_judgement_is_refused(changes, limited, tmp_path):
+    folder = shutil.copytree(limited, tmp_path / "copy")
+    *rows, last = evaluations(folder)
+    altered = changes
+    if isinstance(changes, dict):
+        altered = {k: v for k, v in (last["constraint"] | changes).items() if v is not MISSING}
+    (folder / "evaluations.json").write_text(json.dumps([*rows, last | {"constraint": altered}]))
+    with pytest.raises(ConfigurationError, match=r"evaluations\.json"):
+        train(LIMITED, folder, resume=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["[1]", "[" * 20_000, '[{"timesteps": 32}]', "null", '[{"timesteps": NaN}]', "\udcff"]
 )
 @pytest.mark.parametrize("name", TEXTS)
 def test_texts_of_another_shape_are_refused(name, text, copied):

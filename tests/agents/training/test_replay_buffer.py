@@ -1,4 +1,4 @@
-"""Which action a learner behind a filter learns on."""
+"""Replay of executed actions: which action, reward and cost a learner behind a filter learns on."""
 
 from __future__ import annotations
 
@@ -13,20 +13,25 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from safe_envs import ConfigurationError
+from safe_envs.agents import make_sb3_env
 from safe_envs.agents.training.replay_buffer import (
     FilteredDictReplayBuffer,
     FilteredNStepReplayBuffer,
     FilteredReplayBuffer,
     replay_options,
 )
-from safe_envs.agents.training.sac_lagrangian import FilteredCostReplayBuffer
-from safe_envs.agents.training.vec_env import make_sb3_env
+from safe_envs.agents.training.sac_lagrangian import (
+    CostReplayBuffer,
+    FilteredCostReplayBuffer,
+    with_costs,
+)
 from safe_envs.plugins import load_object
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
@@ -107,9 +112,9 @@ def assert_same_learning(a, b):
 
 
 @pytest.mark.parametrize(
-    "make_envs", [lambda: several(1), several, native], ids=["one", "several", "native"]
+    ("algorithm", "make_envs"),
+    [(SAC, several), (SAC, native), (TD3, lambda: several(1)), (DDPG, native)],
 )
-@pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG])
 def test_executed_actions_are_stored_also_at_the_end_of_episodes(algorithm, make_envs):
     env = make_envs()
     noise = None if algorithm is SAC else NormalActionNoise(np.zeros(1), np.full(1, 0.5))
@@ -120,13 +125,10 @@ def test_executed_actions_are_stored_also_at_the_end_of_episodes(algorithm, make
     assert np.all(np.any(done & differs, axis=0))
     assert np.any(~done & differs)
     assert stored(model).tobytes() == executed.tobytes()
-
-
-def test_a_filter_that_does_nothing_changes_actions_by_rounding_only():
-    model, witness = learned(SAC, several(), **replay_options(several()))
-    proposed, free = witness.actions()[0], ~np.array(witness.intervened)
+    # Where the filter does nothing they are the proposals but for rounding.
+    free = ~np.array(witness.intervened)
     assert np.any(free)
-    np.testing.assert_allclose(stored(model)[free], proposed[free], rtol=0, atol=2e-7)
+    np.testing.assert_allclose(executed[free], proposed[free], rtol=0, atol=2e-7)
 
 
 def test_proposed_is_what_stable_baselines_stores():
@@ -153,13 +155,15 @@ def test_both_stores_each_step_with_either_action(count):
         assert rows[0::2].tobytes() == rows[1::2].tobytes()
 
 
-@pytest.mark.parametrize("action", ["executed", "proposed"])
-@pytest.mark.parametrize("algorithm", [SAC, TD3])
+@pytest.mark.parametrize(
+    ("algorithm", "action"), [(SAC, "executed"), (TD3, "proposed"), (SAC, "the class alone")]
+)
 def test_without_a_filter_nothing_changes(algorithm, action):
+    free, arguments = several(filtered=False), {"replay_buffer_class": FilteredReplayBuffer}
+    if action != "the class alone":
+        arguments = replay_options(free, action)
     plain, _ = learned(algorithm, several(filtered=False))
-    ours, _ = learned(
-        algorithm, several(filtered=False), **replay_options(several(filtered=False), action)
-    )
+    ours, _ = learned(algorithm, free, **arguments)
     assert type(ours.replay_buffer) is FilteredReplayBuffer
     assert_same_learning(plain, ours)
 
@@ -174,16 +178,12 @@ def test_n_step_returns():
     assert_same_learning(plain, ours)
 
 
-def test_memory_optimised_buffer():
+def test_small_memory_and_normalised_observations_and_rewards_leave_the_actions():
     options = replay_options(several())
+    model, witness = learned(SAC, VecNormalize(several()), **options)
+    assert stored(model).tobytes() == witness.actions()[1].tobytes()
     options["replay_buffer_kwargs"]["handle_timeout_termination"] = False
     model, witness = learned(SAC, several(), optimize_memory_usage=True, **options)
-    assert stored(model).tobytes() == witness.actions()[1].tobytes()
-
-
-def test_normalized_observations_and_rewards_leave_the_actions():
-    env = several()
-    model, witness = learned(SAC, VecNormalize(env), **replay_options(VecNormalize(env)))
     assert stored(model).tobytes() == witness.actions()[1].tobytes()
 
 
@@ -233,22 +233,18 @@ def test_a_file_of_plain_ppo_needs_nothing_of_this_package(tmp_path):
     assert not [key for key, content in pickles.items() if b"safe_envs" in content]
 
 
-@pytest.mark.parametrize("action", ["executed", "both"])
-def test_saving_and_loading(tmp_path, action):
-    model, _ = learned(SAC, several(), **replay_options(several(), action))
+def test_saving_and_loading(tmp_path):
+    model, _ = learned(SAC, several(), **replay_options(several(), "both"))
     model.save(tmp_path / "model.zip")
     model.save_replay_buffer(tmp_path / "buffer.pkl")
     again = SAC.load(tmp_path / "model.zip", env=several(), device="cpu")
     assert again.replay_buffer.size() == 0
-    assert again.replay_buffer.action == action
+    assert again.replay_buffer.action == "both"
     again.load_replay_buffer(tmp_path / "buffer.pkl")
     assert stored(again).tobytes() == stored(model).tobytes()
     before = again.replay_buffer.size()
     again.learn(30, callback=(witness := Witness()), reset_num_timesteps=False)
-    assert (
-        stored(again)[before :: 2 if action == "both" else 1].tobytes()
-        == witness.actions()[1].tobytes()
-    )
+    assert stored(again)[before::2].tobytes() == witness.actions()[1].tobytes()
 
 
 def buffer_of(envs=3, action="executed", kind=FilteredReplayBuffer, box=TWO_INPUTS, **arguments):
@@ -334,59 +330,39 @@ def test_options_of_a_problem_and_of_any_env_of_it():
         }
 
 
+BOXES = [(0.0, 4.0), ((0.0, 4.0),), ((0.0, 4.0), (5.0, -3.0)), ((0.0, 4.0), (0.0, np.inf))]
+SMALL = {"optimize_memory_usage": True, "handle_timeout_termination": False}
+
+
+def of_several_bounds():
+    return DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))])
+
+
 @pytest.mark.parametrize(
-    "box",
+    ("call", "fragment"),
     [
-        (0.0, 4.0),
-        ((0.0, 4.0),),
-        ((0.0, 4.0), (5.0, -3.0)),
-        ((0.0, 4.0), (0.0, np.inf)),
-        "box",
-        ((0,), (1, 2)),
+        *((lambda box=box: buffer_of(box=box), "box = ") for box in (*BOXES, "b", ((0,), (1, 2)))),
+        (lambda: buffer_of(action="excuted"), "'executed'"),
+        (lambda: buffer_of(action=None), "action = None"),
+        (lambda: buffer_of(action="both", **SMALL), "optimize_memory_usage"),
+        (lambda: buffer_of(action="both", kind=FilteredNStepReplayBuffer, n_steps=2), "n_steps"),
+        (lambda: replay_options(make(), n_steps=0), "n_steps = 0"),
+        *(
+            (lambda u=u: add(buffer_of(envs=1), [{"safe_action": np.array(u)}]), r"\[4.0, 5.0\]")
+            for u in ([4.1, 0.0], [2.0, -30.0], [np.nan, 0.0])
+        ),
+        (lambda: replay_options(gym.make("CartPole-v1")), "not one of this project's envs"),
+        (lambda: replay_options(DummyVecEnv([lambda: gym.make("CartPole-v1")])), "not one of"),
+        (lambda: replay_options(None), "not one of this project's envs"),
+        (
+            lambda: replay_options(of_several_bounds()),
+            r"\[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
+        ),
     ],
 )
-def test_boxes_that_do_not_fit(box):
-    with pytest.raises(ConfigurationError, match=r"box = .* for each of the 2 inputs"):
-        buffer_of(box=box)
-
-
-def test_actions_and_combinations_that_are_not_allowed():
-    with pytest.raises(
-        ConfigurationError,
-        match=(
-            r"action = 'excuted'; did you mean 'executed'\? \(allowed: executed, proposed, both\)"
-        ),
-    ):
-        buffer_of(action="excuted")
-    with pytest.raises(ConfigurationError, match="action = None; "):
-        buffer_of(action=None)
-    with pytest.raises(ConfigurationError, match="set optimize_memory_usage=False"):
-        buffer_of(action="both", optimize_memory_usage=True, handle_timeout_termination=False)
-    with pytest.raises(ConfigurationError, match="set n_steps=1"):
-        buffer_of(action="both", kind=FilteredNStepReplayBuffer, n_steps=2)
-    with pytest.raises(ConfigurationError, match="n_steps = 0; give a whole number from 1"):
-        replay_options(make(), n_steps=0)
-
-
-@pytest.mark.parametrize("executed", [[4.1, 0.0], [2.0, -30.0], [np.nan, 0.0]])
-def test_executed_actions_beyond_the_box(executed):
-    with pytest.raises(
-        ConfigurationError,
-        match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\];"
-        " give the input bounds of the env's problem",
-    ):
-        add(buffer_of(envs=1), [{"safe_action": np.array(executed)}])
-
-
-def test_envs_without_one_box():
-    for source in (gym.make("CartPole-v1"), DummyVecEnv([lambda: gym.make("CartPole-v1")]), None):
-        with pytest.raises(ConfigurationError, match="not one of this project's envs"):
-            replay_options(source)
-    with pytest.raises(
-        ConfigurationError,
-        match=r"different input bounds \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
-    ):
-        replay_options(DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))]))
+def test_what_does_not_fit_is_refused(call, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        call()
 
 
 def third_party():
@@ -398,11 +374,9 @@ def third_party():
 
 
 @pytest.mark.parametrize(
-    "make_envs",
-    [lambda: several(1), several, native, make, lambda: DummyVecEnv([third_party])],
-    ids=["one", "several", "native", "gym", "third party"],
+    ("algorithm", "make_envs"),
+    [(SAC, several), (SAC, native), (TD3, make), (DDPG, lambda: DummyVecEnv([third_party]))],
 )
-@pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG])
 def test_the_class_alone_stores_what_was_executed(algorithm, make_envs):
     """One argument; plain Stable-Baselines3 stores something else."""
     net = {"net_arch": [8]}
@@ -430,15 +404,6 @@ class Recording(FilteredReplayBuffer):
         self.proposals.append(action.copy())
         self.unit.append([(info["safe_action"] - center) / half for info in infos])
         super().add(obs, next_obs, action, reward, done, infos)
-
-
-def test_the_class_alone_learns_as_with_the_options():
-    alone, _ = learned(SAC, several(), replay_buffer_class=FilteredReplayBuffer)
-    options, _ = learned(SAC, several(), **replay_options(several()))
-    assert_same_learning(alone, options)
-    free, _ = learned(SAC, several(filtered=False), replay_buffer_class=FilteredReplayBuffer)
-    plain, _ = learned(SAC, several(filtered=False))
-    assert_same_learning(free, plain)
 
 
 class Halved(gym.ActionWrapper):
@@ -499,8 +464,7 @@ class Inputs(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize("options", [True, False], ids=["options", "class alone"])
-@pytest.mark.parametrize("saved_filtered", [True, False])
+@pytest.mark.parametrize(("options", "saved_filtered"), [(True, False), (False, True)])
 def test_the_env_of_a_learner_may_be_exchanged(tmp_path, options, saved_filtered):
     env = make(filtered=saved_filtered)
     arguments = replay_options(env) if options else {"replay_buffer_class": FilteredReplayBuffer}
@@ -583,3 +547,170 @@ def test_infos_of_vector_envs_of_gymnasium(kind, mode):
         ends, observation = ends + done.sum(), after
     assert ends >= 3
     assert intervened
+
+
+def test_each_env_gets_its_own_penalty_back():
+    given = {"safe_action": np.array([2.0, 1.0])}
+    batch = {"intervention_penalty": np.array([0.5, 1.0, 2.0]), "safe_action": np.full((3, 2), 1.0)}
+    for infos, own in (
+        ([{**given, "intervention_penalty": 0.5}, {}, given], [3.5, 3.0, 3.0]),
+        ([View(batch, k) for k in (0, 2, 1)], [3.5, 5.0, 4.0]),
+        ([View({}, k, **given, intervention_penalty=float(k)) for k in range(3)], [3.0, 4.0, 5.0]),
+        ([given] * 3, [3.0] * 3),
+    ):
+        buffer = buffer_of()
+        add(buffer, infos, rewards=[3.0] * 3)
+        assert buffer.rewards[0].tolist() == own
+
+
+def filled(penalty, action="executed", n_steps=1, kind=None):
+    """A buffer after episodes of random actions under a penalty on interventions, fed with native
+    infos or those of another kind."""
+    env = make_sb3_env(
+        ENV_ID, 3, "scbf", intervention_penalty=penalty, horizon=0.25, box=BOX, seed=0
+    )
+    options = replay_options(env, action, n_steps, gamma=0.9)
+    spaces = (env.observation_space, env.action_space)
+    buffer = options["replay_buffer_class"](
+        300, *spaces, device="cpu", n_envs=3, **options["replay_buffer_kwargs"]
+    )
+    last = env.reset()
+    for proposed in np.random.default_rng(0).uniform(-1.0, 1.0, (24, 3, 1)).astype(np.float32):
+        observations, rewards, dones, infos = env.step(proposed)
+        buffer.add(
+            last,
+            observations,
+            proposed,
+            rewards,
+            dones,
+            [kind(info) for info in infos] if kind else infos,
+        )
+        last = observations
+    return buffer
+
+
+@pytest.mark.parametrize("kind", [None, dict], ids=["native", "dicts"])
+def test_a_penalty_belongs_to_the_proposal(kind):
+    own, penalised, executed, both = (
+        buffer.rewards[: buffer.size()]
+        for buffer in (
+            filled(0.0),
+            filled(2.0, "proposed"),
+            filled(2.0, kind=kind),
+            filled(2.0, "both", kind=kind),
+        )
+    )
+    assert np.any(own - penalised > 0.1)
+    np.testing.assert_allclose(executed, own, rtol=1e-5, atol=1e-6)
+    assert both[0::2].tobytes() == executed.tobytes()
+    assert both[1::2].tobytes() == penalised.tobytes()
+
+
+@pytest.mark.parametrize("kind", [None, dict], ids=["native", "dicts"])
+def test_n_step_returns_of_executed_actions_are_without_the_penalty(kind):
+    def returns(buffer):
+        np.random.seed(0)  # noqa: NPY002  (of which Stable-Baselines3 samples)
+        return buffer.sample(200).rewards.numpy()
+
+    free, executed, proposed = (
+        returns(filled(c, action, 3, kind))
+        for c, action in ((0.0, "executed"), (2.0, "executed"), (2.0, "proposed"))
+    )
+    np.testing.assert_allclose(executed, free, rtol=1e-5, atol=1e-6)
+    assert np.any(free - proposed > 0.1)
+
+
+def test_penalties_pass_through_the_wrappers():
+    env = VecNormalize(
+        VecMonitor(make_sb3_env(ENV_ID, 3, "scbf", intervention_penalty=2.0, horizon=0.25, box=BOX))
+    )
+    model, _ = learned(SAC, env, **replay_options(env, "both"))
+    rewards = model.replay_buffer.rewards[: model.replay_buffer.size()]
+    distances = np.abs(stored(model)[0::2] - stored(model)[1::2])[..., 0]
+    assert np.any(distances > 0.1)
+    np.testing.assert_allclose(rewards[0::2] - rewards[1::2], 2.0 * distances, atol=1e-5)
+
+
+ONE_INPUT = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (1,)))
+
+
+def fill(buffer, steps, first=0):
+    """Add steps whose numbers tell step and env: 10 k + i."""
+    for k in range(first, first + steps):
+        number = 10.0 * k + np.arange(3)
+        observations = np.stack([number, number], axis=1)
+        infos = [
+            {"cost": n, "safe_action": np.array([4.0]), "nominal_action": np.array([1.0])}
+            for n in number.tolist()
+        ]
+        buffer.add(
+            observations,
+            observations + 0.5,
+            np.full((3, 1), -0.5, dtype=np.float32),
+            -number,
+            np.zeros(3, dtype=bool),
+            infos,
+        )
+    return buffer
+
+
+def plain(kind=CostReplayBuffer, rows=7, **arguments):
+    return kind(rows * 3, *ONE_INPUT, device="cpu", n_envs=3, **arguments)
+
+
+@pytest.mark.parametrize("steps", [5, 7, 12])
+@pytest.mark.parametrize("small", [False, True])
+def test_costs_are_those_of_the_sampled_steps(steps, small):
+    memory = {"optimize_memory_usage": True, "handle_timeout_termination": False} if small else {}
+    buffer = fill(plain(**memory), steps)
+    np.random.seed(4)  # noqa: NPY002
+    steps, costs = buffer.sample(200), buffer.last_sample().costs
+    assert buffer.last_sample().steps is steps
+    assert costs.shape == (200, 1)
+    np.testing.assert_array_equal(costs, -steps.rewards)
+    np.testing.assert_array_equal(costs[:, 0], steps.observations[:, 0])
+    assert len(set(costs.ravel().tolist())) > 3
+
+
+def test_it_draws_what_stable_baselines3_draws():
+    batches, left = [], []
+    for kind in (ReplayBuffer, CostReplayBuffer):
+        buffer = fill(plain(kind), 9)
+        np.random.seed(4)  # noqa: NPY002
+        batches.append([buffer.sample(16) for _ in range(3)])
+        left.append(np.random.random())  # noqa: NPY002
+    for theirs, ours in zip(*batches, strict=True):
+        for a, b in zip(theirs, ours, strict=True):
+            assert (a is None and b is None) or (a == b).all()
+    assert left[0] == left[1]
+
+
+@pytest.mark.parametrize(
+    ("action", "rows", "actions"),
+    [("executed", 1, [1.0]), ("proposed", 1, [-0.5]), ("both", 2, [1.0, -0.5])],
+)
+def test_a_filtered_step_has_its_cost_in_each_row(action, rows, actions):
+    buffer = fill(plain(FilteredCostReplayBuffer, box=((0.0, 4.0),), action=action), 2)
+    assert buffer.pos == 2 * rows
+    np.testing.assert_array_equal(
+        buffer.costs[: 2 * rows], np.repeat([[0, 1, 2], [10, 11, 12]], rows, axis=0)
+    )
+    np.testing.assert_array_equal(buffer.actions[:rows, 0, 0], actions)
+
+
+def test_classes_have_a_counterpart_with_costs():
+    assert with_costs(ReplayBuffer) is CostReplayBuffer
+    assert with_costs(FilteredReplayBuffer) is FilteredCostReplayBuffer
+    assert with_costs(FilteredCostReplayBuffer) is FilteredCostReplayBuffer
+    for kind in (NStepReplayBuffer, FilteredNStepReplayBuffer):
+        with pytest.raises(ConfigurationError, match="n_steps = 1"):
+            with_costs(kind)
+
+
+def test_a_step_without_cost_is_an_error_and_there_is_no_batch_before_the_first():
+    buffer = plain()
+    step = np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 1)), np.zeros(3)
+    with pytest.raises(ConfigurationError, match="cost"):
+        buffer.add(*step, np.zeros(3, dtype=bool), [{"cost": 0.0}, {}, {"cost": 1.0}])
+    with pytest.raises(ConfigurationError, match="sample"):
+        buffer.last_sample()

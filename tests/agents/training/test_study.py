@@ -1,26 +1,37 @@
-"""Studies: independent seeds, common episodes, and nothing done twice or otherwise after a stop."""
+"""Studies: independent seeds, common episodes, and nothing done twice or otherwise after a stop;
+files that describe them; interquartile means and bootstrap intervals over seeds."""
 
 from __future__ import annotations
 
+import itertools
+import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
+from scipy.stats import binom, trim_mean
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.jobs.executor import Backend
 from safe_envs.agents.training import study as study_module
-from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.study import (
-    Planned,
     Study,
     StudyResult,
+    StudyRow,
     Variant,
+    caution,
+    differences,
     evaluation_seed,
+    interquartile_mean,
+    over_seeds,
+    read_study,
     run_study,
+    shipped_studies,
+    summaries,
     training_seed,
 )
 from safe_envs.agents.training.trainer import train
@@ -48,6 +59,10 @@ def study(**changes):
     return Study((SCALAR,), VARIANTS, **given | changes)
 
 
+def timeless(rows):
+    return [replace(row, seconds=None) for row in rows]
+
+
 def test_seeds_of_trainings_and_evaluations_are_all_different_and_of_one_seed():
     ids = ("safe_envs/Scalar-v0", "safe_envs/ACC-v0")
     seeds = [f(s, e, k) for f in (training_seed, evaluation_seed) for s in (0, 1) for e in ids
@@ -69,31 +84,26 @@ def test_seeds_of_trainings_and_evaluations_are_all_different_and_of_one_seed():
     assert not episodes[0] & episodes[1]
 
 
-def test_a_result_is_of_the_files_that_its_filter_and_its_policy_had(tmp_path):
-    table, policy = tmp_path / "table.npz", tmp_path / "policy.zip"
-    text = f"promise:p=0.9:table={table}"
-    given = {"env_id": SCALAR, "variant": "a", "k": 0, "options": {}, "knowledge": "plant"}
-    given |= {"episodes": 9, "seed": 0, "versions": {}}
+def test_a_result_is_of_the_file_that_its_policy_had(tmp_path):
+    place = tmp_path / "mine.py"
+    few = replace(study(seeds=1), variants=(Variant("a", policy=f"{place}:law"),))
+    found = []
+    for law in ("0 * x", "0 * x", "1 + 0 * x"):
+        place.write_text(f"def law(x):\n    return {law}")
+        found.append(run_study(few, tmp_path / "out", ALONE).rows)
+    assert found[0] == found[1]
+    assert len(list((tmp_path / "out" / "results").iterdir())) == 2
 
-    def found():
-        training = Training.of(SCALAR, "ppo", filter=text)
-        parts = ((None, policy, "none"), (None, "nominal", text), (training, "nominal", "none"))
-        return [
-            Planned(training=training, policy=str(policy), filter=text, **given)
-            for training, policy, text in parts
-        ]
 
-    table.write_bytes(b"1")
-    policy.write_bytes(b"1")
-    first = found()
-    assert [each.key for each in found()] == [each.key for each in first]
-    agent = first[2].agent
-    table.write_bytes(b"2")
-    policy.write_bytes(b"2")
-    second = found()
-    assert not {each.key for each in first} & {each.key for each in second}
-    # An agent that learned behind another table is another agent.
-    assert second[2].agent != agent
+@pytest.mark.slow
+def test_an_agent_that_learned_behind_another_file_is_another_agent(tmp_path):
+    place = tmp_path / "mine.py"
+    own = {**SMALL, "n_timesteps": 64, "eval_freq": 64, "filter": f"{place}:Law"}
+    few = replace(study(seeds=1, training=own), variants=(Variant("a", "ppo"),))
+    for gain in (1, 2):
+        place.write_text(f"from safe_envs.wrappers import CBF\nclass Law(CBF):\n    gain = {gain}")
+        assert run_study(few, tmp_path / "out", ALONE).missing == {}
+    assert len(list((tmp_path / "out" / "agents" / "Scalar-v0").iterdir())) == 2
 
 
 @pytest.mark.slow
@@ -151,7 +161,8 @@ def test_variants_share_agents_and_episodes_and_nothing_is_done_twice(tmp_path, 
 
 @pytest.mark.slow
 def test_an_interrupted_study_ends_as_an_uninterrupted_one(tmp_path, monkeypatch):
-    whole = run_study(study(), tmp_path / "whole", ALONE)
+    few = replace(study(seeds=1), variants=VARIANTS[1:])
+    whole = run_study(few, tmp_path / "whole", ALONE)
     calls = []
 
     def stop(part):
@@ -165,36 +176,22 @@ def test_an_interrupted_study_ends_as_an_uninterrupted_one(tmp_path, monkeypatch
 
     monkeypatch.setattr("safe_envs.agents.training.trainer.train", stopped)
     with pytest.raises(KeyboardInterrupt):
-        run_study(study(), tmp_path / "part", ALONE)
+        run_study(few, tmp_path / "part", ALONE)
     assert len(calls) == 2
     assert [path.name for path in calls[1].glob("checkpoint_*")] == [f"checkpoint_{128:012d}"]
     monkeypatch.setattr("safe_envs.agents.training.trainer.train", train)
-    resumed = run_study(study(), tmp_path / "part", ALONE)
-    assert [replace(row, seconds=None) for row in resumed.rows] == [
-        replace(row, seconds=None) for row in whole.rows
-    ]
-
-
-def require_same_in_processes(variants, folder):
-    """Check that two processes find what one finds."""
-    few = replace(study(), variants=variants)
-    alone = run_study(few, folder / "one", ALONE)
-    together = run_study(few, folder / "two", Backend(jobs=2))
-    assert [replace(row, seconds=None) for row in alone.rows] == [
-        replace(row, seconds=None) for row in together.rows
-    ]
-    assert len(alone.rows) == 2 * len(variants)
-
-
-@pytest.mark.slow
-def test_processes_give_what_one_process_gives(tmp_path):
-    require_same_in_processes(VARIANTS[:1], tmp_path)
+    resumed = run_study(few, tmp_path / "part", ALONE)
+    assert timeless(resumed.rows) == timeless(whole.rows)
 
 
 @pytest.mark.oracle
 def test_trainings_in_processes_are_those_of_one_process(tmp_path):
     # Every process imports torch, which takes longer than the trainings.
-    require_same_in_processes(VARIANTS[:3], tmp_path)
+    few = replace(study(), variants=VARIANTS[:3])
+    alone = run_study(few, tmp_path / "one", ALONE)
+    together = run_study(few, tmp_path / "two", Backend(jobs=2))
+    assert timeless(alone.rows) == timeless(together.rows)
+    assert len(alone.rows) == 6
 
 
 @pytest.mark.slow
@@ -215,6 +212,13 @@ def test_a_damaged_result_is_an_error_that_names_the_file(tmp_path):
     path = next((tmp_path / "results").iterdir())
     path.write_text(path.read_text().replace('"safe": ', '"safe": 1'))
     with pytest.raises(ConfigurationError, match="checksum"):
+        run_study(few, tmp_path, ALONE)
+    # Under the right checksum, but of another type.
+    document = json.loads(path.read_text())
+    document["row"]["safe"] = "all"
+    store = study_module.ResultStore(path.parent)
+    store.keep(path.stem, document["configuration"], {"row": document["row"]})
+    with pytest.raises(ConfigurationError, match="safe is 'all'"):
         run_study(few, tmp_path, ALONE)
     shutil.rmtree(tmp_path / "results")
     (tmp_path / "results").write_text("a file")
@@ -247,7 +251,7 @@ def test_a_return_that_is_no_number_stops_no_other_evaluation(tmp_path, monkeypa
         row = replace(result.rows[0], return_mean=float("nan"))
         return replace(result, rows=(row,)) if policy == "zero" else result
 
-    monkeypatch.setattr(study, "evaluate", found)
+    monkeypatch.setattr(study_module, "evaluate", found)
     few = replace(study(seeds=1), variants=(Variant("a", policy="zero"), Variant("b")))
     result = run_study(few, tmp_path, ALONE)
     assert [row.variant for row in result.rows] == ["b"]
@@ -255,14 +259,290 @@ def test_a_return_that_is_no_number_stops_no_other_evaluation(tmp_path, monkeypa
 
 
 def test_wrong_numbers_and_equal_names_are_errors():
-    with pytest.raises(ConfigurationError, match="seeds = 0"):
-        study(seeds=0)
-    with pytest.raises(ConfigurationError, match="one name"):
-        replace(study(), variants=(Variant("a"), Variant("a", "ppo")))
-    with pytest.raises(ConfigurationError, match="did you mean"):
-        Study(("Scaler-v0",), VARIANTS)
+    for call, fragment in (
+        (lambda: study(seeds=0), "seeds = 0"),
+        (lambda: replace(study(), variants=(Variant("a"), Variant("a", "ppo"))), "one name"),
+        (lambda: Study(("Scaler-v0",), VARIANTS), "Scaler-v0"),
+    ):
+        with pytest.raises(ConfigurationError, match=fragment):
+            call()
 
 
-def test_a_row_of_another_type_is_refused():
-    with pytest.raises(TypeError, match="env_id is 1"):
-        study.StudyRow(1, *[None] * 17)
+ONE = {"name": "one", "algorithm": "ppo", "filters": ["default", "none"]}
+TWO = {"name": "two", "algorithm": "sac", "training": {"filter": "default", "action": "both"}}
+
+BOMB = "a0: &a0 [1, 1]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 30)
+)
+
+MERGES = "a0: &a0 {name: a}\n" + "".join(
+    f"a{k}: &a{k}\n  <<: [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 30)
+)
+
+
+def written(path, *variants, **more):
+    path.write_text(yaml.safe_dump({"variants": list(variants), **more}))
+    return str(path)
+
+
+def test_every_shipped_study_can_be_planned():
+    assert "filters-in-training" in shipped_studies()
+    for name in shipped_studies():
+        found = read_study(name)
+        study = Study([SCALAR], found.variants, seeds=1, episodes=found.episodes)
+        assert len(study.variants) >= len(found.agents) > 1
+
+
+def test_a_file_of_ones_own(tmp_path):
+    found = read_study(written(tmp_path / "s.yml", ONE, TWO, {"name": "nominal"}, episodes=7))
+    assert found.episodes == 7
+    assert [agent.name for agent in found.agents] == ["one", "two", "nominal"]
+    one, alone, two, nominal = found.variants
+    assert (one.algorithm, one.filter, alone.filter) == ("ppo", "default", "none")
+    assert dict(two.training) == TWO["training"]
+    assert two.filter == "none"
+    assert (nominal.algorithm, nominal.policy) == (None, "nominal")
+    quick = found.shortened({"n_timesteps": 10})
+    assert dict(quick[2].training) == {**TWO["training"], "n_timesteps": 10}
+    assert dict(quick[3].training) == {}
+    with pytest.raises(ConfigurationError, match="one"):
+        found.require_agent("ones")
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"name": 3}, "name = 3"),
+        ({"name": "two\nlines"}, "printable"),
+        ({"name": "red \x1b[31m"}, "printable"),
+        ({"name": "a | b"}, "printable"),
+        ({"name": "a" * 81}, "printable"),
+        ({"algorithm": None, "policy": "law.py:law"}, "runs none"),
+        ({"algorithm": None, "policy": "os:abort"}, "runs none"),
+        ({"filters": ["law.py:Condition"]}, "runs none"),
+        ({"filters": ["cbf+os:abort"]}, "runs none"),
+        ({"training": {"filter": "./a+b/law.py:Condition"}}, "runs none"),
+        ({"training": {"filter": ["scbf"]}}, "filter"),
+        ({"training": {"settings": [1]}}, "settings"),
+        ({"training": {"settings": "gamma"}}, "settings"),
+        ({"algorithm": "pop"}, "ppo"),
+        ({"algorithm": None, "training": {"filter": "scbf"}}, "no algorithm"),
+        ({"policy": ["a"]}, "policy"),
+        ({"training": {"fliter": "scbf"}}, "filter"),
+        ({"training": {"seed": 1}}, "seed"),
+        ({"training": {"knowledge": "plant"}}, "knowledge"),
+        ({"training": [1]}, "training"),
+        ({"filters": "scbf"}, "filters"),
+        ({"filters": []}, "filters"),
+        ({"penalty": 1.0}, "penalty"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_told(tmp_path, changes, word):
+    given = written(tmp_path / "s.yml", {**ONE, **changes})
+    with pytest.raises(ConfigurationError, match=word):
+        read_study(given)
+
+
+def test_files_that_are_no_studies(tmp_path):
+    for text, word in (
+        ("variants: [", "YAML"),
+        ("- 1", "names with values"),
+        ("variants: 3", "list of variants"),
+        ("variants: []\nepisodes: 0", "list of variants"),
+        ("episodes: 0\nvariants: [{name: a}]", "episodes"),
+        ("variants: [{name: a}, {name: a}]", "one name"),
+        ("runs: 3", "runs"),
+        (BOMB, "values"),
+        (MERGES, "values"),
+        (f"{MERGES}? {{<<: *a29}}\n: 1", "values"),
+        (f"variants: &a [{'1, ' * 9000}*a]", "values"),
+        ("variants: [{name: a}]\nvariants: [{name: b}]", "'variants' twice"),
+        ("episodes: 2026-13-45", "YAML"),
+        (f"episodes: {'9' * 5000}", "YAML"),
+        (f"episodes: {'1:' * 300}1.0", "YAML"),
+        ("episodes: !!int many", "YAML"),
+        ("episodes: !!timestamp now", "YAML"),
+        ("!!python/object/apply:os.getcwd []", "YAML"),
+    ):
+        (tmp_path / "s.yml").write_text(text)
+        with pytest.raises(ConfigurationError, match=word):
+            read_study(str(tmp_path / "s.yml"))
+    with pytest.raises(ConfigurationError, match="filters-in-training"):
+        read_study("filters-in-trainings")
+
+
+def row_of(variant, k, filter_text, **values):
+    given = {"safety_rate": 0.5, "return_mean": 1.0, "intervention_rate": None, "violations": None}
+    return StudyRow(
+        env_id=SCALAR,
+        variant=variant,
+        k=k,
+        policy="p",
+        filter=filter_text,
+        in_loop="none",
+        training_seed=None,
+        evaluation_seed=k,
+        episodes=10,
+        safe=5,
+        ci_low=0.0,
+        ci_high=1.0,
+        infeasible_rate=None,
+        seconds=2.0,
+        **{**given, **values},
+    )
+
+
+def test_statistics_of_agents_and_of_their_differences(tmp_path):
+    read = read_study(written(tmp_path / "s.yml", ONE, {**ONE, "name": "two"}))
+    returns = {"one": [1.0, 2.0, 4.0, 8.0, 16.0], "two": [3.0, 3.0, 3.0, 9.0, 18.0]}
+    rows = []
+    for name, values in returns.items():
+        for k, value in enumerate(values):
+            rows.append(row_of(f"{name} | default", k, "scbf", return_mean=value, violations=k))
+            rows.append(
+                row_of(f"{name} | none", k, "none", return_mean=-value, safety_rate=0.1 * k)
+            )
+    study = Study([SCALAR], read.variants)
+    found = StudyResult(study, rows, {})
+    one, two = summaries(found, read.agents, SCALAR)
+    assert (one.name, one.filter) == ("one", "scbf")
+    assert one.estimates["returns"] == over_seeds([returns["one"]])
+    assert one.estimates["returns_alone"] == over_seeds([[-v for v in returns["one"]]])
+    assert one.estimates["safety_alone"].value == pytest.approx(0.2)
+    assert one.estimates["violations"].value == 2.0
+    assert one.estimates["interventions"] is None
+    assert two.estimates["seconds"].value == 2.0
+    (less,) = differences(found, read.agents, SCALAR, "one")
+    assert less.name == "two"
+    paired = np.subtract(returns["two"], returns["one"])  # 2, 1, -1, 1, 2
+    assert less.estimates["returns"] == over_seeds([paired.tolist()])
+    assert less.estimates["violations"].value == 0.0
+    # A training that failed has no partner.
+    fewer = StudyResult(study, [r for r in rows if (r.variant, r.k) != ("two | default", 2)], {})
+    (less,) = differences(fewer, read.agents, SCALAR, "one")
+    assert less.estimates["returns"].seeds == 4
+    assert summaries(StudyResult(study, [], {}), read.agents, SCALAR) == []
+
+
+def test_agents_are_told_without_a_filter_that_their_env_has_not(tmp_path):
+    given = {**ONE, "filters": ["default", "promise:p=0.9", "none"]}
+    read = read_study(written(tmp_path / "s.yml", given))
+    rows = [row_of("one | default", 0, "scbf", violations=3), row_of("one | none", 0, "none")]
+    first, second = summaries(
+        StudyResult(Study([SCALAR], read.variants), rows, {}), read.agents, SCALAR
+    )
+    assert (first.filter, second.filter) == ("scbf", "promise:p=0.9")
+    assert second.estimates["safety"] is None
+    for each in (first, second):
+        # Those of the agents, whatever filter they are evaluated with.
+        assert each.estimates["violations"].value == 3.0
+        assert each.estimates["safety_alone"].value == 0.5
+    assert summaries(StudyResult(Study([SCALAR], read.variants), [], {}), read.agents, SCALAR) == []
+
+
+@pytest.mark.parametrize("count", range(1, 15))
+def test_the_interquartile_mean_is_scipys_trimmed_mean(count):
+    values = np.random.default_rng(count).normal(size=(6, count))
+    expected = trim_mean(values, 0.25, axis=-1)
+    np.testing.assert_allclose(interquartile_mean(values), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.95, 0.99])
+def test_one_env_is_the_enumeration_of_all_draws(count, confidence):
+    values = np.random.default_rng(count).normal(size=count)
+    draws = np.array(list(itertools.product(values, repeat=count)))
+    means = np.sort(trim_mean(draws, 0.25, axis=-1))
+    # The smallest value up to which a share of at least `tail` of the draws lies, and its mirror
+    # image.
+    tail = (1 - confidence) / 2
+    place = next(k for k in range(len(means)) if (k + 1) / len(means) >= tail - 1e-12)
+    found = over_seeds([values], confidence)
+    assert found.low == pytest.approx(means[place], abs=1e-14)
+    assert found.high == pytest.approx(means[::-1][place], abs=1e-14)
+    assert found.value == pytest.approx(trim_mean(values, 0.25))
+    assert found.seeds == count
+
+
+def test_two_different_values_give_the_binomial_distribution():
+    # Of five draws from {0, 0, 1, 1, 1}, k are 1: the middle three have clip(k - 1, 0, 3) ones.
+    shares = np.array([binom.pmf(k, 5, 0.6) for k in range(6)])
+    means = np.clip(np.arange(6) - 1, 0, 3) / 3
+    for confidence in (0.5, 0.8, 0.95):
+        tail = (1 - confidence) / 2
+        low = means[np.searchsorted(np.cumsum(shares), tail)]
+        high = means[::-1][np.searchsorted(np.cumsum(shares[::-1]), tail)]
+        found = over_seeds([[1, 0, 1, 0, 1]], confidence)
+        assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+
+
+def test_several_envs_are_drawn_within_each():
+    # Every draw from two constant envs is the same, whatever the envs.
+    found = over_seeds([[1.0] * 5, [3.0] * 5])
+    assert (found.value, found.low, found.high) == (2.0, 2.0, 2.0)
+    # All draws of 3 of 3 in two envs, in comparison with those that are sampled.
+    values = np.array([[0.1, 0.5, 0.8], [0.3, 0.35, 0.9]])
+    of_env = [list(itertools.product(row, repeat=3)) for row in values]
+    draws = np.array([a + b for a, b in itertools.product(*of_env)])
+    means = np.sort(trim_mean(draws, 0.25, axis=-1))
+    found = over_seeds(values.tolist(), 0.9)
+    for end, tail in ((found.low, 0.05), (found.high, 0.95)):
+        # Within three standard deviations of the number of draws below the end.
+        error = 3 * np.sqrt(0.05 * 0.95 / 20_000)
+        below, up_to = (means < end - 1e-12).mean(), (means <= end + 1e-12).mean()
+        assert below - error <= tail <= up_to + error
+    assert over_seeds(values.tolist(), 0.9) == found
+    assert over_seeds(values.tolist(), 0.9, seed=1).value == found.value
+
+
+def test_the_order_of_seeds_and_the_sign_do_not_matter():
+    values = [0.2, 0.7, 0.1, 0.9, 0.4]
+    found, mirrored = over_seeds([values]), over_seeds([[-v for v in values]])
+    assert over_seeds([values[::-1]]) == found
+    assert (mirrored.low, mirrored.high) == (-found.high, -found.low)
+    assert found.low <= found.value <= found.high
+
+
+def test_nothing_and_what_is_not_finite_are_errors():
+    for strata in ([], [[]], [[1.0], []], [[1.0, float("nan")]], [[float("inf")]]):
+        with pytest.raises(ConfigurationError, match="at least one number"):
+            over_seeds(strata)
+    with pytest.raises(ConfigurationError, match="confidence"):
+        over_seeds([[1.0]], 1.0)
+
+
+def coverage(draw, truth, count, trials, seed=0):
+    """Return how often the 95 % interval of so many values holds the truth."""
+    rng = np.random.default_rng(seed)
+    found = [over_seeds([draw(rng, count)]) for _ in range(trials)]
+    return np.mean([each.low <= truth <= each.high for each in found])
+
+
+def normal(rng, count):
+    return rng.normal(size=count)
+
+
+def test_intervals_of_few_seeds_hold_less_often_than_they_say():
+    # Of three values it is from the least to the largest, as (1/3)^3 > 2.5 %: both are on one side
+    # of the median with probability 2/2^3.
+    three, five = (coverage(normal, 0.0, count, 1000) for count in (3, 5))
+    assert three == pytest.approx(0.75, abs=4 * np.sqrt(0.75 * 0.25 / 1000))
+    assert three < five < 0.95
+
+
+def test_intervals_of_few_seeds_come_with_what_they_are_worth():
+    assert "no length" in caution(1)
+    assert over_seeds([[0.3]]).low == over_seeds([[0.3]]).high
+    assert "over 3 seeds holds the true value in 75 %" in caution(3)
+    assert caution(20) == ""
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize(
+    ("count", "rate"), [(2, 0.5), (3, 0.75), (4, 0.877), (5, 0.906), (8, 0.935)]
+)
+def test_how_often_the_interval_holds(count, rate):
+    # The guide names the number for five seeds, and the notes of tables those up to five.
+    assert count > 5 or f"in {round(100 * rate)} %" in caution(count)
+    found = coverage(normal, 0.0, count, 20_000, seed=1)
+    assert found == pytest.approx(rate, abs=4 * np.sqrt(rate * (1 - rate) / 20_000) + 5e-4)

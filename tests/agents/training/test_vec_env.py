@@ -1,22 +1,29 @@
-"""The native VecEnv does what DummyVecEnv does over the scalar envs."""
+"""The native VecEnv does what DummyVecEnv does over the scalar envs, and infos are made as far as
+they are read."""
 
 from __future__ import annotations
 
+import copy
+import json
+import pickle
 import sys
 from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecMonitor,
+    VecNormalize,
+    VecVideoRecorder,
+)
 
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
-from safe_envs.engine.program import Program
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
-from tests.wrappers.value.guesses import SCALAR, guess
 
 pytestmark = pytest.mark.slow
 
@@ -84,71 +91,40 @@ def test_equals_dummy_vec_env(env_id, filtered):
     assert sum(dones.sum() for dones, _ in shown) >= 2 * NUM_ENVS
 
 
-def test_equals_dummy_vec_env_when_episodes_end_at_different_steps():
-    ours, theirs = pair("safe_envs/Scalar-v0", "scbf", noise=6.0, horizon=0.3)
-    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
-    ends = [
-        info["TimeLimit.truncated"]
+def ends_of(shown):
+    return [
+        (info["TimeLimit.truncated"], info["violation"])
         for dones, infos in shown
         for done, info in zip(dones, infos, strict=True)
         if done
     ]
-    assert {True, False} == set(ends)
+
+
+SCALAR_ID = "safe_envs/Scalar-v0"
+EARLY = {"start": [0.8], "noise": 1.0, "horizon": 0.1, "terminate_on_violation": True}
+
+
+@pytest.mark.parametrize(
+    ("filter_text", "options", "wanted"),
+    [
+        ("scbf", {"noise": 6.0, "horizon": 0.3}, {True, False}),
+        (None, EARLY, {(True, False), (False, True)}),
+        ("scbf", EARLY, {(True, False), (False, True)}),
+    ],
+)
+def test_equals_dummy_vec_env_when_episodes_end_at_different_steps(filter_text, options, wanted):
+    ours, theirs = pair(SCALAR_ID, filter_text, **options)
+    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
+    found = ends_of(shown)
+    assert {(end if "start" in options else end[0]) for end in found} == wanted
     assert any(dones.any() and not dones.all() for dones, _ in shown)
-
-
-@pytest.mark.parametrize("filter_text", [None, "scbf"])
-def test_equals_dummy_vec_env_when_violations_end_episodes(filter_text):
-    ours, theirs = pair(
-        "safe_envs/Scalar-v0",
-        filter_text,
-        start=[0.8],
-        noise=1.0,
-        horizon=0.1,
-        terminate_on_violation=True,
-    )
-    shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
-    ends = [
-        (info["TimeLimit.truncated"], info["violation"], info["cost"])
-        for dones, infos in shown
-        for done, info in zip(dones, infos, strict=True)
-        if done
-    ]
-    assert {(True, False, 0.0), (False, True, 1.0)} == set(ends)
-    assert not any(
-        info["violation"]
-        for dones, infos in shown
-        for done, info in zip(dones, infos, strict=True)
-        if not done
-    )
 
 
 def test_an_end_in_the_last_control_period_is_no_truncation():
     dt = problem_of(DUBINS).dt
     ours, theirs = pair(DUBINS, None, start=[6.0, 0.0, 0.0], noise=0.0, horizon=dt)
-    ((dones, infos),) = assert_same_steps(ours, theirs, drawn_actions(ours, 1))
-    assert dones.all()
-    assert not any(info["TimeLimit.truncated"] for info in infos)
-
-
-def test_infos_of_an_end_are_those_of_the_episode():
-    env = make_sb3_env(DUBINS, 4, "scbf", seed=0, max_episode_steps=5)
-    env.reset()
-    resets = list(env.reset_infos)
-    for action in drawn_actions(env, 5):
-        observations, _, dones, infos = env.step(action)
-    assert dones.all()
-    # Before the first step nothing was proposed: that info must not stand in for the last one.
-    assert all(
-        info["nominal_action"] == 10.0 * a
-        for info, a in zip(infos, action[:, 0].astype(float), strict=True)
-    )
-    assert all(info["nominal_action"] == 0.0 for info in env.reset_infos)
-    assert all(a is not b for a, b in zip(resets, env.reset_infos, strict=True))
-    assert all(
-        not np.array_equal(info["terminal_observation"], row)
-        for info, row in zip(infos, observations, strict=True)
-    )
+    shown = assert_same_steps(ours, theirs, drawn_actions(ours, 1))
+    assert [truncated for truncated, _ in ends_of(shown)] == [False] * NUM_ENVS
 
 
 def test_infos_stay_as_they_were():
@@ -208,101 +184,71 @@ def test_options_that_do_not_fit_are_refused(options):
         env.reset()
 
 
-def test_attributes_are_rows_or_shared():
+def test_attributes_and_methods_are_those_of_dummy_vec_env():
+    ours, theirs = pair("safe_envs/QuadrotorLimits-v0", "hocbf", noise=0.05)
+    (action,) = drawn_actions(ours, 1)
+    for env in (ours, theirs):
+        env.reset()
+        env.step(action)
+    for name in ("state", "executed", "components"):
+        values = ours.get_attr(name)
+        np.testing.assert_allclose(values, theirs.get_attr(name), rtol=1e-6)
+        np.testing.assert_array_equal(ours.get_attr(name, [2]), values[2:])
+        assert name == "state" or {type(u) for value in values for u in value} == {float}
+    for name in ("observation_space", "action_space"):
+        assert ours.get_attr(name) == theirs.get_attr(name)
+    assert ours.get_attr("spec", 0)[0].id == theirs.get_attr("spec", 0)[0].id
+    assert ours.get_attr("np_random")[0] is not ours.get_attr("np_random")[1]
+    for name in ("executed", "nothing"):
+        found = [env.env_method("has_wrapper_attr", name) for env in (ours, theirs)]
+        assert found[0] == found[1] == [ours.has_attr(name)] * NUM_ENVS
+    with pytest.raises(AttributeError, match="'nothing'"):
+        ours.get_attr("nothing")
+    # Once for the batch.
+    wanted = [env.unwrapped.physical_action(a) for env, a in zip(theirs.envs, action, strict=True)]
+    np.testing.assert_allclose(ours.env_method("physical_action", action), wanted, rtol=1e-6)
+    (found,) = ours.env_method("physical_action", action, indices=1)
+    np.testing.assert_allclose(found, wanted[1], rtol=1e-6)
+    with pytest.raises(ConfigurationError, match="'reset'"):
+        ours.env_method("reset", indices=[0])
+    for kind, wrapped in ((SafetyFilterWrapper, True), (gym.wrappers.TimeLimit, False)):
+        assert ours.env_is_wrapped(kind) == [wrapped] * NUM_ENVS
+    assert ours.env_is_wrapped(SafetyFilterVectorWrapper, 0) == [True]
+    assert make_sb3_env(DUBINS, 2).env_is_wrapped(SafetyFilterWrapper) == [False, False]
+
+
+def test_attributes_are_rows_of_arrays_or_shared_and_are_set_for_all_envs():
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
     env.reset()
-    problems, filters = env.get_attr("problem"), env.get_attr("safety_filter")
-    assert problems[0] is problems[1] is env.env.unwrapped.problem
-    assert filters[0] is filters[1] is env.env.safety_filter
-    np.testing.assert_array_equal(env.get_attr("state"), env.env.unwrapped.state)
-    np.testing.assert_array_equal(env.get_attr("state", [1]), env.env.unwrapped.state[[1]])
-    assert env.get_attr("observation_space", 0) == [env.observation_space]
-    assert env.get_attr("action_space") == [env.action_space] * 2
-    assert env.get_attr("np_random")[0] is not env.get_attr("np_random")[1]
-    assert env.get_attr("spec", 0)[0].id == DUBINS
-    assert env.has_attr("executed")
-    assert not env.has_attr("nothing")
-    with pytest.raises(AttributeError, match="'nothing'"):
-        env.get_attr("nothing")
-
-
-def test_attributes_are_set_for_all_envs():
-    env = make_sb3_env(DUBINS, 2, "scbf")
-    env.set_attr("note", "read")
-    assert env.get_attr("note") == ["read", "read"]
+    for name, holder in (("problem", env.env.unwrapped), ("safety_filter", env.env)):
+        values = [*env.get_attr(name), *env.env_method("get_wrapper_attr", name, indices=[0])]
+        assert all(value is getattr(holder, name) for value in values)
+    for shared in ("read", (), [], (np.zeros(2), 1.0), (np.zeros(3),)):
+        env.set_attr("note", shared)
+        assert all(value is shared for value in env.get_attr("note"))
+    env.set_attr("of_matrices", [np.arange(4.0).reshape(2, 2)])
+    ((row,),) = env.get_attr("of_matrices", 1)
+    np.testing.assert_array_equal(row, [2.0, 3.0])
     env.set_attr("safety_filter", "another", indices=[0, 1])
     assert env.env.safety_filter == "another"
     with pytest.raises(ConfigurationError, match="'note' is shared by all 2 envs"):
         env.set_attr("note", "changed", indices=0)
     with pytest.raises(AttributeError):
         env.set_attr("components", np.zeros((2, 3)))
-    env.reset()
     env.set_attr("state", [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     np.testing.assert_array_equal(env.get_attr("state"), [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
 
 
-def test_methods_are_called_once_for_the_batch():
-    env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
-    env.reset()
-    assert env.env_method("get_wrapper_attr", "problem", indices=[0]) == [
-        env.get_attr("problem")[0]
-    ]
-    assert [env.env_method("has_wrapper_attr", name) for name in ("problem", "nothing")] == [
-        [True, True],
-        [False, False],
-    ]
-    rows = env.env_method("normalized_action", [np.array([5.0, -10.0])])
-    np.testing.assert_array_equal(rows, [[0.5], [-1.0]])
-    np.testing.assert_array_equal(
-        env.env_method("normalized_action", [np.array([5.0, -10.0])], indices=1), [[-1.0]]
-    )
-    with pytest.raises(ConfigurationError, match="'reset', which acts on all envs"):
-        env.env_method("reset", indices=[0])
-
-
-def test_components_are_handed_out_by_env():
-    env_id = "safe_envs/QuadrotorLimits-v0"
-    ours, theirs = pair(env_id, "hocbf", noise=0.05)
-    (action,) = drawn_actions(ours, 1)
-    for env in (ours, theirs):
-        env.reset()
-        env.step(action)
-    for name in ("executed", "components"):
-        values = ours.get_attr(name)
-        np.testing.assert_allclose(
-            values, [getattr(env.unwrapped, name) for env in theirs.envs], rtol=1e-6
-        )
-        assert all(type(u) is float for value in values for u in value)
-        assert ours.get_attr(name, [2]) == [values[2]]
-    wanted = [env.unwrapped.physical_action(a) for env, a in zip(theirs.envs, action, strict=True)]
-    np.testing.assert_allclose(ours.env_method("physical_action", action), wanted, rtol=1e-6)
-    ours.set_attr("of_matrices", [np.arange(6.0).reshape(NUM_ENVS, 2)])
-    ((row,),) = ours.get_attr("of_matrices", 1)
-    np.testing.assert_array_equal(row, [2.0, 3.0])
-    for shared in ((), [], (np.zeros(NUM_ENVS), 1.0), (np.zeros(NUM_ENVS + 1),)):
-        ours.set_attr("shared", shared)
-        assert all(value is shared for value in ours.get_attr("shared"))
-
-
-def test_wrappers_are_found():
-    env = make_sb3_env(DUBINS, 2, "scbf")
-    assert env.env_is_wrapped(SafetyFilterVectorWrapper) == [True, True]
-    assert env.env_is_wrapped(SafetyFilterWrapper, 0) == [True]
-    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
-    assert make_sb3_env(DUBINS, 2).env_is_wrapped(SafetyFilterWrapper) == [False, False]
-    env.close()
-
-
-def test_nothing_is_drawn_without_a_render_mode():
+def test_render_of_each_env_is_its_picture():
     env = make_sb3_env(DUBINS, 2)
     assert env.render_mode is None
-    with pytest.warns(UserWarning, match="no images"):
-        assert env.get_images() == [None, None]
-    with pytest.warns(UserWarning, match="no `render_mode`"):
-        assert env.render() is None
-
-
-def test_render_of_each_env_is_its_picture():
+    for call, found in (
+        (env.get_images, [None, None]),
+        (env.render, None),
+        (lambda: env.env_method("render"), [None, None]),
+    ):
+        with pytest.warns(UserWarning, match="render.mode"):
+            assert call() == found
     env = make_sb3_env(DUBINS, 3, "scbf", seed=1, render_mode="rgb_array")
     env.reset()
     pictures = env.env_method("render")
@@ -312,8 +258,6 @@ def test_render_of_each_env_is_its_picture():
     (last,) = env.env_method("render", indices=2)
     np.testing.assert_array_equal(last, pictures[2])
     assert (last != pictures[0]).any()
-    with pytest.warns(UserWarning, match="without a render mode"):
-        assert make_sb3_env(DUBINS, 2).env_method("render") == [None, None]
 
 
 def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
@@ -401,39 +345,37 @@ def test_filters_are_texts_conditions_or_nothing(given):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "fragment"),
     [
-        ({"env_id": "StochasticDubin-v0"}, "did you mean 'safe_envs/StochasticDubins-v0'"),
-        ({"env_id": "CartPole-v1"}, "not one of this project's envs"),
-        ({"num_envs": 0}, "num_envs = 0; give a whole number from 1"),
-        ({"num_envs": 2.0}, "num_envs = 2.0"),
+        ({"env_id": "StochasticDubin-v0"}, "'safe_envs/StochasticDubins-v0'"),
+        ({"env_id": "CartPole-v1"}, "CartPole-v1"),
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"num_envs": 2.0}, r"num_envs = 2\.0"),
         ({"filter": "scfb"}, "scbf"),
-        ({"filter": 3}, "condition = 3"),
+        ({"filter": 3}, "3"),
         ({"filter": "scbf", "knowledge": "oracle"}, "oracle"),
         ({"filter": "scbf", "objective": "fastest"}, "fastest"),
-        (
-            {"filter": "scbf", "intervention_penalty": -0.1},
-            "intervention_penalty = -0.1; give a finite number from 0",
-        ),
+        ({"filter": "scbf", "intervention_penalty": -0.1}, r"intervention_penalty = -0\.1"),
         ({"filter": "scbf", "intervention_penalty": float("nan")}, "intervention_penalty = nan"),
         ({"filter": "scbf", "intervention_penalty": "1"}, "intervention_penalty = '1'"),
         ({"intervention_penalty": 0.1}, "without a filter"),
+        ({"filter": "scbf", "estimator": "ekf"}, "measurement"),
         ({"seed": -1}, "seed = -1"),
-        ({"horizn": 1.0}, "did you mean 'horizon'"),
+        ({"horizn": 1.0}, "'horizon'"),
         ({"render_mode": "human"}, "render_mode = 'human'"),
+        ({"engine": "fast"}, "engine = 'fast'"),
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_wrong_arguments_are_errors(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
+def test_wrong_arguments_are_errors(arguments, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
         make_sb3_env(**{"env_id": DUBINS, "num_envs": 2, **arguments})
 
 
 def test_other_envs_are_errors():
-    with pytest.raises(ConfigurationError, match="neither one of this project's vector envs"):
-        SafeVecEnv(gym.make_vec("CartPole-v1", num_envs=2))
-    with pytest.raises(ConfigurationError, match="make it with 'SameStep'"):
-        SafeVecEnv(gym.make_vec(DUBINS, num_envs=2))
+    for env, fragment in (("CartPole-v1", "vector envs"), (DUBINS, "'SameStep'")):
+        with pytest.raises(ConfigurationError, match=fragment):
+            SafeVecEnv(gym.make_vec(env, num_envs=2))
 
 
 def test_wrong_actions_are_errors():
@@ -447,34 +389,182 @@ def test_wrong_actions_are_errors():
         env.step(np.array([[0.0], [np.nan]], dtype=np.float32))
 
 
-@pytest.mark.parametrize("condition", [None, "scbf"])
-def test_engines_give_the_same_steps_to_rounding(condition, monkeypatch):
-    monkeypatch.setattr(Program, "compiled", Program.plain)
-    ours, theirs = (
-        make_sb3_env("Scalar-v0", 3, condition, seed=7, engine=engine, horizon=0.04)
-        for engine in ("compiled", "numpy")
-    )
-    shown = assert_same_steps(ours, theirs, drawn_actions(ours, 10))
-    assert sum(dones.sum() for dones, _ in shown) >= 3
-
-
 def test_agents_learn_behind_the_promise_filter_and_may_observe_p():
     env = SafetyFilterVectorWrapper(
-        gym.make_vec(SCALAR, num_envs=4, autoreset_mode="SameStep", horizon=0.06),
-        guess(horizon=0.06),
+        gym.make_vec(SCALAR_ID, num_envs=4, autoreset_mode="SameStep", horizon=0.2),
+        "promise:p=0.97",
         observe_promise=True,
     )
     envs = SafeVecEnv(env, intervention_penalty=0.1)
     assert envs.observation_space.shape == (2,)
     seen = envs.reset()
     rng = np.random.default_rng(0)
-    for k in range(13):
-        levels = [info["promise"] for info in envs.reset_infos] if k % 6 == 0 else None
-        if levels is not None:
-            np.testing.assert_array_equal(seen[:, 1], np.float32(levels))
+    for k in range(41):
+        if k % 20 == 0:
+            levels = np.float32([info["promise"] for info in envs.reset_infos])
+            np.testing.assert_array_equal(seen[:, 1], levels)
         seen, _, dones, infos = envs.step(rng.uniform(-1.0, 1.0, (4, 1)).astype(np.float32))
         for i in np.flatnonzero(dones):
             assert infos[i]["terminal_observation"][1] == np.float32(infos[i]["promise"])
-    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, device="cpu", seed=0)
-    model.learn(32)
+    model = PPO("MlpPolicy", envs, n_steps=8, batch_size=16, device="cpu", seed=0).learn(32)
     assert model.predict(seen)[0].shape == (4, 1)
+
+
+def test_with_an_estimator_the_features_are_those_at_the_estimate_and_filters_act_there():
+    given = {"measurement": "default", "estimator": "ekf", "seed": 0}
+    env = make_sb3_env(DUBINS, 3, "scbf", **given)
+    observation = env.reset()
+    assert observation.shape == (3, len(problem_of(DUBINS).features))
+    for _ in range(5):
+        observation, _, _, infos = env.step(np.zeros((3, 1), dtype=np.float32))
+    for seen, info in zip(observation, infos, strict=True):
+        x, y, theta = info["estimate"]
+        np.testing.assert_allclose(seen, [x, y, np.cos(theta), np.sin(theta)], rtol=1e-5)
+        assert not np.allclose(info["estimate"], info["state"])
+        assert info["nees_dof"] == 3
+    measured = make_sb3_env(DUBINS, 3, "scbf", observe="measurement", **given)
+    assert measured.reset().shape == (3, 3)
+
+
+def test_monitor_reports_the_last_step_of_an_episode(tmp_path):
+    native = make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=4)
+    env = VecMonitor(native, str(tmp_path), info_keywords=("episode_cost",))
+    env.reset()
+    total = np.zeros(2)
+    for action in drawn_actions(env, 4):
+        _, rewards, dones, infos = env.step(action)
+        total += rewards
+    assert dones.all()
+    for info, wanted in zip(infos, total, strict=True):
+        assert info["episode"]["r"] == pytest.approx(wanted)
+        assert (info["episode"]["l"], info["episode"]["episode_cost"]) == (4, info["episode_cost"])
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [
+        (PPO, {"n_steps": 32, "batch_size": 64, "n_epochs": 2}),
+        (SAC, {"learning_starts": 100, "batch_size": 32}),
+    ],
+)
+def test_algorithms_learn_behind_the_wrappers_of_stable_baselines3(algorithm, settings):
+    native = make_sb3_env(DUBINS, 4, "scbf", intervention_penalty=0.1, max_episode_steps=10)
+    env = VecNormalize(VecMonitor(native, info_keywords=("episode_cost", "episode_interventions")))
+    model = algorithm("MlpPolicy", env, device="cpu", seed=0, **settings).learn(300)
+    assert len(model.ep_info_buffer) >= 28
+    assert all(episode["l"] == 10 for episode in model.ep_info_buffer)
+    assert native.get_attr("np_random_seed") == [0, 1, 2, 3]
+
+
+READINGS = {
+    "keys": lambda info: {key: info[key] for key in info.keys()},  # noqa: SIM118
+    "items": lambda info: dict(info.items()),
+    "values": lambda info: dict(zip(info, info.values(), strict=True)),
+    "iteration": lambda info: {key: info[key] for key in info},
+    "reversed": lambda info: {key: info[key] for key in reversed(info)},
+    "dict": dict,
+    "unpacked": lambda info: {**info},
+    "or": lambda info: info | {},
+    "reflected or": lambda info: {} | info,
+    "update": lambda info: [target := {}, target.update(info)][0],
+    "copy": lambda info: info.copy(),
+    "pickle": lambda info: pickle.loads(pickle.dumps(info)),
+    "deepcopy": copy.deepcopy,
+    "setdefault": lambda info: {key: info.setdefault(key, None) for key in tuple(info)},
+    "pop": lambda info: {key: info.pop(key) for key in tuple(info)},
+    "popitem": lambda info: dict([info.popitem() for _ in range(len(info))]),
+    "repr": lambda info: eval(repr(info), {"array": np.array, "float32": np.float32}),
+}
+
+
+def test_infos_are_made_as_far_as_they_are_read():
+    env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
+    env.reset()
+    info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
+    assert (info.batch is env.batch_info, info.index) == (True, 1)
+    assert ("cost" in info, "terminal_observation" in info) == (True, False)
+    assert (info.get("episode"), info.get("episode", 3)) == (None, 3)
+    with pytest.raises(KeyError, match="episode"):
+        info["episode"]
+    assert dict.keys(info) == set()
+    assert isinstance(info["cost"], float)
+    assert info.get("barrier") is info["barrier"]
+    for twin in (info.copy(), copy.copy(info)):
+        assert (twin.batch is info.batch, twin.index) == (True, info.index)
+        assert twin["barrier"] is info["barrier"]
+        assert dict.keys(twin) == {"barrier"}
+
+
+@pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
+def test_every_way_to_read_an_info_gives_all_of_it(reading):
+    env = make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=1)
+    env.reset()
+    info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
+    wanted = {
+        **{key: values[1] for key, values in env.batch_info.items()},
+        "terminal_observation": dict.get(info, "terminal_observation"),
+    }
+    read = reading(info)
+    assert len(read) == len(wanted) == 18
+    for key, value in wanted.items():
+        # The text of an array has eight digits.
+        np.testing.assert_allclose(read[key], value, rtol=1e-7, err_msg=key)
+
+
+def test_infos_are_equal_if_their_entries_are():
+    # An array of several barriers has no truth value of its own.
+    envs = [make_sb3_env("safe_envs/QuadrotorLimits-v0", 2, "hocbf", seed=0) for _ in range(2)]
+    for env in envs:
+        env.reset()
+    info, twin = (env.step(np.ones((2, 4), dtype=np.float32))[3][1] for env in envs)
+    changed = [info.copy() for _ in range(4)]
+    changed[0]["cost"] = 7.0
+    changed[1]["barrier"][1] += 1.0
+    changed[2]["another"] = 1
+    del changed[3]["cost"]
+    # A copy of a lazy one is lazy, so that no comparison can rely on an earlier one.
+    for other, same in (
+        (twin, True),
+        (info, True),
+        (dict(twin.copy()), True),
+        *((other, False) for other in changed),
+    ):
+        for a, b in (
+            (info.copy(), other),
+            (other, info.copy()),
+            (info.copy(), other.copy()),
+            (other.copy(), info.copy()),
+        ):
+            assert ((a == b), (a != b)) == (same, not same)
+    assert info.copy() != 3
+
+
+def test_a_dict_of_an_info_is_written_as_json():
+    env = make_sb3_env(DUBINS, 2, seed=0)
+    env.reset()
+    info = env.reset_infos[1]
+    assert set(json.loads(json.dumps(dict(info), default=list))) == set(env.batch_info)
+
+
+def test_infos_can_be_changed_without_changing_the_batch():
+    env = make_sb3_env(DUBINS, 2, seed=0)
+    env.reset()
+    info, other = env.reset_infos
+    unchanged = info.copy()
+    info["cost"] = 7.0
+    info["barrier"][:] = 7.0
+    del info["h_min"]
+    assert info.get("cost") == info["cost"] == 7.0
+    assert "h_min" not in info
+    assert info.get("h_min") is None
+    assert info != unchanged
+    assert unchanged == {key: values[0] for key, values in env.batch_info.items()}
+    assert (len(info), len(other)) == (4, 5)
+    assert other["cost"] == 0.0
+    assert env.batch_info["barrier"][0] != 7.0
+    copied = pickle.loads(pickle.dumps(info))
+    assert type(copied) is dict
+    assert type(copy.deepcopy(info)) is dict
+    info.clear()
+    assert "violation" not in info
