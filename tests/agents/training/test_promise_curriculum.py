@@ -13,7 +13,7 @@ from safe_envs.agents.training import vec_env
 from safe_envs.agents.training.config import PromiseCurriculum, Training
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
-from tests.wrappers.value.guesses import SCALAR, guess
+from tests.values.guesses import SCALAR, guess
 
 PROMISE = "promise:p=0.97"
 HORIZON = {"horizon": 0.2}  # 20 steps

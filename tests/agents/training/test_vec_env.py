@@ -16,7 +16,7 @@ from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
 from safe_envs.engine.program import Program
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
-from tests.wrappers.value.guesses import SCALAR, guess
+from tests.values.guesses import SCALAR, guess
 
 pytestmark = pytest.mark.slow
 

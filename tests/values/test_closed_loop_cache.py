@@ -22,7 +22,7 @@ from safe_envs.values.closed_loop import (
     save_closed_loop,
 )
 from safe_envs.values.tables import ValueFileError
-from tests.wrappers.value.systems import scalar
+from tests.values.systems import scalar
 
 POINTS = (np.linspace(0.05, 1.95, 40),)
 

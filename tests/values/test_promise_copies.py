@@ -11,8 +11,7 @@ from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.promise_filter import PromiseFilter, PromiseSettings
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings
-
-from .walks import walk
+from tests.oracles.walks import walk
 
 
 @pytest.mark.parametrize("specification", ["", "always safe & eventually goal"])

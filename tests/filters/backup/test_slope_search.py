@@ -13,7 +13,7 @@ from safe_envs.proofs.backup_filter import BackupFilter
 from safe_envs.proofs.backup_search import DIFFERENCE, LEFT, aims
 from safe_envs.wrappers import SafetyFilterVectorWrapper
 from tests.agents.evaluation.test_compiled_episodes import assert_alike
-from tests.wrappers.backup.carts import STRONGEST, cart_filter, table_problem
+from tests.oracles.carts import STRONGEST, cart_filter, table_problem
 
 
 @pytest.fixture(scope="module")

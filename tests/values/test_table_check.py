@@ -15,7 +15,7 @@ from safe_envs.values import proved
 from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.proved import ProvedStarts, TableRefusedError, check_table, check_table_file
 from safe_envs.values.tables import save_table
-from tests.wrappers.value.systems import quadrature, scalar, solved, u, x, y
+from tests.values.systems import quadrature, scalar, solved, u, x, y
 
 
 def plane(sigma=((0.3, 0), (0, 0.2)), **options):

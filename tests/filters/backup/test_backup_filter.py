@@ -13,7 +13,7 @@ import sympy as sp
 from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionError
 from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.proofs.backup_filter import BackupFilter
-from tests.wrappers.backup.carts import (
+from tests.oracles.carts import (
     BRAKE,
     DT,
     PULL,

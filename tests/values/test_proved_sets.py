@@ -9,7 +9,7 @@ import sympy as sp
 from safe_envs.values.grid import Axis, Grid
 from safe_envs.values.proved import ProvedSets
 from safe_envs.values.reduction import reduced
-from tests.wrappers.value.systems import scalar, x
+from tests.values.systems import scalar, x
 
 
 def sets_of(barrier, edges, blur, leaving="violation"):

@@ -12,7 +12,7 @@ from safe_envs import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.backup import BackupLaw
 from safe_envs.proofs.backup_filter import BackupFilter
 from safe_envs.proofs.backup_plans import sampled_states
-from tests.wrappers.backup.carts import BRAKE, PULL, STRONGEST, cart_problem, v, x
+from tests.oracles.carts import BRAKE, PULL, STRONGEST, cart_problem, v, x
 
 
 def made(law, terminal, **options):

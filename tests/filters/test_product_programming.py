@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from safe_envs.filters.specification import Automaton, Parsed, Specification, automaton_of, parsed
-
-from .formulas import satisfied
+from tests.oracles.formulas import satisfied
 
 STEPS = 4
 SETS = {"safe": (1, 1, 0, 1), "G1": (0, 1, 0, 0), "G2": (1, 0, 0, 1)}

@@ -9,7 +9,7 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.values.look_ahead import LookAhead, draw_starts, start_values
-from tests.wrappers.value.systems import quadrature, scalar, solved, x
+from tests.values.systems import quadrature, scalar, solved, x
 
 
 def test_one_start_needs_no_margin():

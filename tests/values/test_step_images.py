@@ -10,7 +10,7 @@ from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.values.images import Step
 from safe_envs.values.reduction import reduced
-from tests.wrappers.value.systems import s, scalar, u, v, x, y
+from tests.values.systems import s, scalar, u, v, x, y
 
 
 def coupled(noise=(0.3, 0.0)):

@@ -45,6 +45,30 @@ def scalar(
     return state_problem(system, barriers, **given)
 
 
+def pursued(**options):
+    """Return a state that has to stay away from another one, which moves by itself."""
+    system = ControlAffineSDE(
+        states=[x, y],
+        inputs=[u],
+        drift=[0, sp.Rational(3, 2)],
+        input_matrix=[[1], [0]],
+        diffusion=[[s], [0]],
+        parameters={s: 0.3},
+    )
+    return state_problem(
+        system,
+        (x - y) ** 2 - sp.Rational(1, 25),
+        box=(-1.0, 1.0),
+        start=(0.6, -0.8),
+        dt=0.1,
+        horizon=1.5,
+        workspace={x: (-1.0, 1.5)},
+        name="pursued",
+        filter="scbf",
+        **options,
+    )
+
+
 def solved(problem: SafetyProblem, *cells: int, **settings: Any) -> ValueTable:
     """Return a table with these numbers of cells."""
     return solve(problem, ValueSettings(cells=cells, **settings))

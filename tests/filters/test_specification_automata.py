@@ -10,8 +10,7 @@ import pytest
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.specification import MOST_STATES, Specification, automaton_of, parsed
-
-from .formulas import NAMES, random_text, satisfied
+from tests.oracles.formulas import NAMES, random_text, satisfied
 
 LONGEST = 5
 

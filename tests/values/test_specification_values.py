@@ -16,8 +16,17 @@ from safe_envs.registry import make_problem
 from safe_envs.values.look_ahead import LookAhead, start_values
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueFileError, ValueSettings, load_table, save_table
-
-from .walks import NOISE, PERIOD, POINTS, SPEED, STEPS, WITHIN, exact_values, labels_of, walk
+from tests.oracles.walks import (
+    NOISE,
+    PERIOD,
+    POINTS,
+    SPEED,
+    STEPS,
+    WITHIN,
+    exact_values,
+    labels_of,
+    walk,
+)
 
 QUADRATURE = 2e-3
 """Error of the quadrature: one in the place of the points by half a width."""

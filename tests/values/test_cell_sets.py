@@ -11,7 +11,7 @@ import sympy as sp
 from safe_envs import ConfigurationError
 from safe_envs.values.cells import Sets, hull_of, uniform_grid
 from safe_envs.values.reduction import reduced
-from tests.wrappers.value.systems import scalar, x
+from tests.values.systems import scalar, x
 
 pytestmark = pytest.mark.filterwarnings("ignore:the input bounds")
 BARRIERS = {

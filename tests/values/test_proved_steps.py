@@ -13,7 +13,7 @@ from safe_envs.values.images import Step
 from safe_envs.values.proved import ProvedImages, ProvedWeights
 from safe_envs.values.reduction import reduced
 from safe_envs.values.smoothing import noise_boxes
-from tests.wrappers.value.systems import u, x, y
+from tests.values.systems import u, x, y
 
 RNG = np.random.default_rng(5)
 

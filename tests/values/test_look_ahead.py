@@ -15,7 +15,8 @@ from safe_envs.dynamics.integrators import Integrator
 from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.promise_filter import PromiseFilter, PromiseMemory, PromiseSettings
 from safe_envs.values.reduction import reduced
-from tests.wrappers.value.systems import (
+from tests.values.systems import (
+    pursued,
     random_states,
     require_promised,
     row,
@@ -27,30 +28,6 @@ from tests.wrappers.value.systems import (
     x,
     y,
 )
-
-
-def pursued(**options):
-    """Return a state that has to stay away from another one, which moves by itself."""
-    system = ControlAffineSDE(
-        states=[x, y],
-        inputs=[u],
-        drift=[0, sp.Rational(3, 2)],
-        input_matrix=[[1], [0]],
-        diffusion=[[s], [0]],
-        parameters={s: 0.3},
-    )
-    return state_problem(
-        system,
-        (x - y) ** 2 - sp.Rational(1, 25),
-        box=(-1.0, 1.0),
-        start=(0.6, -0.8),
-        dt=0.1,
-        horizon=1.5,
-        workspace={x: (-1.0, 1.5)},
-        name="pursued",
-        filter="scbf",
-        **options,
-    )
 
 
 def timed(**options):

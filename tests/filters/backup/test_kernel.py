@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.wrappers.backup.carts import (
+from tests.oracles.carts import (
     STRONGEST,
     cart_filter,
     drawn,

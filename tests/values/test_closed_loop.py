@@ -10,7 +10,7 @@ from safe_envs import ConfigurationError
 from safe_envs.filters.conditions.text import conditions_for
 from safe_envs.registry import make_problem
 from safe_envs.values.closed_loop import closed_loop_table
-from tests.wrappers.value.systems import quadrature, scalar, x
+from tests.values.systems import quadrature, scalar, x
 
 
 @pytest.mark.parametrize("sigma", [0.4, 0.2 + 0.3 * x**2])

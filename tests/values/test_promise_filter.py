@@ -12,7 +12,7 @@ from safe_envs import ConfigurationError, ControlAffineSDE
 from safe_envs.errors import InvalidInputError
 from safe_envs.problem.builder import state_problem
 from safe_envs.values.promise_filter import PromiseFilter, PromiseMemory, PromiseSettings
-from tests.wrappers.value.chain import SAFE, STATES, STEPS, Chain, U, X, chain_problem
+from tests.oracles.exact_chain import SAFE, STATES, STEPS, Chain, U, X, chain_problem
 
 EXACT, PROBLEM = Chain(), chain_problem()
 V = sp.Symbol("v", real=True)

@@ -15,8 +15,8 @@ from safe_envs.files import VARIABLE, locked
 from safe_envs.values import solve as solving
 from safe_envs.values.solve import table_for
 from safe_envs.values.tables import FORMAT, ValueFileError, ValueSettings, load_table, save_table
-from tests.wrappers.value.systems import scalar, solved, x
-from tests.wrappers.value.test_table_files import PROBLEM, table_of
+from tests.values.systems import scalar, solved, x
+from tests.values.test_table_files import PROBLEM, table_of
 
 
 @pytest.fixture

@@ -27,8 +27,7 @@ from safe_envs.values.promise_filter import (
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings, ValueTable
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SpecificationMonitorVector
-
-from .walks import NOISE, PERIOD, STEPS, walk
+from tests.oracles.walks import NOISE, PERIOD, STEPS, walk
 
 REACH = "always safe & eventually goal"
 ORDER = "always safe & eventually (left then right)"

@@ -11,7 +11,7 @@ from safe_envs.values.promise_filter import PromiseSettings
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.filter_layers import settings_of
 from tests.conftest import problem_of
-from tests.wrappers.backup.carts import cart_problem
+from tests.oracles.carts import cart_problem
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionErro
 from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings
-from tests.wrappers.value.systems import (
+from tests.values.systems import (
     quadrature,
     require_around,
     require_promised,

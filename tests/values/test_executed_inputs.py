@@ -10,7 +10,7 @@ from safe_envs import ConfigurationError
 from safe_envs.filters.conditions.text import conditions_for
 from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.values.closed_loop import ExecutedInputs
-from tests.wrappers.value.systems import scalar, x
+from tests.values.systems import scalar, x
 
 RNG = np.random.default_rng(3)
 

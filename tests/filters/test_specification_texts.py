@@ -9,8 +9,7 @@ import pytest
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.specification import Specification, parsed
-
-from .formulas import NAMES, random_text, robustness
+from tests.oracles.formulas import NAMES, random_text, robustness
 
 SETS = ("safe", "goal", "G1", "G2")
 
