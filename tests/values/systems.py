@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,11 +13,11 @@ from scipy.special import ndtr
 
 from safe_envs import ControlAffineSDE, SafetyProblem, state_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings, ValueTable
 
 x, y, u, v, s = sp.symbols("x y u v s", real=True)
+Interval = tuple[float, float]
 
 
 def scalar(
@@ -102,13 +104,7 @@ def quadrature(
     low, high = ends
     q = 0.5 * (high - low) * places + 0.5 * (high + low)
     weights = 0.5 * (high - low) * weights
-    system, dt = problem.plant, problem.dt
-    rates = [system.numeric(e)[0] for e in (system.drift, system.input_matrix, system.diffusion)]
-    drift, gain, sigma = (
-        np.broadcast_to(e, q.shape) for e in compile_function(system.states, rates, "arrays")(q)
-    )
-    mean = q + dt * (drift + gain * np.asarray(inputs)[:, None])
-    size = np.broadcast_to(np.abs(sigma) * np.sqrt(dt), mean.shape)
+    mean, size = (each.T for each in _step(problem, q, inputs))
     density = np.zeros((*mean.shape, nodes))
     for turn in range(-40, 41) if period else (0,):
         apart = (q + turn * period - mean[..., None]) / size[..., None]
@@ -122,39 +118,59 @@ def quadrature(
     return q, rows[::-1]
 
 
-def require_around(
-    table: ValueTable, q: np.ndarray, exact: list[np.ndarray], largest: list[np.ndarray]
-) -> float:
-    """Require lower <= exact and largest <= upper at all instants; return the mean gap."""
-    cells, gap = table.grid.cell_of([q]), 0.0
-    assert (cells >= 0).all()
-    for k, (value, most) in enumerate(zip(exact, largest, strict=True)):
-        lower, upper = (each[cells] for each in row(table, k))
-        assert (lower <= value + 1e-9).all(), k
-        assert (upper >= most - 1e-9).all(), k
-        gap += float((upper - lower).mean()) / len(exact)
-    return gap
+def expected_after(
+    problem: SafetyProblem,
+    values: np.ndarray,
+    edges: np.ndarray,
+    q: np.ndarray,
+    inputs: np.ndarray,
+    *,
+    safe: Sequence[Interval],
+    ones: Sequence[Interval] = (),
+    period: float = 0.0,
+) -> np.ndarray:
+    """Return E V(X_1) exactly, after a step of one state, one input and one noise, shape (Q, U).
 
-
-def random_states(table: ValueTable, count: int, seed: int = 0) -> list[np.ndarray]:
-    """Draw coordinates within a grid."""
-    rng = np.random.default_rng(seed)
-    return [
-        a.edges[0] + (a.edges[-1] - a.edges[0]) * rng.random(count) * (1 - 1e-9)
-        for a in table.grid.axes
-    ]
-
-
-def require_promised(problem: SafetyProblem, table: ValueTable, count: int = 200) -> None:
-    """Require that the look-ahead never falls below the table, at random safe states and instants.
-
-    The states are those of the coordinates, which have to be the problem's states.
+    Args:
+        problem: whose step is taken.
+        values: V on each cell in the safe set; outside it is 0.
+        edges: of the cells.
+        q: states.
+        inputs: of the step.
+        safe: intervals of the safe set.
+        ones: intervals where V is 1 instead.
+        period: of the state, 0 for none.
     """
-    ahead = LookAhead(table, problem)
-    q = random_states(table, count)
-    k = np.random.default_rng(1).integers(0, table.steps, count)
-    _, ends = ahead.sets_at(k, q)
-    lower, most = ahead.values(k, q), ahead.scanned(k, q).max(axis=1)
-    assert (lower <= np.where(ends, 1.0, most) + 1e-7).all()
-    assert (lower > 0).any()
-    assert (ahead.largest(k, q) >= most - 1e-7).all()
+    ends = [e for interval in (*safe, *ones) for e in interval if math.isfinite(e)]
+    cuts = np.unique([*edges, *ends])
+    if ones:
+        cuts = np.array([-1e30, *cuts, 1e30])
+    middle = 0.5 * (cuts[:-1] + cuts[1:])
+    cells = np.searchsorted(edges, middle, side="right") - 1
+    inside = (cells >= 0) & (cells < len(values)) & _is_in(safe, middle)
+    held = np.where(inside, values[np.clip(cells, 0, len(values) - 1)], 0.0)
+    held = np.where(_is_in(ones, middle), 1.0, held)
+    mean, size = _step(problem, q, inputs)
+    total = np.zeros(mean.shape)
+    for turn in np.arange(-40, 41) * period if period else (0.0,):
+        passed = ndtr((cuts + turn - mean[..., None]) / size[..., None])
+        total += np.diff(passed, axis=-1) @ held
+    return total
+
+
+def _is_in(intervals: Sequence[Interval], q: np.ndarray) -> np.ndarray:
+    return np.any([(a < q) & (q < b) for a, b in [*intervals, (1.0, 0.0)]], axis=0)
+
+
+def _step(
+    problem: SafetyProblem, q: np.ndarray, inputs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return means and standard deviations of the next states, shape (Q, U)."""
+    system, dt = problem.plant, problem.dt
+    rates = [system.numeric(e)[0] for e in (system.drift, system.input_matrix, system.diffusion)]
+    drift, gain, sigma = (
+        np.broadcast_to(e, q.shape)[:, None]
+        for e in compile_function(system.states, rates, "arrays")(q)
+    )
+    mean = q[:, None] + dt * (drift + gain * np.asarray(inputs))
+    return mean, np.broadcast_to(np.abs(sigma) * np.sqrt(dt), mean.shape)
