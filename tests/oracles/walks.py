@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import sympy as sp
 from scipy.special import ndtr
@@ -80,20 +82,39 @@ def labels_of(automaton: Automaton, k: int, moves: bool) -> np.ndarray:
     return automaton.label([inside[name] for name in automaton.atoms])
 
 
+INPUTS = np.linspace(-2.0, 2.0, 17)
+
+
 def exact_values(
     automaton: Automaton, *, moves: bool = False, goal: bool = True, leaving: str = "violation"
 ) -> np.ndarray:
     """Return V_k(x, a) of the walk where an episode goes on, shape (K + 1, points, states)."""
+    return _programmed(automaton, moves, goal, leaving)[0]
+
+
+def worst_inputs(automaton: Automaton, *, moves: bool = False, goal: bool = True) -> np.ndarray:
+    """Return the inputs after which the least can be attained, shape (K, points, states)."""
+    return _programmed(automaton, moves, goal, "violation")[1]
+
+
+@functools.cache
+def _kernel() -> np.ndarray:
+    """Return probabilities of next points, by input and point within the workspace."""
+    means = POINTS[WITHIN][None, :, None] + PERIOD * INPUTS[:, None, None]
+    return np.diff(ndtr((_EDGES - means) / (NOISE * np.sqrt(PERIOD))), axis=2).astype(np.float32)
+
+
+def _programmed(
+    automaton: Automaton, moves: bool, goal: bool, leaving: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return V_k(x, a), and the inputs with the least expected value after them."""
     ended = ~WITHIN | ((POINTS >= 0.7) & goal)
-    means = POINTS[WITHIN][None, :, None] + PERIOD * np.linspace(-2.0, 2.0, 17)[:, None, None]
-    passed = ndtr((_EDGES - means) / (NOISE * np.sqrt(PERIOD)))
-    kernel = np.diff(passed, axis=2)
     states = np.arange(automaton.size)
     accepted = np.broadcast_to(automaton.accepting.astype(float), (len(POINTS), automaton.size))
     last = accepted.copy()
     if leaving == "violation":
         last[~WITHIN] = 0.0
-    values = [last]
+    values, worst = [last], np.zeros((STEPS, *last.shape))
     for k in reversed(range(STEPS)):
         labels = labels_of(automaton, k + 1, moves)
         following = automaton.step(k + 1, states, labels[:, None])
@@ -101,9 +122,16 @@ def exact_values(
         found = np.where(ended[:, None], accepted, 0.0)
         if leaving == "violation":
             found[~WITHIN] = 0.0
-        rows = (kernel @ onward).max(axis=0)
+        expected = (_kernel() @ onward.astype(np.float32)).astype(float)
+        worst[k, WITHIN] = INPUTS[expected.argmin(axis=0)]
+        rows = expected.max(axis=0)
         found[WITHIN] = np.where(ended[WITHIN][:, None], accepted[WITHIN], rows)
         # What is settled before the workspace is left, counts.
         found[np.ix_(WITHIN, automaton.verdict(k, states) == 1)] = 1.0
         values.insert(0, found)
-    return np.array(values)
+    return np.array(values), worst
+
+
+def place_of(x: np.ndarray) -> np.ndarray:
+    """Return which of `POINTS` are nearest to states."""
+    return np.clip(np.floor((x + 3.0) / _WIDTH).astype(int), 0, len(POINTS) - 1)

@@ -1,293 +1,486 @@
-"""The promise filter on a chain that is known exactly: what it keeps against a hostile policy."""
+"""The promise filter keeps what it says against a hostile policy, and changes little."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
+import functools
+import pickle
+from typing import Any
 
 import numpy as np
 import pytest
 import sympy as sp
+from gymnasium.vector import AutoresetMode
 
-from safe_envs import ConfigurationError, ControlAffineSDE
-from safe_envs.errors import InvalidInputError
-from safe_envs.problem.builder import state_problem
-from safe_envs.values.promise_filter import PromiseFilter, PromiseMemory, PromiseSettings
-from tests.oracles.exact_chain import SAFE, STATES, STEPS, Chain, U, X, chain_problem
-
-EXACT, PROBLEM = Chain(), chain_problem()
-V = sp.Symbol("v", real=True)
-LINE = np.arange(STATES, dtype=float)
-HOSTILE = np.array(
-    [
-        EXACT.inputs[EXACT.scanned(np.full(STATES, k), (LINE,)).argmin(axis=1), 0]
-        for k in range(STEPS)
-    ]
+from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, state_problem
+from safe_envs.agents.evaluation.bounds import PromiseBound
+from safe_envs.agents.evaluation.notes import computed_notes
+from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.filters.specification import problem_automaton
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.values.look_ahead import LookAhead
+from safe_envs.values.promise_filter import (
+    PromiseFilter,
+    PromiseSettings,
+    promise_filter_for,
+    why_not_of_safety,
 )
-"""At each control instant and state, the input that does most against staying in C."""
+from safe_envs.values.solve import solve
+from safe_envs.values.tables import ValueSettings, ValueTable, save_table
+from safe_envs.wrappers import SafetyFilterVectorWrapper, SpecificationMonitorVector
+from tests.oracles.walks import PERIOD, STEPS, exact_values, place_of, walk, worst_inputs
+from tests.values.systems import scalar, solved, x
+
+SAFETY = ""
+REACH = "always safe & eventually goal"
+ORDER = "always safe & eventually (left then right)"
+WINDOW = "eventually[3,9] right"
+TOUCH = "eventually left"
 
 
-def memory_of(p: float, envs: int, look_ahead: Chain = EXACT) -> PromiseMemory:
-    return PromiseMemory(PromiseFilter(look_ahead, PromiseSettings(p), PROBLEM), envs)
+@functools.cache
+def table_of(text: str, moves: bool = False) -> tuple[ValueTable, SafetyProblem]:
+    """Return the table of a walk, which has a goal for one of the specifications only."""
+    problem = walk(moves=moves, goal=text == REACH)
+    return solve(problem, ValueSettings(specification=text, cells=(160,), inputs=17)), problem
 
 
-def play(memory: PromiseMemory, starts: np.ndarray, seed: int = 0):
-    """Return whether each episode was safe, and the mean of p_0."""
-    rng, x = np.random.default_rng(seed), starts.astype(float)
-    memory.begin((x,))
-    begun = memory.levels.mean()
-    safe = (x >= SAFE.start) & (x < SAFE.stop)
-    for k in range(STEPS):
-        u = HOSTILE[k, x.astype(int)]
-        u = memory.decide_arrays((x,), (u,)).action[0]
-        x = EXACT.moved(x, u, rng)
-        memory.advance((x,), False)
-        safe &= (x >= SAFE.start) & (x < SAFE.stop)
-    return safe, begun
+def promised(table: ValueTable, problem: SafetyProblem, p: float, text: str = "") -> PromiseFilter:
+    return PromiseFilter(LookAhead(table, problem), PromiseSettings(p, specification=text), problem)
 
 
-@pytest.mark.parametrize("p", [0.5, 0.9, 0.99])
-def test_a_hostile_policy_leaves_what_was_asked_for(p):
-    starts = np.full(6000, 15)
-    safe, begun = play(memory_of(p, len(starts)), starts)
-    error = 3.0 * np.sqrt(p * (1.0 - p) / len(starts))
+def filter_of(text: str, p: float, moves: bool = False) -> PromiseFilter:
+    return promised(*table_of(text, moves), p, text)
+
+
+class Episodes:
+    """Episodes behind a promise filter, and what a hostile policy knows about them.
+
+    Args:
+        chosen: the filter.
+        count: of envs.
+        mode: of resets.
+    """
+
+    def __init__(self, chosen: PromiseFilter, count: int, mode: Any = AutoresetMode.NEXT_STEP):
+        problem, text = chosen.problem, chosen.settings.specification
+        self.env = SafeVectorEnv(dataclasses.replace(problem), count, autoreset_mode=mode)
+        self.filtered = SafetyFilterVectorWrapper(self.env, chosen)
+        self.monitor = SpecificationMonitorVector(self.filtered, text or "always safe")
+        self._low, self._high = np.array(problem.box).T
+
+    def reset(self, x: Any = None, seed: int = 0) -> dict[str, Any]:
+        options = None if x is None else {"state": np.reshape(x, (-1, self.env.problem.plant.n))}
+        return self.monitor.reset(seed=seed, options=options)[1]
+
+    def step(self, u: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """Propose physical inputs; return whose episodes end, and the info."""
+        u = np.reshape(u, (self.env.num_envs, -1))
+        scaled = (2.0 * u - self._low - self._high) / (self._high - self._low)
+        *_, terminated, truncated, info = self.monitor.step(scaled)
+        return terminated | truncated, info
+
+    def met(self, worst: np.ndarray, info: dict[str, Any], first: int = 0):
+        """Play on under the hostile policy from an instant on.
+
+        Returns:
+            Which episodes met the specification, and of each step where one goes on: p_k, where the
+            filter intervened, where it could keep p_k, and the verdicts before.
+        """
+        count = self.env.num_envs
+        met, alive, rows = np.zeros(count, dtype=bool), np.ones(count, dtype=bool), []
+        for k in range(first, STEPS):
+            before = info["verdict"]
+            u = worst[k, place_of(self.env.components[0]), info["automaton_state"]]
+            ended, info = self.step(u)
+            over = ended & alive
+            # Leaving the workspace is a violation, unless all was met before.
+            lost = (np.abs(self.env.components[0]) > 1.0) & (before < 1)
+            met[over] = (info["satisfied"] & ~lost)[over]
+            assert not info["promise"][over & ~met & (before >= 0)].any()
+            found = info["promise"], info["intervention"], info["feasible"], before
+            rows.append([part[alive] for part in found])
+            alive &= ~over
+        assert not alive.any()
+        return met, [np.concatenate(column) for column in zip(*rows, strict=True)]
+
+
+@functools.cache
+def hostile(text: str, moves: bool = False) -> np.ndarray:
+    automaton = problem_automaton(table_of(text, moves)[1], text or "always safe")
+    return worst_inputs(automaton, moves=moves, goal=text == REACH)
+
+
+def play(text: str, p: float, moves: bool = False, starts: Any = None, episodes: int = 2500):
+    """Play episodes under the hostile policy; return what `Episodes.met` does, and p_0."""
+    chosen = filter_of(text, p, moves)
+    played = Episodes(chosen, episodes if starts is None else len(starts))
+    info = played.reset(starts)
+    return *played.met(hostile(text, moves), info), info["promise"]
+
+
+CASES = [
+    (SAFETY, 0.5, False),
+    (SAFETY, 0.6, False),
+    (REACH, 0.5, True),
+    (REACH, 0.9, False),
+    (ORDER, 0.9, True),
+    (WINDOW, 0.5, False),
+]
+
+
+@pytest.mark.parametrize(("text", "p", "moves"), CASES)
+def test_a_hostile_policy_leaves_what_was_asked_for(text, p, moves):
+    met, _, begun = play(text, p, moves)
+    error = 3.0 * np.sqrt(p * (1.0 - p) / len(met))
     assert begun == pytest.approx(p)
     # The policy takes all that it is left: the filter does not do more than it has to.
-    assert p - error <= safe.mean() <= p + error + 0.03
+    assert p - error <= met.mean() <= p + error + 0.05
 
 
-def test_a_q_that_is_half_a_percent_too_high_breaks_it():
-    starts = np.full(6000, 15)
-    memory = memory_of(0.9, len(starts), Chain(factor=1.005))
-    safe, begun = play(memory, starts)
-    assert begun == pytest.approx(0.9)
-    assert safe.mean() < 0.85
+@pytest.mark.parametrize("text", [SAFETY, REACH])
+def test_from_every_start_the_mean_of_p_0_is_kept(text):
+    # Without the goal itself: a table takes it to be an end, an env not before the next step.
+    p, starts = 0.98, np.linspace(-0.999, 0.69 if text else 0.999, 3001)
+    met, _, begun = play(text, p, starts=starts)
+    automaton = problem_automaton(table_of(text)[1], text or "always safe")
+    exact = exact_values(automaton, goal=bool(text))[0][place_of(starts)]
+    a = int(automaton.step(0, automaton.initial, automaton.label([1, 0][: len(automaton.atoms)])))
+    # p_0 is what one step of look-ahead has, in the safe set.
+    assert not begun[starts <= -0.8].any()
+    inside = starts > -0.79
+    assert (begun[inside] <= np.minimum(exact[inside, a], p) + 2e-3).all()
+    assert (np.minimum(exact[inside, a], p) - begun[inside]).mean() < 0.03
+    assert met.mean() >= begun.mean() - 3.0 * np.sqrt(0.25 / len(starts))
+    assert 0.3 < begun.mean() < 0.95
 
 
-def test_from_every_start_the_mean_of_p_0_is_kept():
-    starts = np.repeat(np.arange(STATES), 200)
-    memory = memory_of(0.999, len(starts))
-    safe, begun = play(memory, starts)
-    assert safe.mean() >= begun - 3.0 * np.sqrt(0.25 / len(starts))
-    assert (memory.losses, memory.largest_loss < 1e-12) == (0, True)
-    # Near the edge of C not even the best input has .999.
-    assert 0.5 < begun < 0.9
-
-
-def test_p_0_is_the_one_step_look_ahead_in_c_and_0_outside():
-    x = LINE
-    found = memory_of(0.9, STATES).safety_filter.start((x,))
-    inside = (x >= SAFE.start) & (x < SAFE.stop)
-    np.testing.assert_array_equal(found[~inside], 0.0)
-    np.testing.assert_allclose(found[inside], np.minimum(EXACT.table[0, inside], 0.9), rtol=1e-12)
-    assert found[inside].min() < 0.9 < EXACT.table[0].max()
-
-
-def test_a_proposed_input_that_keeps_p_is_executed_exactly():
-    memory = memory_of(0.9, 3)
-    x, u = np.full(3, 15.0), np.array([0.123456789, -1.0, 1.0])
-    memory.begin((x,))
-    found = memory.decide_arrays((x,), (u,))
-    np.testing.assert_array_equal(found.action[0], u)
-    assert not found.active[0].any()
-    assert found.feasible.all()
+def test_what_is_met_for_sure_is_left_alone_and_what_is_violated_is_given_up():
+    met, (levels, intervened, _, verdict), _ = play(TOUCH, 0.9, episodes=500)
+    assert (levels[verdict > 0] == 1.0).all()
+    assert not intervened[verdict > 0].any()
+    assert np.count_nonzero(verdict > 0) > 100
+    assert intervened[verdict == 0].any()
+    assert met.any()
+    _, (levels, intervened, feasible, verdict), _ = play(WINDOW, 0.5, episodes=500)
+    over = verdict < 0
+    assert np.count_nonzero(over) > 100
+    for part in (levels, intervened, feasible):
+        assert not part[over].any()
 
 
 def test_the_input_is_the_nearest_that_keeps_p():
-    # Close to the lower edge only inputs from some u* on keep p; the filter is to find u*.
-    p = 0.97 * EXACT.table[0, 6]
-    x = np.full(41, 6.0)
-    u = np.linspace(-1.0, 1.0, 41)
-    memory = memory_of(p, len(x))
-    memory.begin((x,))
-    found = memory.decide_arrays((x,), (u,)).action[0]
-    fine = np.linspace(-1.0, 1.0, 200_001)
-    q = EXACT.expected(np.array([0]), (x[:1],), fine[None, :, None])[0]
-    allowed = fine[q >= p]
-    nearest = allowed[np.abs(allowed[None] - u[:, None]).argmin(axis=1)]
-    assert 0 < np.count_nonzero(np.abs(nearest - u) > 1e-4) < len(u)
-    assert np.abs(found - nearest).max() < 0.25 / 64 + 1e-5
-    assert (EXACT.expected(np.zeros(41, int), (x,), found[:, None, None])[:, 0] >= p).all()
+    # Next to the wall only inputs from some u* on keep p, and these are executed as proposed.
+    proposed = np.linspace(-2.0, 2.0, 81)
+    at = np.full(81, -0.6)
+    best = Episodes(filter_of(SAFETY, 0.999), 1).reset(at[:1])["promise"].item()
+    p = 0.97 * best
+    played = Episodes(filter_of(SAFETY, p), 81)
+    assert played.reset(at)["promise"] == pytest.approx(p)
+    _, info = played.step(proposed)
+    executed, changed = info["safe_action"][:, 0], info["intervention"]
+    assert info["feasible"].all()
+    assert 10 < changed.sum() < 70
+    np.testing.assert_allclose(executed[~changed], proposed[~changed], atol=1e-6)
+    edge = proposed[~changed].min()
+    assert (changed == (proposed < edge)).all()
+    # To the resolution of the search: a 64th of the distance of scanned inputs.
+    assert np.ptp(executed[changed]) < 0.25 / 64 + 1e-5
+    assert edge - 0.05 - 0.25 / 64 < executed[changed].min() <= edge + 1e-6
+    # u* is where the exact expectation is p, but for the error of the table.
+    problem = table_of(SAFETY)[1]
+    automaton = problem_automaton(problem, "always safe")
+    after = exact_values(automaton, goal=False)[1].max(axis=1)
+    draws = np.random.default_rng(0).normal(size=40_000) * 0.5 * np.sqrt(PERIOD)
+    kept = after[place_of(-0.6 + PERIOD * executed[0] + draws)].mean()
+    assert p - 0.01 < kept < p + 0.03
 
 
-def test_outside_c_and_after_an_exit_it_takes_the_best_input_and_says_so():
-    memory = memory_of(0.9, 3)
-    x = np.array([1.0, 15.0, 15.0])
-    memory.begin((x,))
-    assert memory.levels.tolist() == [0.0, 0.9, 0.9]
-    memory.decide_arrays((x,), (np.zeros(3),))
-    # The first is back in C, the second leaves it, and the third's episode ends in C.
-    x = np.array([4.0, 1.0, 15.0])
-    memory.advance((x,), np.array([False, False, True]))
-    assert memory.levels[:2].tolist() == [0.0, 0.0]
-    assert memory.levels[2] > 0.0
-    x = np.array([4.0, 4.0, 4.0])
-    found = memory.decide_arrays((x,), (np.full(3, -1.0),))
-    assert not found.feasible.any()
-    np.testing.assert_array_equal(found.action[0], 1.0)
-    np.testing.assert_array_equal(memory.report()["promise"], 0.0)
-    memory.advance((x,), False)
-    np.testing.assert_array_equal(memory.levels, 0.0)
-    np.testing.assert_array_equal(found.slack[0], 0.0)
+def test_outside_of_the_safe_set_it_takes_the_best_input_and_says_so():
+    played, going, returned = Episodes(filter_of(SAFETY, 0.5), 60), np.ones(60, dtype=bool), 0
+    starts = np.append(np.full(59, -0.9), 0.0)
+    assert played.reset(starts)["promise"].tolist() == [0.0] * 59 + [0.5]
+    for k in range(4):
+        ended, info = played.step(np.full(60, -2.0))
+        lost = np.flatnonzero(going[:59])
+        assert info["feasible"][59]
+        assert not info["feasible"][lost].any()
+        if k == 0:  # The best input leads away from the wall.
+            np.testing.assert_allclose(info["safe_action"][lost, 0], 2.0)
+        # Back inside nothing is kept.
+        assert not info["promise"][lost].any()
+        assert not info["slack"][lost].any()
+        returned += int((played.env.components[0][lost] > -0.8).sum())
+        going &= ~ended
+    assert returned > 50
+
+
+def test_for_a_specification_the_proposed_input_is_executed_where_nothing_can_be_kept():
+    played = Episodes(filter_of(REACH, 0.9), 2)
+    begun = played.reset([-0.9, -0.7])["promise"]
+    _, info = played.step([0.3, -2.0])
+    assert begun[0] == 0.0 < begun[1]
+    assert info["safe_action"][0, 0] == pytest.approx(0.3)
+    assert info["safe_action"][1, 0] > -2.0
+    assert info["intervention"].tolist() == [False, True]
+    assert info["feasible"].tolist() == [False, True]
+
+
+def test_p_is_spent_evenly_and_its_mean_does_not_fall():
+    # Noise in boxes shows what the next states have: p_1 = min(c, L_1), with one c for all.
+    problem = scalar(-x, 0.3 + 0.3 * x, start=(0.3,), horizon=0.5)
+    played = Episodes(promised(solved(problem, 120, inputs=9), problem, 0.6), 4000)
+    begun = played.reset()["promise"]
+    _, info = played.step(np.full(4000, -1.0))
+    levels, most = info["promise"], info["promise"].max()
+    assert 0.02 < (np.abs(levels - most) < 1e-6).mean() < 1.0
+    error = 3.0 * levels.std() / np.sqrt(4000)
+    assert begun[0] - error <= levels.mean() <= begun[0] + error + 0.06
 
 
 def test_a_table_of_zeros_gives_nothing_and_no_nan():
-    nothing = copy.copy(EXACT)
-    nothing.table, nothing.ahead = 0.0 * EXACT.table, 0.0 * EXACT.ahead
-    memory = memory_of(0.9, 2, nothing)
-    x = (np.array([15.0, 3.0]),)
-    memory.begin(x)
+    table, problem = table_of(SAFETY)
+    nothing = dataclasses.replace(table, lower=0.0 * table.lower)
+    played = Episodes(promised(nothing, problem, 0.9), 2)
+    assert not played.reset([0.0, -0.5])["promise"].any()
     for _ in range(3):
-        found = memory.decide_arrays(x, (np.zeros(2),))
-        memory.advance(x, False)
-        assert np.isfinite([found.action[0], found.margin[0], memory.levels]).all()
-        assert not found.feasible.any()
+        _, info = played.step([0.0, 1.0])
+        assert not info["feasible"].any()
+        for name in ("safe_action", "promise", "slack"):
+            assert np.isfinite(info[name]).all()
 
 
-def test_one_state_is_a_batch_of_one():
-    many, one = memory_of(0.95, 5), memory_of(0.95, 1)
-    rng = np.random.default_rng(1)
-    xs = rng.integers(4, 26, (6, 5)).astype(float)
-    us = rng.uniform(-1.0, 1.0, (5, 5))
-    many.begin((xs[0],))
-    rows = []
-    for k in range(5):
-        found = many.decide_arrays((xs[k],), (us[k],))
-        many.advance((xs[k + 1],), False)
-        rows.append((found.action[0], found.feasible, found.slack[0], many.levels))
-    for i in range(5):
-        one.begin((xs[0, i].item(),))
-        for k in range(5):
-            found = one.decide_floats((xs[k, i].item(),), [us[k, i].item()])
-            one.advance((xs[k + 1, i].item(),), False)
-            action, feasible, slack, levels = (part[i].item() for part in rows[k])
-            assert (found.action, found.feasible, found.slack) == ([action], feasible, [slack])
-            assert one.levels[0] == levels
-            assert type(found.feasible) is bool
+def test_what_a_false_table_loses_is_told():
+    table, problem = table_of(SAFETY)
+    # The next values are too high, and those after them are not: p_1 cannot be kept.
+    lower = np.array(table.lower)
+    lower[1] = np.minimum(1.0, 1.2 * lower[1])
+    played = Episodes(promised(dataclasses.replace(table, lower=lower), problem, 0.95), 50)
+    played.reset(np.full(50, -0.7))
+    told = 0.0
+    for _ in range(3):
+        _, info = played.step(np.zeros(50))
+        told = max(told, info["slack"].max())
+    assert told > 1e-3
+    exact = Episodes(promised(table, problem, 0.95), 50)
+    exact.reset(np.full(50, -0.7))
+    for _ in range(3):
+        assert exact.step(np.zeros(50))[1]["slack"].max() < 1e-6
 
 
-def test_losses_are_counted():
-    memory = memory_of(0.9, 2)
-    x = (np.array([15.0, 15.0]),)
-    memory.begin(x)
-    memory.levels = np.array([0.9, 0.9999])
-    found = memory.decide_arrays(x, (np.zeros(2),))
-    top = EXACT.table[0, 15]
-    assert memory.losses == 1
-    assert memory.largest_loss == pytest.approx(0.9999 - top)
-    np.testing.assert_allclose(found.slack[0], [0.0, 0.9999 - top], rtol=1e-9)
-    np.testing.assert_allclose(memory.levels, [0.9, top])
-
-
-def test_episodes_longer_than_the_table_are_refused():
-    with pytest.raises(ConfigurationError, match=r"have 41 steps, and the table.*only 40"):
-        PromiseFilter(EXACT, PromiseSettings(0.9), chain_problem(STEPS + 1))
-    PromiseFilter(EXACT, PromiseSettings(0.9), chain_problem(STEPS - 1))
-
-
-def test_beyond_the_table_nothing_is_promised():
-    memory, x = memory_of(0.9, 1), np.array([15.0])
-    memory.begin((x,))
-    for _ in range(STEPS):
-        assert memory.decide_arrays((x,), (np.zeros(1),)).feasible.all()
-        memory.advance((x,), False)
-    assert memory.levels[0] > 0.0
-    assert not memory.decide_arrays((x,), (np.zeros(1),)).feasible.any()
-    memory.advance((x,), False)
-    assert (memory.levels.tolist(), memory.losses) == ([0.0], 0)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"promise": np.array([0.5, np.nan])},
-        {"promise": np.array([0.5, 1.5])},
-        {"promise": np.array([0.5])},
-        {"instant": np.array([0, -1])},
-        {"promise_ended": np.zeros(3, dtype=bool)},
-    ],
-)
-def test_a_snapshot_of_no_promise_is_refused(change):
-    memory = memory_of(0.9, 2)
-    memory.begin((np.array([15.0, 15.0]),))
-    with pytest.raises(InvalidInputError, match="for each of 2 envs"):
-        memory.restore({**memory.snapshot(), **change})
-    assert memory.levels.tolist() == [0.9, 0.9]
-
-
-def test_a_copy_shares_the_table():
-    memory = memory_of(0.9, 2)
-    twin = copy.deepcopy(memory)
-    assert twin.safety_filter is memory.safety_filter
-    memory.begin((np.array([15.0, 15.0]),))
-    assert twin.levels.tolist() == [0.0, 0.0]
-
-
-class Plane:
-    """Two inputs: q falls with their sum, so that inputs below a line are allowed."""
-
-    steps = 1
-    inputs = np.stack(np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-2, 2, 9)), -1).reshape(-1, 2)
-
-    def values(self, k, x):
-        return np.ones(len(k))
-
-    def expected(self, k, x, u):
-        return np.clip(0.6 - 0.1 * (u[..., 0] + u[..., 1]), 0.0, 1.0)
-
-    def scanned(self, k, x):
-        return self.expected(k, x, np.broadcast_to(self.inputs, (len(k), *self.inputs.shape)))
-
-    def best_input(self, k, x):
-        return np.broadcast_to(self.inputs[0], (len(k), 2)), self.scanned(k, x).max(axis=1)
-
-    def sufficient(self, k, x, u, levels):
-        return self.expected(k, x, u[:, None, :])[:, 0], np.full(len(u), np.inf)
+def two_inputs(gain, barrier, box, start, dt=1.0, noise=0.02):
+    u, v = sp.symbols("u v", real=True)
+    inputs, row = ((u, v), [[1, gain]]) if gain else ((u,), [[1]])
+    system = ControlAffineSDE((x,), inputs, [0.5], row, [[noise]])
+    return state_problem(
+        system, barrier, box=box, start=start, dt=dt, horizon=dt, workspace={x: (-3.0, 3.0)}
+    )
 
 
 def test_two_inputs_move_in_the_euclidean_distance():
-    problem = state_problem(
-        ControlAffineSDE((X,), (U, V), [0], [[1, 1]], [[0]]),
-        1 - X**2,
-        box=[(-1.0, 1.0), (-2.0, 2.0)],
-        start=[0.0],
-        dt=1.0,
-        horizon=1.0,
-    )
-    chosen = PromiseFilter(Plane(), PromiseSettings(0.6), problem)
-    rng = np.random.default_rng(0)
-    u = tuple(rng.uniform(-1.0, 1.0, (2, 200)) * [[1.0], [2.0]])
-    zeros = np.zeros(200)
-    found = chosen.choose(zeros.astype(int), np.full(200, 0.6), (zeros,), u)
-    # Allowed is u1 + u2 <= 0: the distance to that line is the least that can be had.
-    distance = np.hypot(*np.subtract(found.action, u))
-    least = np.maximum(u[0] + u[1], 0.0) / np.sqrt(2.0)
-    np.testing.assert_array_equal(found.replaced, u[0] + u[1] > 0.0)
-    assert (np.sum(found.action, axis=0) <= 1e-9).all()
-    assert (distance >= least - 1e-9).all()
-    assert (distance - least).max() < 0.25
-    assert (np.abs(found.action[0]) <= 1.0).all()
-
-
-class Peak(Plane):
-    """One input, of which only a few values near 0.3125 are any good."""
-
-    inputs = np.linspace(-1.0, 1.0, 33)[:, None]
-
-    def expected(self, k, x, u):
-        return np.clip(0.9 - 5.0 * np.abs(u[..., 0] - 0.3125), 0.0, 1.0)
+    problem = two_inputs(1, 1 - x, [(-1.0, 1.0), (-2.0, 2.0)], [0.4])
+    chosen = promised(solved(problem, 300, inputs=9), problem, 0.6)
+    played, rng = Episodes(chosen, 400), np.random.default_rng(0)
+    played.reset()
+    u = rng.uniform(-1.0, 1.0, (400, 2)) * [1.0, 2.0]
+    _, info = played.step(u)
+    executed, changed = info["safe_action"], info["intervention"]
+    # Allowed is u1 + u2 <= c: the distance to that line is the least that can be had.
+    total = u.sum(axis=1)
+    assert total[~changed].max() < total[changed].min()
+    c = executed.sum(axis=1).max()
+    assert abs(c - 0.1) < 0.05  # From .4 + .5 to 1.
+    distance = np.linalg.norm(executed - u, axis=1)
+    least = np.maximum(total - c, 0.0) / np.sqrt(2.0)
+    assert (distance >= least - 1e-6).all()
+    assert (distance - least).max() < 0.35
+    assert (np.abs(executed[:, 0]) <= 1.0).all()
 
 
 def test_all_scanned_inputs_are_looked_at_before_anything_is_lost():
-    # Of every fourth input none is allowed.
-    chosen = PromiseFilter(Peak(), PromiseSettings(0.85), chain_problem(1))
-    assert not (chosen.look_ahead.expected(0, 0, np.linspace(-1, 1, 9)[:, None]) >= 0.85).any()
-    u, levels = np.array([-1.0, 0.5, 0.3130]), np.full(3, 0.85)
-    x = (np.full(3, 15.0),)
-    found = chosen.choose(np.zeros(3, dtype=int), levels, x, (u,))
-    np.testing.assert_array_equal(found.level, levels)
-    np.testing.assert_allclose(found.action[0], [0.3025, 0.3225, 0.3130], atol=1e-3)
-    assert (found.expected >= 0.85).all()
-    # More than the best one has is lowered to that.
-    found = chosen.choose(np.zeros(3, dtype=int), np.full(3, 0.95), x, (u,))
-    np.testing.assert_allclose(found.level, 0.9)
-    np.testing.assert_allclose(found.action[0], 0.3125)
+    # Of the inputs from -.4 on only a few between .3 and .33 lead to the second part.
+    barrier = sp.Max(sp.Rational(1, 400) - x**2, (x - 0.8) * (0.83 - x))
+    problem = two_inputs(0, barrier, (-0.4, 1.0), [0.0], noise=0.003)
+    chosen = promised(solved(problem, 3000, inputs=57), problem, 0.9)
+    played = Episodes(chosen, 3)
+    begun = played.reset()["promise"]
+    assert begun == pytest.approx(0.9)
+    _, info = played.step([-0.4, 0.5, 0.315])
+    assert info["feasible"].all()
+    assert (info["slack"] == 0.0).all()
+    executed = info["safe_action"][:, 0]
+    assert ((executed > 0.3) & (executed < 0.33)).all()
+    assert executed[0] < executed[2] < executed[1]
+    assert executed[2] == pytest.approx(0.315)
+
+
+@pytest.mark.parametrize(
+    "mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED]
+)
+def test_promises_begin_anew_with_every_episode(mode):
+    played = Episodes(filter_of(ORDER, 0.9), 40, mode)
+    info = played.reset(seed=1)
+    start, rng, begun = info["automaton_state"].copy(), np.random.default_rng(0), 0
+    fresh, seen = np.zeros(40, dtype=bool), set()
+    for _ in range(2 * STEPS + 4):
+        over, info = played.step(rng.uniform(-2.0, 2.0, (40, 1)))
+        if mode == AutoresetMode.DISABLED and over.any():
+            _, info = played.monitor.reset(options={"reset_mask": over})
+        new = fresh if mode == AutoresetMode.NEXT_STEP else over
+        np.testing.assert_array_equal(info["automaton_state"][new], start[new])
+        np.testing.assert_allclose(info["promise"][new], 0.9)
+        begun, fresh = begun + np.count_nonzero(new), over
+        seen |= set(info["automaton_state"].tolist())
+    assert begun >= 60
+    assert len(seen) > 2
+
+
+@pytest.mark.parametrize("text", [SAFETY, REACH, WINDOW])
+def test_from_states_that_are_set_is_kept_what_can_be_after_the_trace(text):
+    p, count, late = 0.9, 2000, 2
+    chosen = filter_of(text, p)
+    played = Episodes(chosen, count)
+    played.reset(np.full(count, -0.2), seed=1)
+    for _ in range(late):
+        _, info = played.step(np.zeros(count))
+    before, a, good = info["promise"], info["automaton_state"], info["verdict"] >= 0
+    assert good.mean() > 0.9
+    played.env.state = x = np.linspace(-0.75, 0.65, count)[:, None]
+    played.filtered.follow()
+    levels = played.filtered.snapshot()["promise"]
+    problem = chosen.problem
+    automaton = problem_automaton(problem, text or "always safe")
+    exact = exact_values(automaton, goal=text == REACH)[late, place_of(x[:, 0]), a]
+    assert (levels <= np.minimum(exact, p) + 2e-3)[good].all()
+    assert (np.minimum(exact, p) - levels)[good].mean() < 0.05
+    assert (levels < before).any()
+    met, _ = played.met(hostile(text), info, late)
+    assert met[good].mean() >= levels[good].mean() - 3.0 * np.sqrt(0.25 / count)
+
+
+def test_a_goal_that_a_state_is_set_into_is_not_yet_an_end():
+    text, problem = "always safe & eventually left", walk()
+    table = solve(problem, ValueSettings(specification=text, cells=(160,), inputs=17))
+    played = Episodes(promised(table, problem, 0.9, text), 2)
+    # Both have been on the left: if their episodes ended now, they had met the specification.
+    played.reset(np.full(2, -0.4))
+    played.env.state = np.array([[0.75], [0.5]])
+    played.filtered.follow()
+    levels = played.filtered.snapshot()["promise"]
+    assert levels[0] == 0.0
+    assert levels[1] > 0.0
+
+
+def test_a_late_start_is_no_whole_episode():
+    envs = Episodes(filter_of(REACH, 0.9), 2).filtered
+    envs.reset(seed=0, options={"t": 0.0})
+    with pytest.raises(ConfigurationError, match="time 0"):
+        envs.reset(options={"t": PERIOD})
+
+
+@pytest.mark.parametrize("text", [SAFETY, ORDER])
+def test_a_snapshot_has_all_that_is_remembered(text):
+    played = Episodes(filter_of(text, 0.6), 20)
+    envs = played.filtered
+    envs.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 20, 1))
+    for action in actions[:6]:
+        envs.step(action)
+    snapshot = envs.snapshot()
+
+    def goes_on():
+        return [envs.step(action)[-1]["promise"] for action in actions[6:]]
+
+    envs.restore(snapshot, seed=9)
+    first = goes_on()
+    envs.restore(snapshot, seed=9)
+    np.testing.assert_array_equal(goes_on(), first)
+    now = envs.snapshot()
+    with pytest.raises(InvalidInputError, match="promise_automaton"):
+        envs.restore({k: v for k, v in snapshot.items() if k != "promise_automaton"})
+    for name, value in (
+        ("promise", np.full(20, np.nan)),
+        ("promise", np.full(20, 1.5)),
+        ("promise", np.full(19, 0.5)),
+        ("instant", np.full(20, -1)),
+        ("promise_ended", np.zeros(21, dtype=bool)),
+    ):
+        with pytest.raises(InvalidInputError):
+            envs.restore({**snapshot, name: value})
+    np.testing.assert_array_equal(envs.snapshot()["promise"], now["promise"])
+
+
+@pytest.mark.parametrize("text", [SAFETY, REACH])
+def test_copies_and_pickles_decide_alike(text):
+    chosen, infos = filter_of(text, 0.6), []
+    assert copy.deepcopy(chosen) is chosen  # Its table may be of gigabytes.
+    for each in (chosen, pickle.loads(pickle.dumps(chosen))):
+        played = Episodes(each, 50)
+        played.reset(np.linspace(-0.7, 0.6, 50))
+        infos.append([played.step(np.linspace(-2.0, 2.0, 50))[1] for _ in range(3)])
+    for one, other in zip(*infos, strict=True):
+        for name in ("promise", "safe_action", "intervention", "feasible"):
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_the_file_of_a_table_is_read(tmp_path):
+    table, problem = table_of(REACH)
+    settings = dataclasses.replace(table.settings, knowledge="plant")
+    save_table(dataclasses.replace(table, settings=settings), tmp_path / "walk.npz")
+    text = f"promise:p=0.9:spec={REACH}:table={tmp_path / 'walk.npz'}"
+    infos = []
+    for chosen in (
+        filter_of(REACH, 0.9),
+        promise_filter_for(problem, PromiseSettings.of_text(text)),
+    ):
+        played = Episodes(chosen, 20)
+        played.reset()
+        infos.append(played.step(np.full(20, -2.0))[1]["safe_action"])
+    np.testing.assert_array_equal(*infos)
+
+
+def test_a_table_of_something_else_is_refused():
+    table, problem = table_of(REACH)
+    for other in ("", "always safe"):
+        with pytest.raises(ConfigurationError, match="eventually goal"):
+            promised(table, problem, 0.9, other)
+    wider = {**problem.regions, "left": problem.regions["left"] + 0.01}
+    with pytest.raises(ConfigurationError, match="regions"):
+        filter_of(REACH, 0.9).require_problem(dataclasses.replace(problem, regions=wider))
+    table, problem = table_of(SAFETY)
+    longer = dataclasses.replace(problem, horizon=problem.horizon + PERIOD)
+    with pytest.raises(ConfigurationError, match=f"{STEPS + 1} steps"):
+        PromiseFilter(LookAhead(table, problem), PromiseSettings(0.9), longer)
+    shorter = dataclasses.replace(problem, horizon=problem.horizon - PERIOD)
+    PromiseFilter(LookAhead(table, problem), PromiseSettings(0.9), shorter)
+
+
+@pytest.mark.parametrize(
+    ("specification", "fragment"),
+    [
+        ("always safe & eventually nowhere", "nowhere"),
+        ("always (safe", "specification"),
+        ("eventually[0,99] left", "99"),
+    ],
+)
+def test_what_is_no_specification_of_the_problem_is_refused(specification, fragment):
+    settings = PromiseSettings(0.9, specification=specification)
+    with pytest.raises(ConfigurationError, match=fragment):
+        promise_filter_for(walk(), settings)
+
+
+def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
+    problem = walk()
+    starts = np.array([[0.0], [0.5], [-0.9]])
+    with pytest.MonkeyPatch.context() as patch:
+        made = "safe_envs.values.promise_filter.promise_filter_for"
+        patch.setattr(made, lambda problem, settings, knowledge: filter_of(REACH, 0.9))
+        bound = PromiseBound(PromiseSettings(0.9, specification=REACH), problem, "model")
+        assert (bound.why_none, bound.at(starts).mean()) == ("", pytest.approx(0.6))
+        settings = PromiseSettings(0.9, specification="eventually goal")
+        assert "unsafe episodes" in why_not_of_safety(problem, settings)
+        assert "'eventually goal'" in PromiseBound(settings, problem, "model").why_none
+    assert why_not_of_safety(problem, PromiseSettings(0.9)) == ""
+    assert len(computed_notes(["promise:p=0.9", f"promise:p=0.9:spec={REACH}"])) == 2
+    assert len(computed_notes(["promise:p=0.9"])) == 1
