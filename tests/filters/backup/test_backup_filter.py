@@ -1,8 +1,9 @@
-"""Decisions of the backup filter: one state and batches, several laws, the last resort, errors."""
+"""What the backup filter keeps, against exact kernels; one state and batches; the last resort."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from dataclasses import replace
 
@@ -11,8 +12,13 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionError
+from safe_envs.agents import make_policy
+from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
+from safe_envs.agents.evaluation.episodes import play
+from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.backup import Backup, BackupLaw
 from safe_envs.proofs.backup_filter import BackupFilter
+from safe_envs.wrappers import SafetyFilterVectorWrapper
 from tests.oracles.carts import (
     BRAKE,
     DT,
@@ -24,12 +30,101 @@ from tests.oracles.carts import (
     cart_filter,
     cart_problem,
     drawn,
+    highest,
+    moved,
     settings,
+    table_problem,
     v,
     x,
 )
 
 BOUNDS = (-STRONGEST, STRONGEST)
+
+
+def test_the_kept_set_is_the_kernel_of_held_inputs():
+    states, proposed = drawn(6000)
+    found = cart_filter().filter(states, proposed)
+    clear = np.abs(highest(states) - 1.0) > 1e-9
+    kept = highest(states) <= 1.0
+    assert (found.feasible == kept)[clear].all()
+    assert 0.2 < kept.mean() < 0.9
+
+
+def test_an_input_is_allowed_exactly_where_it_leads_into_the_kernel():
+    states, proposed = drawn(6000)
+    found = cart_filter().filter(states, proposed)
+    reached = moved(states, proposed)
+    level = np.maximum(reached[:, 0], highest(reached))
+    clear = np.abs(level - 1.0) > 1e-8
+    passed = (found.action == proposed)[:, 0]
+    assert (passed == (level <= 1.0))[clear].all()
+    # Where it is not, the largest input that does is missed by a step of the search at most.
+    changed = ~passed & found.feasible & clear
+    assert changed.sum() > 100
+    u = found.action[changed, 0]
+    reached = moved(states[changed], found.action[changed])
+    assert np.maximum(reached[:, 0], highest(reached)).max() <= 1.0
+    step = (proposed[changed, 0] + STRONGEST) / 64
+    beyond = moved(states[changed], (u + step)[:, None])
+    assert (np.maximum(beyond[:, 0], highest(beyond)) > 1.0 - 1e-8).all()
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.02])
+def test_the_kept_set_approaches_that_of_continuous_control(dt):
+    rng = np.random.default_rng(1)
+    speed = rng.uniform(0.0, 2.0, 200)
+    edge = 1.0 - speed**2 / (2 * STRONGEST)
+    guard = cart_filter(dt=dt)
+    # Between control instants the cart may be beyond by what it climbs in half a period.
+    over = STRONGEST * dt**2 / 8
+    rest = np.zeros((200, 1))
+    inside = guard.filter(np.column_stack([edge - 1e-9, speed]), rest)
+    outside = guard.filter(np.column_stack([edge + over + 1e-9, speed]), rest)
+    stays = speed > STRONGEST * dt  # else it is in the terminal set one instant later
+    assert inside.feasible.all()
+    assert not outside.feasible[stays].any()
+
+
+def test_from_the_kernel_nothing_makes_it_infeasible():
+    """Steps of random and of hostile proposals, in the env's own arithmetic."""
+    states, _ = drawn(4000, seed=3)
+    states = states[highest(states) <= 1.0 - 1e-9][:300]
+    guard, rng = cart_filter(), np.random.default_rng(4)
+    lowest = np.inf
+    for k in range(80):
+        proposed = rng.uniform(-2 * STRONGEST, 2 * STRONGEST, (300, 1))
+        proposed[::2] = STRONGEST
+        found = guard.filter(states, proposed)
+        assert found.feasible.all(), k
+        assert np.abs(found.action).max() <= STRONGEST
+        states = moved(states, found.action)
+        lowest = min(lowest, (1.0 - states[:, 0]).min())
+    assert lowest >= 0.0
+    assert (states[::2, 0] > 0.99).mean() > 0.5  # it lets them come close
+
+
+def test_a_margin_holds_at_every_instant():
+    states, _ = drawn(4000, seed=5)
+    states = states[highest(states) <= 0.9][:200]
+    guard = cart_filter(settings=settings(margin=0.05))
+    for _ in range(60):
+        states = moved(states, guard.filter(states, np.full((200, 1), STRONGEST)).action)
+    assert 0.05 <= (1.0 - states[:, 0]).min() < 0.06
+
+
+def test_a_short_horizon_keeps_less_and_stays_feasible():
+    states, proposed = drawn(1500, seed=6)
+    long, short = cart_filter(), cart_filter(horizon=0.5)
+    at_ease = short.filter(states, proposed).feasible
+    assert (long.filter(states, proposed).feasible[at_ease]).all()
+    # v <= 0 after 1 + 5 periods of full braking.
+    assert (states[at_ease, 1] <= 0.6 * STRONGEST + 1e-12).all()
+    states = states[at_ease]
+    for _ in range(40):
+        found = short.filter(states, np.full((len(states), 1), STRONGEST))
+        assert found.feasible.all()
+        states = moved(states, found.action)
+    assert states[:, 0].max() <= 1.0
 
 
 def walls(laws=(BRAKE, PULL)):
@@ -45,7 +140,7 @@ def walls(laws=(BRAKE, PULL)):
 
 @pytest.mark.parametrize("guard", [cart_filter(), walls(), walls((PULL,))])
 def test_one_state_is_decided_as_in_a_batch(guard):
-    states, proposed = drawn(150, seed=7)
+    states, proposed = drawn(60, seed=7)
     together = guard.filter(states, proposed)
     assert len(np.unique(together.active)) == len(np.unique(together.feasible)) == 2
     for i, (state, u) in enumerate(zip(states, proposed, strict=True)):
@@ -98,7 +193,7 @@ def test_the_cause_is_the_barrier_that_the_proposal_violates():
 
 
 def test_several_laws_keep_more_than_each_of_them():
-    states, proposed = drawn(5000, seed=8)
+    states, proposed = drawn(1500, seed=8)
     both, brake, pull = (
         guard.filter(states, proposed) for guard in (walls(), walls((BRAKE,)), walls((PULL,)))
     )
@@ -267,3 +362,74 @@ def test_another_problem_is_refused():
             guard.require_problem(cart_problem(**options))
     with pytest.raises(ConfigurationError, match="system"):
         guard.require_problem(cart_problem(noise=0.1))
+
+
+def table_states(count):
+    rng = np.random.default_rng(2)
+    states = np.column_stack(
+        [rng.uniform(lo, hi, count) for lo, hi in ((-1, 1), (0, 1.5), (-1, 0), (-1, 1))]
+    )
+    return states, rng.uniform(-STRONGEST, STRONGEST, (count, 2))
+
+
+@pytest.fixture(scope="module")
+def two_inputs():
+    return BackupFilter.for_problem(table_problem())
+
+
+def test_the_input_along_the_wall_is_left_as_it_was(two_inputs):
+    states, proposed = table_states(1200)
+    proposed[:, 0] = STRONGEST
+    found = two_inputs.filter(states, proposed)
+    alone = cart_filter().filter(states[:, :2], proposed[:, :1])
+    changed = found.feasible & found.active[:, 0]
+    assert changed.sum() > 60
+    assert (np.abs(found.action) <= STRONGEST).all()
+    along = np.abs(found.action - proposed)[changed, 1]
+    assert np.median(along) < 1e-9
+    # Where the instant of the peak changes on the way, the slopes are of another one.
+    assert (along > 0.1).mean() < 0.1
+    # And the other one is about as near as that of the cart on its own.
+    lost = (alone.action - found.action)[changed, 0]
+    assert np.abs(lost).max() < 2 * STRONGEST / 8
+    assert np.mean(lost) < 2 * STRONGEST / 64
+
+
+def test_nothing_is_executed_that_was_not_verified(two_inputs):
+    states, proposed = table_states(300)
+    found = two_inputs.filter(states, proposed)
+    again = two_inputs.filter(states, found.action)
+    assert np.array_equal(again.feasible, found.feasible)
+    assert not again.active[found.feasible].any()
+    np.testing.assert_allclose(
+        again.margin[found.feasible], found.margin[found.feasible], atol=1e-12
+    )
+
+
+def test_with_two_inputs_nothing_makes_it_infeasible(two_inputs):
+    rng = np.random.default_rng(3)
+    env = SafetyFilterVectorWrapper(SafeVectorEnv(table_problem(horizon=10.0), 60), two_inputs)
+    env.reset(seed=0)
+    for k in range(40):
+        proposed = rng.uniform(-1.0, 1.0, (60, 2))
+        proposed[::2] = np.sign(proposed[::2])
+        info = env.step(proposed)[-1]
+        assert info["feasible"].all(), k
+        assert (info["barrier"] > 0.0).all()
+
+
+def test_the_compiled_text_plays_the_episodes_of_numpy():
+    problem = table_problem(horizon=1.0)
+    actor, guard = make_policy("nominal", problem), BackupFilter.for_problem(problem)
+    env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, 4), "backup")
+    program = CompiledEpisodes(problem, actor, guard, False)
+    expected = list(play(env, actor, range(8), 3))
+    found = list(program.play(program.program.plain(), range(8), 3, 1, lambda _: []))
+    one, other = (
+        type(batches[0].results).joined([batch.results for batch in batches])
+        for batches in (expected, found)
+    )
+    assert one.interventions.sum() > 8
+    for field in dataclasses.fields(one):
+        pair = getattr(one, field.name), getattr(other, field.name)
+        np.testing.assert_allclose(*pair, rtol=1e-7, atol=1e-12, err_msg=field.name)

@@ -88,14 +88,18 @@ class Pressed:
 
 
 POLICIES = ("random", "bang_bang", "adversary")
-NAMES = [pytest.param(n, marks=[pytest.mark.slow] * (n == "QuadrotorLimits")) for n in SYSTEMS]
+QUICK = [
+    ("DubinsDisk", "adversary"),
+    ("ACCGap", "bang_bang"),
+    ("Pendulum", "adversary"),
+    ("QuadrotorLimits", "random"),
+]
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "policy"), QUICK)
 def test_no_step_is_infeasible_or_unsafe(name, policy):
-    pressed = Pressed(name, 100, seed=0)
-    assert pressed.run(getattr(pressed, policy), 30) == (0, 0)
+    pressed = Pressed(name, 40, seed=0)
+    assert pressed.run(getattr(pressed, policy), 20) == (0, 0)
 
 
 @pytest.mark.oracle
@@ -106,11 +110,14 @@ def test_no_step_of_a_million_is_infeasible_or_unsafe(name, policy):
     assert pressed.run(getattr(pressed, policy), 250) == (0, 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n == "DubinsDisk" else pytest.mark.oracle) for n in SYSTEMS],
+)
 def test_every_start_of_the_env_is_in_the_domain(name):
     pressed = Pressed(name, 10, seed=2)
     problem = pressed.problem
-    x = problem.starts[problem.start].proposals(2000)
+    x = problem.starts[problem.start].proposals(1000)
     x = x[pressed.barrier(x) >= 0.0]
     at_rest = np.broadcast_to(0.5 * (pressed.low + pressed.high), (len(x), problem.plant.m))
     kept = pressed.filter.filter(x, at_rest).feasible
