@@ -14,8 +14,6 @@ import sympy as sp
 from gymnasium.vector import AutoresetMode
 
 from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, state_problem
-from safe_envs.agents.evaluation.bounds import PromiseBound
-from safe_envs.agents.evaluation.notes import computed_notes
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.filters.specification import problem_automaton
 from safe_envs.problem.problem import SafetyProblem
@@ -472,15 +470,7 @@ def test_what_is_no_specification_of_the_problem_is_refused(specification, fragm
 
 def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
     problem = walk()
-    starts = np.array([[0.0], [0.5], [-0.9]])
-    with pytest.MonkeyPatch.context() as patch:
-        made = "safe_envs.values.promise_filter.promise_filter_for"
-        patch.setattr(made, lambda problem, settings, knowledge: filter_of(REACH, 0.9))
-        bound = PromiseBound(PromiseSettings(0.9, specification=REACH), problem, "model")
-        assert (bound.why_none, bound.at(starts).mean()) == ("", pytest.approx(0.6))
-        settings = PromiseSettings(0.9, specification="eventually goal")
-        assert "unsafe episodes" in why_not_of_safety(problem, settings)
-        assert "'eventually goal'" in PromiseBound(settings, problem, "model").why_none
-    assert why_not_of_safety(problem, PromiseSettings(0.9)) == ""
-    assert len(computed_notes(["promise:p=0.9", f"promise:p=0.9:spec={REACH}"])) == 2
-    assert len(computed_notes(["promise:p=0.9"])) == 1
+    for text, fragment in (("", ""), (REACH, ""), ("eventually goal", "'eventually goal'")):
+        why = why_not_of_safety(problem, PromiseSettings(0.9, specification=text))
+        assert fragment in why
+        assert bool(why) == bool(fragment)

@@ -151,7 +151,7 @@ def require_kept(problem, size=1500, periods=40):
             [v, -sp.sin(x)], to_zero(-2 * v, 1.0, (x, v)), 1 - x, dt=0.3, substeps=3, horizon=3.0
         ),
         # w follows x, which is in another block: what pushes out of its set is taken into account.
-        lambda: made([-x, x - v, x**2 - w], to_zero(0, 0.6, (x, v, w)), sp.Rational(3, 5) - w),
+        lambda: made([-x, x / 2 - v, x**2 - w], to_zero(0, 0.6, (x, v, w)), sp.Rational(3, 5) - w),
         # Saturated: the branch of the law at the equilibrium, as far as it is the law.
         lambda: made(
             [v, -x], to_zero(sp.Max(-1, sp.Min(1, -2 * v)), 1.0, (x, v)), 2 - x, box=(-1.0, 1.0)
