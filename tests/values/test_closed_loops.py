@@ -226,16 +226,3 @@ def test_a_damaged_file_is_no_table(cache, tmp_path, how, caplog):
     path.replace(kept)
     assert (closed_loop_for(loop()).start_bounds(POINTS) == right).all()
     assert "computed again" in caplog.text
-
-
-def test_suitable_cells_are_bounded_by_the_instants(cache, monkeypatch):
-    monkeypatch.setattr(closed_loop, "_WORK", 20 * scalar().steps)
-    assert loop().grid().cells < 30
-    assert loop().grid((200,)).cells >= 200
-
-
-def test_many_starts_are_bounded_in_parts(cache, monkeypatch):
-    table = loop().table(loop().grid())
-    whole = table.start_bounds(POINTS)
-    monkeypatch.setattr(closed_loop, "_STARTS_AT_ONCE", 7)
-    assert (table.start_bounds(POINTS) == whole).all()

@@ -90,8 +90,12 @@ def require_bellman(table, problem, safe, ones=(), instants=None):
         assert (lower <= upper).all()
 
 
-@pytest.mark.parametrize("count", [5, 60])
-@pytest.mark.parametrize("name", CASES)
+FEW = ("plain", "thin", "two parts", "angle", "noise of the state")
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [*((name, 60) for name in CASES), *((name, 5) for name in FEW)]
+)
 def test_envelopes_meet_bellmans_inequalities(name, count):
     options, safe, gap = CASES[name]
     options = dict(options)

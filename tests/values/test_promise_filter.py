@@ -110,7 +110,7 @@ def hostile(text: str, moves: bool = False) -> np.ndarray:
     return worst_inputs(automaton, moves=moves, goal=text == REACH)
 
 
-def play(text: str, p: float, moves: bool = False, starts: Any = None, episodes: int = 2500):
+def play(text: str, p: float, moves: bool = False, starts: Any = None, episodes: int = 2000):
     """Play episodes under the hostile policy; return what `Episodes.met` does, and p_0."""
     chosen = filter_of(text, p, moves)
     played = Episodes(chosen, episodes if starts is None else len(starts))
@@ -119,7 +119,6 @@ def play(text: str, p: float, moves: bool = False, starts: Any = None, episodes:
 
 
 CASES = [
-    (SAFETY, 0.5, False),
     (SAFETY, 0.6, False),
     (REACH, 0.5, True),
     (REACH, 0.9, False),
