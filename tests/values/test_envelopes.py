@@ -268,6 +268,14 @@ def test_the_value_of_systems_side_by_side_is_the_product_of_values(names, cells
         lambda: (scalar(horizon=0.3), (12,)),
         lambda: (scalar(-x, 0.2 + x**2, gain=1 + x, horizon=0.3), (12,)),
         lambda: (side_by_side("turning", "varied", horizon=0.2), (5, 4)),
+        lambda: (
+            scalar(
+                sp.exp(-x) / 4 - sp.sqrt(x + 3) / 4 + 1 / (x + 3) - sp.Min(x, x**3) / 9,
+                0.2 + sp.Max(x, 0) / 5,
+                horizon=0.2,
+            ),
+            (12,),
+        ),
     ],
 )
 def test_with_and_without_numba_tables_are_the_same(make, monkeypatch):

@@ -14,6 +14,7 @@ import sympy as sp
 from gymnasium.vector import AutoresetMode
 
 from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, state_problem
+from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.filters.specification import problem_automaton
 from safe_envs.problem.problem import SafetyProblem
@@ -26,7 +27,11 @@ from safe_envs.values.promise_filter import (
 )
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings, ValueTable, save_table
-from safe_envs.wrappers import SafetyFilterVectorWrapper, SpecificationMonitorVector
+from safe_envs.wrappers import (
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    SpecificationMonitorVector,
+)
 from tests.oracles.walks import PERIOD, STEPS, exact_values, place_of, walk, worst_inputs
 from tests.values.systems import scalar, solved, x
 
@@ -116,6 +121,14 @@ def play(text: str, p: float, moves: bool = False, starts: Any = None, episodes:
     played = Episodes(chosen, episodes if starts is None else len(starts))
     info = played.reset(starts)
     return *played.met(hostile(text, moves), info), info["promise"]
+
+
+def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
+    problem = walk()
+    for text, fragment in (("", ""), (REACH, ""), ("eventually goal", "'eventually goal'")):
+        why = why_not_of_safety(problem, PromiseSettings(0.9, specification=text))
+        assert fragment in why
+        assert bool(why) == bool(fragment)
 
 
 CASES = [
@@ -408,6 +421,26 @@ def test_a_snapshot_has_all_that_is_remembered(text):
     np.testing.assert_array_equal(envs.snapshot()["promise"], now["promise"])
 
 
+@pytest.mark.parametrize("text", [SAFETY, ORDER])
+def test_one_env_is_a_batch_of_one(text):
+    chosen = filter_of(text, 0.6)
+    one, batch = SafetyFilterWrapper(SafeEnv(chosen.problem), chosen), Episodes(chosen, 1)
+    _, info = one.reset(seed=0)
+    infos = batch.reset(seed=0)
+    for k in range(6):
+        assert type(info["promise"]) is float
+        assert info["promise"] == infos["promise"][0]
+        if k:
+            for name in ("safe_action", "feasible", "intervention", "slack"):
+                assert np.array_equal(info[name], infos[name][0]), name
+        *_, terminated, _, info = one.step(np.array([-1.0]))
+        ended, infos = batch.step([-2.0])
+        assert ended[0] == terminated
+        if terminated:
+            assert k > 1
+            break
+
+
 @pytest.mark.parametrize("text", [SAFETY, REACH])
 def test_copies_and_pickles_decide_alike(text):
     chosen, infos = filter_of(text, 0.6), []
@@ -465,11 +498,3 @@ def test_what_is_no_specification_of_the_problem_is_refused(specification, fragm
     settings = PromiseSettings(0.9, specification=specification)
     with pytest.raises(ConfigurationError, match=fragment):
         promise_filter_for(walk(), settings)
-
-
-def test_its_bound_is_one_of_being_safe_where_unsafe_episodes_do_not_meet_it():
-    problem = walk()
-    for text, fragment in (("", ""), (REACH, ""), ("eventually goal", "'eventually goal'")):
-        why = why_not_of_safety(problem, PromiseSettings(0.9, specification=text))
-        assert fragment in why
-        assert bool(why) == bool(fragment)
