@@ -120,7 +120,7 @@ def test_a_reward_of_time_counts_at_its_time():
 
 def test_an_angle_has_no_ends():
     values = []
-    for turn in (0.0, 3.0):
+    for turn in (0.0, 1.04):  # With an edge of the safe set within, and at pi.
         system = ControlAffineSDE.from_rate((x,), (u,), [u], diffusion=[NOISE])
         problem = state_problem(
             system,
@@ -134,7 +134,7 @@ def test_an_angle_has_no_ends():
             nominal=0,
         )
         values.append(price_violations(problem, FrontierSettings(3, 1, (121,))).values)
-    np.testing.assert_allclose(*values, rtol=0, atol=5e-3)
+    np.testing.assert_allclose(*values, rtol=0, atol=4e-4)
     assert values[0][0] - values[0][-1] > 0.3
 
 

@@ -88,7 +88,7 @@ class Pressed:
 
 
 POLICIES = ("random", "bang_bang", "adversary")
-QUICK = [("DubinsDisk", "adversary"), ("QuadrotorLimits", "random")]
+QUICK = [("DubinsDisk", "adversary"), ("ACCGap", "bang_bang")]
 
 
 @pytest.mark.parametrize(("name", "policy"), QUICK)
