@@ -9,7 +9,7 @@ is *allowed* at x if the plan of some law from F(x, u) is good. The filter execu
 1. the proposed input, if it is allowed;
 2. else the nearest allowed one that it finds between the input of a backup law and the proposed
    one: of a few points on each of these segments, and then of points between the last allowed one
-   and the next. With several inputs it goes on from there, see `slope_search`. Of every input that
+   and the next. With several inputs it goes on from there, see `backup_search`. Of every input that
    is executed, its own plan was simulated;
 3. else the input of the law with the best plan. It says that it is infeasible if that plan is not
    good either.
