@@ -114,7 +114,15 @@ def in_parts(pool: ThreadPoolExecutor, count: int, sweep: Callable[[int, int, An
 def cell_images(
     step: Step, grid: Grid, numbers: np.ndarray, scanned: ScannedInputs, instant: int
 ) -> tuple[StepImages, StepImages]:
-    """Return where cells of a grid go under single inputs, and under boxes of them."""
+    """Return where cells go under single inputs, and under boxes of them.
+
+    Args:
+        step: of the problem.
+        grid: of the coordinates.
+        numbers: of the cells.
+        scanned: inputs, and boxes of them.
+        instant: at which the first sub-step begins.
+    """
     low, high = grid.corners(numbers)
     single = step.images(low, high, scanned.ends, instant)
     return single, single if step.is_affine else step.images(low, high, scanned.boxes, instant)
