@@ -15,7 +15,7 @@ from tests.conftest import OWN_TARGETS, selection
 ROOT = Path(__file__).parents[1]
 MARKED = {
     "docs": "tests/docs_site",
-    "oracle": "tests/wrappers/value/test_value_oracles.py",
+    "oracle": "tests/values/test_value_oracles.py",
     "cluster": "tests/agents/jobs/test_executor.py",
 }
 """Tests with each of the marks."""

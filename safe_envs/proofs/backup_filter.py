@@ -9,7 +9,7 @@ is *allowed* at x if the plan of some law from F(x, u) is good. The filter execu
 1. the proposed input, if it is allowed;
 2. else the nearest allowed one that it finds between the input of a backup law and the proposed
    one: of a few points on each of these segments, and then of points between the last allowed one
-   and the next. With several inputs it goes on from there, see `slope_search`. Of every input that
+   and the next. With several inputs it goes on from there, see `backup_search`. Of every input that
    is executed, its own plan was simulated;
 3. else the input of the law with the best plan. It says that it is infeasible if that plan is not
    good either.
@@ -65,7 +65,7 @@ from safe_envs.filters.runtime import doubles, require_finite
 from safe_envs.problem.backup import Backup, backup_of
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.problem import Barrier, SafetyProblem
-from safe_envs.proofs.backup_plans import PlannedLaw, Plans, require_kept, sampled_states
+from safe_envs.proofs.backup_plans import Plans, require_kept, sampled_states
 from safe_envs.proofs.backup_search import Search
 from safe_envs.proofs.backup_sets import with_terminal_sets
 from safe_envs.proofs.backup_source import backup_source
@@ -171,21 +171,138 @@ ROUNDING = 1e-9
 """Below which no barrier falls on the plan of an input that is executed in place of a backup."""
 
 
-class PlanFilter:
-    """Decides whether inputs are allowed, and which are executed in place of others.
+def _put(parts: Sequence[np.ndarray], rows: np.ndarray, values: Sequence[np.ndarray]) -> None:
+    for part, value in zip(parts, values, strict=True):
+        part[rows] = value
+
+
+class _Stated(NamedTuple):
+    """What a filter was made for."""
+
+    system: ControlAffineSDE
+    barriers: tuple[Barrier, ...]
+    bounds: tuple[tuple[float, float], ...]
+    dt: float
+    substeps: int
+
+
+class BackupFilter:
+    """Chooses an input near a proposed one after which a backup law keeps the system safe.
 
     Args:
-        plans: that are simulated.
-        floor: below which no barrier may be on a plan.
+        system: that the filter knows. Noise is left out of its plans.
+        barriers: h, safe where h >= 0: a `Barrier` or an expression of the states, or several.
+        backup: laws with their terminal sets, and their horizon.
+        bounds: (low, high) of all inputs in physical units, or one such pair for each; finite.
+        dt: control period in s.
+        substeps: integration steps in it, as the plant is simulated.
+        settings: a horizon or a margin in place of the usual.
 
     Attributes:
-        plans: as given.
-        floor: as given.
+        model: the system, as given.
+        settings: as given.
+        text: of the settings.
+        plans: that are simulated.
+        floor: below which no barrier may be on a plan.
+        stated: names of the laws whose terminal sets nothing but samples was checked of.
+
+    Raises:
+        SystemDefinitionError: The system or a barrier is none, or they do not fit.
+        ConfigurationError: A bound or a number is not allowed.
     """
 
-    def __init__(self, plans: Plans, floor: float) -> None:
-        self.plans, self.floor = plans, floor
-        self._search = Search(plans, floor)
+    def __init__(
+        self,
+        system: ControlAffineSDE,
+        barriers: Any,
+        backup: Backup,
+        bounds: Any,
+        dt: float,
+        substeps: int = 1,
+        settings: BackupSettings | None = None,
+    ) -> None:
+        self.model = arguments.require_system(system)
+        named = named_barriers(barriers)
+        for barrier in named:
+            used: set[Any] = barrier.expression.free_symbols
+            system.require_known(f"barrier {barrier.name}", used, system.states)
+        if not isinstance(backup, Backup):
+            raise SystemDefinitionError(
+                f"backup = {shown(backup)}; give a Backup of safe_envs.problem.backup"
+            )
+        for law in backup.laws:
+            law.require_known(system)
+            if law.terminal is None:
+                raise SystemDefinitionError(
+                    f"backup law {law.name} has no terminal set; give terminal=..., an expression"
+                    " that is >= 0 in a set that the law never leaves; or take"
+                    " BackupFilter.for_problem, which derives it from the equilibrium"
+                )
+        self.settings = BackupSettings() if settings is None else settings
+        self.text = self.settings.text
+        self.stated = tuple(law.name for law in backup.laws)
+        low, high = arguments.read_bounds(system.inputs, bounds, endless=False)
+        period = finite_number("dt", dt)
+        if period <= 0.0:
+            raise ConfigurationError(f"dt = {dt} s; a control period is positive and finite")
+        horizon = backup.horizon if self.settings.horizon is None else self.settings.horizon
+        # A horizon of whole periods is not to lose one to rounding.
+        periods = math.ceil(horizon / period * (1.0 - 1e-12))
+        if periods > LONGEST:
+            raise ConfigurationError(
+                f"horizon = {horizon:g} s of the backup filter has {periods} control periods of"
+                f" {period:g} s; {LONGEST} at most"
+            )
+        plans = Plans(
+            system,
+            [barrier.expression for barrier in named],
+            backup.laws,
+            (low, high),
+            period,
+            substeps,
+            periods,
+        )
+        self.plans, self.floor = plans, max(self.settings.margin, ROUNDING)
+        self._search = Search(plans, self.floor)
+        self._stated = _Stated(
+            system, tuple(named), tuple(zip(low, high, strict=True)), period, substeps
+        )
+
+    @classmethod
+    def for_problem(
+        cls,
+        problem: SafetyProblem,
+        settings: BackupSettings | str | None = None,
+        knowledge: str = "model",
+    ) -> BackupFilter:
+        """Return the filter for the barriers and the backup of a problem.
+
+        Args:
+            problem: that is to be kept safe.
+            settings: or their text; the problem's own horizon and no margin by default.
+            knowledge: "model" for what the designer believes, "plant" for the true system.
+
+        Raises:
+            SystemDefinitionError: What is given is no problem, or a law leaves its stated terminal
+                set at a sampled state.
+            ConfigurationError: The problem states no backup, or a word or number is not allowed.
+        """
+        arguments.require_problem(problem)
+        arguments.require_word("knowledge", knowledge, ("model", "plant"))
+        if isinstance(settings, str):
+            settings = BackupSettings.of_text(settings)
+        settings = BackupSettings() if settings is None else settings
+        settings.require_fit(problem)
+        system = problem.model if knowledge == "model" else problem.plant
+        given, backup = backup_of(problem), with_terminal_sets(problem, system, settings.margin)
+        assert given is not None
+        assert backup is not None
+        timing = problem.dt, problem.substeps
+        made = cls(system, problem.barriers, backup, problem.box, *timing, settings)
+        stated = [j for j, law in enumerate(given.laws) if law.terminal is not None]
+        made.stated = tuple(given.laws[j].name for j in stated)
+        require_kept(made.plans, stated, sampled_states(problem), settings.margin)
+        return made
 
     def domain(self, x: Components) -> np.ndarray:
         """Return whether the input of some law is allowed at states, bool (B,).
@@ -260,132 +377,6 @@ class PlanFilter:
             _put((*action, *margin, *slack), rows, (*last.action, *last.heights, *last.slack))
             feasible[rows] = last.good
         return FilterDecision(action, margin, (~kept,), feasible, slack, failed, u)
-
-
-def _put(parts: Sequence[np.ndarray], rows: np.ndarray, values: Sequence[np.ndarray]) -> None:
-    for part, value in zip(parts, values, strict=True):
-        part[rows] = value
-
-
-class _Stated(NamedTuple):
-    """What a filter was made for."""
-
-    system: ControlAffineSDE
-    barriers: tuple[Barrier, ...]
-    bounds: tuple[tuple[float, float], ...]
-    dt: float
-    substeps: int
-
-
-class BackupFilter(PlanFilter):
-    """Chooses an input near a proposed one after which a backup law keeps the system safe.
-
-    Args:
-        system: that the filter knows. Noise is left out of its plans.
-        barriers: h, safe where h >= 0: a `Barrier` or an expression of the states, or several.
-        backup: laws with their terminal sets, and their horizon.
-        bounds: (low, high) of all inputs in physical units, or one such pair for each; finite.
-        dt: control period in s.
-        substeps: integration steps in it, as the plant is simulated.
-        settings: a horizon or a margin in place of the usual.
-
-    Attributes:
-        model: the system, as given.
-        settings: as given.
-        text: of the settings.
-        plans: that are simulated.
-        stated: names of the laws whose terminal sets nothing but samples was checked of.
-
-    Raises:
-        SystemDefinitionError: The system or a barrier is none, or they do not fit.
-        ConfigurationError: A bound or a number is not allowed.
-    """
-
-    def __init__(
-        self,
-        system: ControlAffineSDE,
-        barriers: Any,
-        backup: Backup,
-        bounds: Any,
-        dt: float,
-        substeps: int = 1,
-        settings: BackupSettings | None = None,
-    ) -> None:
-        self.model = arguments.require_system(system)
-        named = named_barriers(barriers)
-        for barrier in named:
-            used: set[Any] = barrier.expression.free_symbols
-            system.require_known(f"barrier {barrier.name}", used, system.states)
-        if not isinstance(backup, Backup):
-            raise SystemDefinitionError(
-                f"backup = {shown(backup)}; give a Backup of safe_envs.problem.backup"
-            )
-        for law in backup.laws:
-            law.require_known(system)
-        self.settings = BackupSettings() if settings is None else settings
-        self.text = self.settings.text
-        self.stated = tuple(law.name for law in backup.laws)
-        low, high = arguments.read_bounds(system.inputs, bounds, endless=False)
-        period = finite_number("dt", dt)
-        if period <= 0.0:
-            raise ConfigurationError(f"dt = {dt} s; a control period is positive and finite")
-        horizon = backup.horizon if self.settings.horizon is None else self.settings.horizon
-        # A horizon of whole periods is not to lose one to rounding.
-        periods = math.ceil(horizon / period * (1.0 - 1e-12))
-        if periods > LONGEST:
-            raise ConfigurationError(
-                f"horizon = {horizon:g} s of the backup filter has {periods} control periods of"
-                f" {period:g} s; {LONGEST} at most"
-            )
-        plans = Plans(
-            system,
-            [barrier.expression for barrier in named],
-            planned(backup),
-            (low, high),
-            period,
-            substeps,
-            periods,
-        )
-        super().__init__(plans, max(self.settings.margin, ROUNDING))
-        self._stated = _Stated(
-            system, tuple(named), tuple(zip(low, high, strict=True)), period, substeps
-        )
-
-    @classmethod
-    def for_problem(
-        cls,
-        problem: SafetyProblem,
-        settings: BackupSettings | str | None = None,
-        knowledge: str = "model",
-    ) -> BackupFilter:
-        """Return the filter for the barriers and the backup of a problem.
-
-        Args:
-            problem: that is to be kept safe.
-            settings: or their text; the problem's own horizon and no margin by default.
-            knowledge: "model" for what the designer believes, "plant" for the true system.
-
-        Raises:
-            SystemDefinitionError: What is given is no problem, or a law leaves its stated terminal
-                set at a sampled state.
-            ConfigurationError: The problem states no backup, or a word or number is not allowed.
-        """
-        arguments.require_problem(problem)
-        arguments.require_word("knowledge", knowledge, ("model", "plant"))
-        if isinstance(settings, str):
-            settings = BackupSettings.of_text(settings)
-        settings = BackupSettings() if settings is None else settings
-        settings.require_fit(problem)
-        system = problem.model if knowledge == "model" else problem.plant
-        given, backup = backup_of(problem), with_terminal_sets(problem, system, settings.margin)
-        assert given is not None
-        assert backup is not None
-        timing = problem.dt, problem.substeps
-        made = cls(system, problem.barriers, backup, problem.box, *timing, settings)
-        stated = [j for j, law in enumerate(given.laws) if law.terminal is not None]
-        made.stated = tuple(given.laws[j].name for j in stated)
-        require_kept(made.plans, stated, sampled_states(problem), settings.margin)
-        return made
 
     def require_problem(self, problem: SafetyProblem) -> None:
         """Raise ConfigurationError where the filter was made for something else than a problem."""
@@ -469,24 +460,6 @@ class BackupFilter(PlanFilter):
             u.copy(),
             barriers.reshape(*batch, self.plans.count),
         )
-
-
-def planned(backup: Backup) -> list[PlannedLaw]:
-    """Return the laws of a backup with their terminal sets.
-
-    Raises:
-        SystemDefinitionError: The terminal set of a law is not stated.
-    """
-    found = []
-    for law in backup.laws:
-        if law.terminal is None:
-            raise SystemDefinitionError(
-                f"backup law {law.name} has no terminal set; give terminal=..., an expression that"
-                " is >= 0 in a set that the law never leaves; or take BackupFilter.for_problem,"
-                " which derives it from the equilibrium"
-            )
-        found.append(PlannedLaw(law.name, law.law, law.terminal))
-    return found
 
 
 __all__ = ["BackupFilter", "BackupSettings"]

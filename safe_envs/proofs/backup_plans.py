@@ -9,7 +9,6 @@ nothing is proved.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ from safe_envs.dynamics.defined import NO_VALUE, defined_arrays
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SystemDefinitionError
+from safe_envs.problem.backup import BackupLaw
 
 
 def closed_part(
@@ -65,23 +65,27 @@ def closed_part(
 _FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
 
 
-@dataclass(frozen=True)
-class PlannedLaw:
-    """A backup law with its terminal set.
+_CHUNK = 2048
+"""States that are simulated at once: more of them no longer fit into a processor's cache."""
+
+
+class PlanVerdict(NamedTuple):
+    """Whether plans stay safe until they enter a terminal set; arrays (M,) or of one plan.
 
     Attributes:
-        name: of the law.
-        law: an expression for each input.
-        terminal: >= 0 in the terminal set.
+        allowed: whether one of the laws does.
+        height: smallest barrier on the plan that does; with none, on that of the first law up to
+            where it fails.
+        failed: the barrier that the first law violates first, -1 where it merely takes too long.
     """
 
-    name: str
-    law: tuple[sp.Expr, ...]
-    terminal: sp.Expr
+    allowed: Any
+    height: Any
+    failed: Any
 
 
-class PlannedSystem:
-    """What the plans of backup laws consist of.
+class Plans:
+    """Simulates the plans of backup laws, of one state in floats and of batches.
 
     A period is one of the env with every random number 0: classical Runge-Kutta for a system
     without noise, whose plans are thereby those of the env; and Euler for one with noise. Inputs
@@ -90,7 +94,7 @@ class PlannedSystem:
     Args:
         system: that is known.
         barriers: h of each barrier.
-        laws: at least one.
+        laws: at least one, with their terminal sets.
         bounds: lower and upper bounds of the inputs.
         dt: control period in s.
         substeps: integration steps in it.
@@ -116,7 +120,7 @@ class PlannedSystem:
         self,
         system: ControlAffineSDE,
         barriers: Iterable[sp.Expr],
-        laws: Sequence[PlannedLaw],
+        laws: Sequence[BackupLaw],
         bounds: tuple[Sequence[float], Sequence[float]],
         dt: float,
         substeps: int,
@@ -221,29 +225,6 @@ class PlannedSystem:
         shape = x[0].shape
         step = self.steps["arrays"].step
         return tuple([filled(c, shape) for c in step(x, u, self.still_arrays)])
-
-
-_CHUNK = 2048
-"""States that are simulated at once: more of them no longer fit into a processor's cache."""
-
-
-class PlanVerdict(NamedTuple):
-    """Whether plans stay safe until they enter a terminal set; arrays (M,) or of one plan.
-
-    Attributes:
-        allowed: whether one of the laws does.
-        height: smallest barrier on the plan that does; with none, on that of the first law up to
-            where it fails.
-        failed: the barrier that the first law violates first, -1 where it merely takes too long.
-    """
-
-    allowed: Any
-    height: Any
-    failed: Any
-
-
-class Plans(PlannedSystem):
-    """Simulates the plans of backup laws, of one state in floats and of batches."""
 
     def kept_after_one(self, x: Sequence[float], u: Sequence[float], floor: float) -> PlanVerdict:
         """Return whether some law keeps the state that an input leads to; see `kept_after`.

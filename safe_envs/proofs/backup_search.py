@@ -206,18 +206,7 @@ class Search:
         height: np.ndarray,
         law: np.ndarray,
     ) -> tuple[Components, np.ndarray]:
-        """Go on from allowed inputs as `slope_search` says.
-
-        Args:
-            x: p components (R,) of the states.
-            point: m components (R,) of the inputs.
-            wanted: m components (R,) of the proposed ones.
-            height: the smallest barriers on the plans of the inputs, (R,).
-            law: by which an input was found, -1 where it is not allowed, (R,).
-
-        Returns:
-            m components of inputs, and the smallest barriers on their plans.
-        """
+        """Go on from allowed inputs along the aims of each law; return inputs and heights, (R,)."""
         table, height = np.array(point), height.copy()
         for j in range(len(self._plans.laws)):
             rows = np.flatnonzero(law == j)
@@ -245,18 +234,7 @@ class Search:
         width: float,
         parts: Sequence[float],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Try points of segments.
-
-        Args:
-            segments: components (R,) of the states, and of where the segments begin and end.
-            share: of the segments from which on points are tried, shape (R,).
-            width: up to how much more.
-            parts: of the width, the largest first.
-
-        Returns:
-            Whether one of the points is allowed, the smallest barrier on the plan of the first that
-            is, and its part.
-        """
+        """Return whether a point of each segment is allowed, its height, and its part."""
         size, count = len(share), len(parts)
         at, begin, end = [_repeated(each, count) for each in segments]
         shares = np.concatenate([share + width * part for part in parts])

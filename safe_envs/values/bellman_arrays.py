@@ -60,7 +60,7 @@ def sweep_upper(first: int, last: int, *arguments: Any) -> None:
 
 
 def kept_values(first: int, last: int, *arguments: Any) -> None:
-    """Bound expected values, and find how little of them suffices; see `spending_kernel`."""
+    """Bound expected values, and find how little of them suffices; see `promise_kernel`."""
     images, effects, inputs, weights, layers, tables, *grid, _, _, levels, expected, found = (
         arguments
     )

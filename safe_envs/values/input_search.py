@@ -16,8 +16,8 @@ from safe_envs.errors import ConfigurationError, NotCompilableError
 from safe_envs.values import bellman_arrays
 from safe_envs.values.bellman_kernel import expected_values, sweep_lower, sweep_upper
 from safe_envs.values.expected_value_kernel import AXES
-from safe_envs.values.grid import GridArrays
-from safe_envs.values.images import StepImages
+from safe_envs.values.grid import Grid, GridArrays
+from safe_envs.values.images import Step, StepImages
 from safe_envs.values.promise_kernel import kept_values
 
 _ALONG_EACH = {1: 41, 2: 13, 3: 7}
@@ -109,6 +109,23 @@ def in_parts(pool: ThreadPoolExecutor, count: int, sweep: Callable[[int, int, An
     parts = [(first, min(first + size, count)) for first in range(0, count, size)]
     for done in [pool.submit(sweep, *part, np.zeros(2 * AXES)) for part in parts]:
         done.result()
+
+
+def cell_images(
+    step: Step, grid: Grid, numbers: np.ndarray, scanned: ScannedInputs, instant: int
+) -> tuple[StepImages, StepImages]:
+    """Return where cells go under single inputs, and under boxes of them.
+
+    Args:
+        step: of the problem.
+        grid: of the coordinates.
+        numbers: of the cells.
+        scanned: inputs, and boxes of them.
+        instant: at which the first sub-step begins.
+    """
+    low, high = grid.corners(numbers)
+    single = step.images(low, high, scanned.ends, instant)
+    return single, single if step.is_affine else step.images(low, high, scanned.boxes, instant)
 
 
 _UNKNOWN = 2.0

@@ -26,7 +26,7 @@ from safe_envs.dynamics.codegen import Components
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.values.grid import CELL_SLACK, ROUNDING, Grid, grid_arrays
 from safe_envs.values.images import Step, StepImages, StepValues
-from safe_envs.values.input_search import InputSearch, ScannedInputs
+from safe_envs.values.input_search import InputSearch, ScannedInputs, cell_images
 from safe_envs.values.look_ahead import LookAhead, ProductTables
 from safe_envs.values.reduction import ReducedProblem
 from safe_envs.values.smoothing import Smoothing, rounded_down
@@ -112,7 +112,10 @@ class SpecificationOperator:
         shape = len(self._states.live), self._grid.cells
         ahead = lower.reshape(shape), upper.reshape(shape)
         if self._images is None or self._moves:
-            self._images = self._imaged(k)
+            instant = k * self._reduced.substeps
+            self._images = cell_images(
+                self._step, self._grid, self._numbers, self._scanned, instant
+            )
         # What is read ahead comes first: it has the sets of the next instant.
         found = [self._read(k, place, *ahead) for place in range(shape[0])]
         if not self.is_constant or self._states.automaton.phase(k) != self._states.automaton.phase(
@@ -172,15 +175,6 @@ class SpecificationOperator:
             search.lift(float((before - table).max()))
         self._swept[place] = table
         return search
-
-    def _imaged(self, k: int) -> tuple[StepImages, StepImages]:
-        """Return where the cells go under single inputs, and under boxes of them."""
-        low, high = self._grid.corners(self._numbers)
-        instant = k * self._reduced.substeps
-        single = self._step.images(low, high, self._scanned.ends, instant)
-        if self._step.is_affine:
-            return single, single
-        return single, self._step.images(low, high, self._scanned.boxes, instant)
 
     def _reached(self, k: int) -> _Cells:
         """Return where traces may be at a control instant."""

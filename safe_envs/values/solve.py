@@ -35,8 +35,8 @@ from safe_envs.lazy_attributes import package_version
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.values.cells import CellSets, Sets
 from safe_envs.values.grid import CELL_SLACK, ROUNDING, grid_arrays
-from safe_envs.values.images import Step, StepImages
-from safe_envs.values.input_search import bellman_functions, in_parts, scanned_inputs, threads
+from safe_envs.values.images import Step
+from safe_envs.values.input_search import InputSearch, cell_images, scanned_inputs, threads
 from safe_envs.values.products import SpecificationOperator
 from safe_envs.values.reduction import ReducedProblem, reduced
 from safe_envs.values.smoothing import Smoothing, rounded_down
@@ -140,19 +140,17 @@ class _Operator:
         self._reduced, self._grid, self._step = solver._reduced, solver._grid, solver._step
         self._sets, self._pool, self._smoothing = solver._sets, pool, smoothing
         self._scanned = solver._scanned
-        self._functions = bellman_functions()
         slack = ROUNDING if self._reduced.noise else CELL_SLACK
-        self._means = grid_arrays(smoothing.means, slack, smoothing.parts)
+        means = grid_arrays(smoothing.means, slack, smoothing.parts)
         self._moves = self._step.depends_on_time
         self.is_constant = not (self._moves or self._sets.depend_on_time)
         self._cells, self._parts = self._classified(self._reduced.steps)
         everywhere = np.arange(self._grid.cells)
         self._numbers = np.flatnonzero(self._cells.touches) if self.is_constant else everywhere
         self._imaged_at = -1
-        self._best = np.zeros(len(self._numbers), dtype=np.int64)
-        self._known = np.full((len(self._numbers), len(self._scanned.values)), 2.0)
-        self._leader = np.zeros(len(self._numbers), dtype=np.int64)
-        self._rival = np.full(len(self._numbers), 2.0)
+        weights = self._step.noise.weights
+        self._search = InputSearch(self._scanned, weights, means, pool, len(self._numbers))
+        self._work = len(self._numbers) * len(self._scanned.values) * len(weights)
         self._turn = 0
 
     def last(self) -> tuple[np.ndarray, np.ndarray]:
@@ -190,93 +188,37 @@ class _Operator:
         ahead = self._parts
         cells = self.cells(k)
         if self._imaged_at < 0 or self._moves:
-            self._images, self._imaged_at = self._imaged(k), k
+            instant = k * self._reduced.substeps
+            self._images = cell_images(
+                self._step, self._grid, self._numbers, self._scanned, instant
+            )
+            self._imaged_at = k
         if not self.is_constant:
-            self._known[:] = self._rival[:] = 2.0
+            self._search.forget()
         here = CellSets(*(each[self._numbers] for each in cells))
         # Values do not rise backwards in time: those of the next instant are the best to be had.
         ahead_of = lower if self.is_constant else np.where(lower > 0.0, lower, 1.0)
         found = ahead_of[self._numbers].astype(np.float64)
-        if self._known.size * len(self._step.noise.weights) < _SMALL:
+        if self._work < _SMALL:
             found[:] = np.inf  # All inputs are tried.
-        bounds = np.zeros(len(self._numbers))
         around = [
             self._pool.submit(self._around, *given)
             for given in ((lower, ahead.inside), (-upper, ahead.touches))
         ]
-        self._sweep_lower(around[0].result(), found, here)
-        self._sweep_upper(around[1].result(), bounds)
+        rest = -(self._step.noise.rest + self._smoothing.beyond)
+        going, may_go = here.touches & ~here.ends, here.touches & ~here.may_end
+        single, boxed = self._images
+        self._search.lower(self._turn, single, around[0].result(), going, found)
+        bounds = self._search.upper(boxed, around[1].result(), rest, may_go)
         self._turn += 1
         new_lower = (cells.touches & cells.ends).astype(np.float32)
         new_upper = (cells.touches & cells.may_end).astype(np.float32)
-        going = here.touches & ~here.ends
         new_lower[self._numbers[going]] = rounded_down(np.clip(found[going], 0.0, 1.0))
-        going = here.touches & ~here.may_end
-        new_upper[self._numbers[going]] = 0.0 - rounded_down(-np.clip(bounds[going], 0.0, 1.0))
+        new_upper[self._numbers[may_go]] = 0.0 - rounded_down(-np.clip(bounds[may_go], 0.0, 1.0))
         return new_lower, new_upper
 
-    def _imaged(self, k: int) -> tuple[StepImages, StepImages]:
-        """Return where the cells go under single inputs, and under boxes of them."""
-        low, high = self._grid.corners(self._numbers)
-        single = self._step.images(low, high, self._scanned.ends, k * self._reduced.substeps)
-        if self._step.is_affine:
-            return single, single
-        boxed = self._step.images(low, high, self._scanned.boxes, k * self._reduced.substeps)
-        return single, boxed
-
     def _around(self, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        return self._smoothing.least_around(self._smoothing.smoothed(values, counts))[None]
-
-    def _sweep_lower(self, tables: np.ndarray, found: np.ndarray, here: CellSets) -> None:
-        images, effects = self._images[0]
-        sweep, step = self._functions["sweep_lower"], self._step
-        going = here.touches & ~here.ends
-        self._best = np.where(going, np.maximum(self._best, 0), -1)
-        in_parts(
-            self._pool,
-            len(self._numbers),
-            lambda first, last, shifts: sweep(
-                first,
-                last,
-                self._turn,
-                images,
-                effects,
-                self._scanned.ends,
-                step.noise.weights,
-                tables,
-                0.0,
-                self._scanned.neighbours,
-                *self._means,
-                shifts,
-                self._best,
-                found,
-            ),
-        )
-
-    def _sweep_upper(self, tables: np.ndarray, bounds: np.ndarray) -> None:
-        images, effects = self._images[1]
-        sweep, step = self._functions["sweep_upper"], self._step
-        rest = -(step.noise.rest + self._smoothing.beyond)
-        in_parts(
-            self._pool,
-            len(self._numbers),
-            lambda first, last, shifts: sweep(
-                first,
-                last,
-                images,
-                effects,
-                self._scanned.boxes,
-                step.noise.weights,
-                tables,
-                rest,
-                *self._means,
-                shifts,
-                self._known,
-                self._leader,
-                self._rival,
-                bounds,
-            ),
-        )
+        return self._smoothing.least_around(self._smoothing.smoothed(values, counts))
 
 
 FOLDER = "values"

@@ -16,7 +16,7 @@ from safe_envs.agents import make_problem
 from safe_envs.filters import torch_layer
 from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
-from tests.wrappers.value.guesses import guess
+from tests.values.guesses import guess
 
 pytestmark = pytest.mark.slow
 

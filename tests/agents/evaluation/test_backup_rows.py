@@ -23,7 +23,7 @@ from safe_envs.problem.backup import BackupLaw
 from safe_envs.proofs.backup_filter import BackupFilter
 from safe_envs.wrappers import SafetyFilterVectorWrapper
 from tests.agents.evaluation.test_compiled_episodes import assert_alike, joined
-from tests.wrappers.backup.carts import DT, STRONGEST, cart, cart_problem, v, x
+from tests.oracles.carts import DT, STRONGEST, cart, cart_problem, v, x
 
 WIDE = {"start": [(-0.5, 0.9), (0.0, 2.0)]}
 TWO = (1 - x, 1 + x)

@@ -11,7 +11,7 @@ from safe_envs.envs.registered import SystemEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.proofs.backup_filter import BackupFilter, BackupSettings
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
-from tests.wrappers.backup.carts import cart_problem
+from tests.oracles.carts import cart_problem
 
 KEYS = (
     "nominal_action",

@@ -23,8 +23,8 @@ from safe_envs.wrappers import (
 from safe_envs.wrappers.statistics import CostReturnWrapper
 from tests.conftest import problem_of
 from tests.envs.test_copies import assert_goes_on_alone, copied, plain  # noqa: F401
+from tests.values.guesses import SCALAR, guess
 from tests.wrappers.env_wrappers.test_external_env import CAR
-from tests.wrappers.value.guesses import SCALAR, guess
 
 DUBINS = "safe_envs/StochasticDubins-v0"
 SHORT = {"horizon": 0.5}

@@ -12,7 +12,7 @@ import pytest
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
-from tests.wrappers.value.guesses import SCALAR, guess
+from tests.values.guesses import SCALAR, guess
 
 SHORT = {"horizon": 0.06}
 KEYS = ("promise", "safe_action", "feasible", "intervention", "slack", "episode_interventions")
