@@ -23,6 +23,7 @@ from safe_envs import (
 )
 from safe_envs.agents import evaluate
 from safe_envs.agents.rare_events.estimate import estimate_rare
+from safe_envs.engine.program import Program
 from safe_envs.filters.decision_log import DecisionLog
 from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.problem.named_sets import NamedSets
@@ -135,8 +136,8 @@ def test_an_error_names_the_barrier_and_the_state():
         overflowing.filter([1e120, 0.0], [0.0])
 
 
-@pytest.mark.slow
-def test_filtered_envs_agree_in_every_engine(problem):
+def test_filtered_envs_agree_in_every_engine(problem, monkeypatch):
+    monkeypatch.setattr(Program, "compiled", Program.plain)
     states = np.array([LOST, KEPT, EDGE])
     batches = [
         SafetyFilterVectorWrapper(SafeVectorEnv(problem, 3, engine=engine), "cbf")
@@ -161,15 +162,14 @@ def test_a_wrapped_env_says_so_and_is_drawn(problem):
 
 
 def test_evaluations_count_violations(problem):
-    free, kept = evaluate(
-        problem, filters=["none", "cbf"], episodes=60, bounds=False, engine="numpy"
-    ).rows
+    given = {"filters": ["none", "cbf"], "episodes": 60, "bounds": False, "engine": "numpy"}
+    free, kept = evaluate(problem, **given).rows
     assert 30 < free.violations > kept.violations
     assert free.min_h_median == -math.inf
     assert json.loads(json.dumps(free.as_dict(), allow_nan=False))["min_h_median"] is None
 
 
-@pytest.mark.slow
+@pytest.mark.oracle
 def test_evaluations_agree_in_every_engine(problem):
     given = {"filters": "cbf", "episodes": 60, "bounds": False, "monitoring": "continuous"}
     rows = [evaluate(problem, engine=e, **given).rows[0] for e in ("numpy", "compiled")]

@@ -71,10 +71,14 @@ def test_a_deterministic_plant_is_filtered_as_without_delay_to_the_last_bit(dela
 
 def test_no_delay_is_the_filter_itself():
     start, proposed = (0.2, 0.1), proposals(10)
-    assert (
-        loop(DelayedFilter(plain_filter(), 0, DT), 0, start, proposed)[0]
-        == (loop(plain_filter(), 0, start, proposed)[0])
-    )
+    late = DelayedFilter(plain_filter(), 0, DT)
+    assert loop(late, 0, start, proposed)[0] == loop(plain_filter(), 0, start, proposed)[0]
+    with pytest.raises(InvalidInputError, match="nan"):
+        late.filter([0.0, np.nan], REST)
+    # Nothing is under way that could be unknown.
+    late.override(REST)
+    late.filter([0.0, 0.0], REST)
+    assert late.sent.shape == (0, 2)
 
 
 def test_a_batch_is_filtered_as_its_states_one_by_one():
@@ -207,25 +211,6 @@ def test_nothing_is_decided_while_an_input_under_way_is_unknown(batch):
     late.filter(state, proposed)
 
 
-def test_a_call_that_fails_says_nothing_of_how_many_plants_there_are():
-    late = DelayedFilter(plain_filter(), 2, DT)
-    with pytest.raises(InvalidInputError, match="do not fit"):
-        late.filter(np.zeros((3, 2)), REST)
-    with pytest.raises(InvalidInputError, match=r"shape \(\.\.\., 2\)"):
-        late.override([0.0])
-    late.override(REST)
-    assert late.filter([0.0, 0.0], REST).action.shape == (2,)
-
-
-def test_without_delay_nothing_is_under_way_that_could_be_unknown():
-    late = DelayedFilter(plain_filter(), 0, DT)
-    with pytest.raises(InvalidInputError, match="nan"):
-        late.filter([0.0, np.nan], REST)
-    late.override(REST)
-    late.filter([0.0, 0.0], REST)
-    assert late.sent.shape == (0, 2)
-
-
 def test_what_is_under_way_is_no_array_of_the_user():
     one = ControlAffineSDE((x,), (u,), [0], [1], [0])
     late = DelayedFilter(SafetyFilter(one, 1 - x**2, "cbf:alpha=1", (-1.0, 1.0)), 2, DT)
@@ -235,14 +220,6 @@ def test_what_is_under_way_is_no_array_of_the_user():
     late.override(sent)
     sent[:] = 7.0
     np.testing.assert_array_equal(late.sent[:, -1], np.full((3, 1), 0.5))
-
-
-@pytest.mark.parametrize("remake", [copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
-def test_a_prediction_outlives_its_compiled_functions(remake):
-    prediction = Prediction(NOISY, DT, 3)
-    inputs = [(0.5, 1.0), (-1.0, 2.0)]
-    wanted = prediction.of_one((0.1, 0.2), inputs)
-    assert remake(prediction).of_one((0.1, 0.2), inputs) == wanted
 
 
 @pytest.mark.parametrize("remake", [copy.deepcopy, lambda f: pickle.loads(pickle.dumps(f))])
@@ -257,41 +234,54 @@ def test_a_copied_filter_goes_on_with_what_it_sent(remake):
         np.testing.assert_array_equal(mine.barrier, other.barrier)
 
 
-def test_errors():
-    safety_filter = plain_filter()
-    for arguments, message in (
-        ((-1, DT), "delay = -1"),
-        ((1, 0.0), "dt = 0.0 s"),
-        ((1, "fast"), "dt"),
-        ((1, DT, 0), "substeps = 0"),
-    ):
-        with pytest.raises(ConfigurationError, match=message):
-            DelayedFilter(safety_filter, *arguments)
-    with pytest.raises(InvalidInputError, match="rest = "):
-        DelayedFilter(safety_filter, 1, DT, rest=[0.0])
-    with pytest.raises(ConfigurationError, match=r"outside the bounds of the filter, \[\(-2.0"):
-        DelayedFilter(safety_filter, 1, DT, rest=[0.0, 0.0])
-    for other in ("x", None, LINEAR):
-        with pytest.raises(ConfigurationError, match="give a SafetyFilter"):
-            DelayedFilter(other, 1, DT)
-    late = DelayedFilter(safety_filter, 1, DT)
-    with pytest.raises(InvalidInputError, match=r"the state has the entry nan at \[1\]"):
-        late.filter([0.0, np.nan], REST)
-    late.reset()
-    with pytest.raises(InvalidInputError, match=r"\(\.\.\., 2\)"):
-        late.filter([0.0], REST)
-    late.reset()
-    late.filter([0.0, 0.0], REST)
-    with pytest.raises(InvalidInputError, match="call reset"):
-        late.filter(np.zeros((3, 2)), np.zeros((3, 2)))
-    with pytest.raises(InvalidInputError, match=r"does not fit.*shape \(2,\)"):
-        late.override([1.0])
+def made(*arguments, late=None, **more):
+    return DelayedFilter(plain_filter() if late is None else late, *arguments, **more)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "fragment"),
+    [
+        (lambda: made(-1, DT), ConfigurationError, "delay = -1"),
+        (lambda: made(1, 0.0), ConfigurationError, "dt = 0.0"),
+        (lambda: made(1, "fast"), ConfigurationError, "dt"),
+        (lambda: made(1, DT, 0), ConfigurationError, "substeps = 0"),
+        (lambda: made(1, DT, rest=[0.0]), InvalidInputError, "rest"),
+        (lambda: made(1, DT, rest=[0.0, 0.0]), ConfigurationError, "bounds"),
+        *(
+            (lambda other=other: made(1, DT, late=other), ConfigurationError, "SafetyFilter")
+            for other in ("x", LINEAR)
+        ),
+        (lambda: made(1, DT).filter([0.0, np.nan], REST), InvalidInputError, r"nan at \[1\]"),
+        (lambda: made(1, DT).filter([0.0], REST), InvalidInputError, "2"),
+        (lambda: made(2, DT).filter(np.zeros((3, 2)), REST), InvalidInputError, "fit"),
+        (lambda: made(2, DT).override([0.0]), ConfigurationError, "call filter"),
+        (lambda: DelayedFilter(None, 1, DT), ConfigurationError, "SafetyFilter"),
+    ],
+)
+def test_what_does_not_fit_is_refused(call, error, fragment):
+    with pytest.raises(error, match=fragment):
+        call()
+
+
+@pytest.mark.parametrize("state", [[1e60], [[0.0], [1e60]]])
+def test_a_prediction_without_a_value_is_an_error(state):
     fast = ControlAffineSDE((x,), (u,), [x**3], [1], [0], {})
-    blown = DelayedFilter(
-        SafetyFilter(fast, [(Barrier(1 - x**2), HOCBF((1.0,)))], bounds=(-1.0, 1.0)), 3, 1.0
-    )
-    with pytest.raises(NumericalError, match="no finite prediction"):
-        blown.filter([1e60], [0.0])
-    blown.reset()
-    with pytest.raises(NumericalError, match=r"no finite prediction from the state at \[1\]"):
-        blown.filter([[0.0], [1e60]], [[0.0], [0.0]])
+    blown = DelayedFilter(SafetyFilter(fast, 1 - x**2, "cbf:alpha=1", (-1.0, 1.0)), 3, 1.0)
+    with pytest.raises(NumericalError, match="prediction"):
+        blown.filter(state, np.zeros_like(state))
+
+
+def test_another_number_of_plants_needs_a_reset():
+    late = made(2, DT)
+    with pytest.raises(InvalidInputError, match="fit"):  # a call that fails says nothing of it
+        late.filter(np.zeros((3, 2)), REST)
+    late.override(REST)
+    assert late.filter([0.0, 0.0], REST).action.shape == (2,)
+    for call in (
+        lambda: late.filter(np.zeros((3, 2)), np.zeros((3, 2))),
+        lambda: late.override([1.0]),
+    ):
+        with pytest.raises(InvalidInputError, match=r"reset|\(2,\)"):
+            call()
+    late.reset()
+    assert late.filter(np.zeros((3, 2)), np.zeros((3, 2)) + REST).action.shape == (3, 2)

@@ -98,24 +98,38 @@ def test_what_does_not_fit_is_refused(y, u, words):
         safety_filter.filter_measurement(y, np.array(u))
 
 
-def test_errors_of_making_one():
+def pendulum(estimator):
     problem = make_problem("Pendulum-v0", measurement="default")
+    if not isinstance(estimator, str):
+        estimator = estimator(problem)
+    return SafetyFilter(problem.model, problem.barriers, "scbf", (-5, 5), estimator=estimator)
+
+
+def of_other_states(_):
     other = make_problem("Scalar-v0", measurement="default")
-    plain = SafetyFilter.for_problem(problem, "scbf")
-    with pytest.raises(ConfigurationError, match="has no estimator"):
-        plain.filter_measurement([0.0, 0.0], [0.0])
-    given = {"initial": InitialBelief.of([0.0], [1.0])}
-    wrong = ExtendedKalmanFilter(other.model, other.measurement, other.dt, **given)
-    with pytest.raises(ConfigurationError, match="other states"):
-        SafetyFilter(problem.model, problem.barriers, "scbf", bounds=(-5, 5), estimator=wrong)
-    without = ExtendedKalmanFilter(problem.model, problem.measurement, problem.dt)
-    with pytest.raises(ConfigurationError, match="initial="):
-        SafetyFilter(problem.model, problem.barriers, "scbf", bounds=(-5, 5), estimator=without)
-    with pytest.raises(ConfigurationError, match="give an Estimator"):
-        SafetyFilter(problem.model, problem.barriers, "scbf", bounds=(-5, 5), estimator="ekf")
-    ready = SafetyFilter.for_problem(problem, "scbf", estimator="ekf")
-    with pytest.raises(ConfigurationError, match="nothing was measured"):
-        _ = ready.measured.mean
+    initial = InitialBelief.of([0.0], [1.0])
+    return ExtendedKalmanFilter(other.model, other.measurement, other.dt, initial=initial)
+
+
+@pytest.mark.parametrize(
+    ("call", "fragment"),
+    [
+        (
+            lambda: pendulum(lambda _: None).filter_measurement([0.0, 0.0], [0.0]),
+            "has no estimator",
+        ),
+        (lambda: pendulum(of_other_states), "other states"),
+        (
+            lambda: pendulum(lambda p: ExtendedKalmanFilter(p.model, p.measurement, p.dt)),
+            "initial=",
+        ),
+        (lambda: pendulum("ekf"), "Estimator"),
+        (lambda: measured()[1].measured.mean, "nothing was measured"),
+    ],
+)
+def test_what_cannot_be_made_or_asked_is_refused(call, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        call()
 
 
 X, V, U, LEAD, LEAD_SPEED, GUST = sp.symbols("x v u lead lead_speed belief_gust", real=True)
@@ -182,17 +196,17 @@ def test_the_belief_of_a_moving_barrier_is_the_one_by_hand():
     ],
 )
 def test_no_estimator_predicts_what_it_is_not_given(changed, words):
-    with pytest.raises(SystemDefinitionError, match=f"{words}.*Barriers may hold signals"):
+    with pytest.raises(SystemDefinitionError, match=words):
         follower(**changed)
 
 
 def test_parameters_of_the_prediction_are_not_adjustable():
     car, estimator = follower()
     given = {"bounds": (-9, 9), "estimator": estimator, "adjustable": ("mass",)}
-    with pytest.raises(ConfigurationError, match="input matrix of the estimator depends on mass"):
+    with pytest.raises(ConfigurationError, match="mass"):
         SafetyFilter(car, LEAD - X, "hocbf:p=1,2", **given)
     weighed = replace(car, parameters={}, signals={**car.signals, MASS: 0})
-    with pytest.raises(ConfigurationError, match="depends on mass, whose value"):
+    with pytest.raises(ConfigurationError, match="mass"):
         SafetyFilter(weighed, LEAD - X, "hocbf:p=1,2", bounds=(-9, 9), estimator=estimator)
     car, estimator = follower(rate=[V, U])
     found = SafetyFilter(car, LEAD - X - MASS, "hocbf:p=1,2", **{**given, "estimator": estimator})

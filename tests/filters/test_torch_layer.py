@@ -16,7 +16,7 @@ from safe_envs.agents import make_problem
 from safe_envs.filters import torch_layer
 from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
-from tests.wrappers.value.guesses import guess
+from tests.wrappers.cases import guess
 
 pytestmark = pytest.mark.slow
 
@@ -128,7 +128,6 @@ def test_values_and_flags_are_those_of_the_filter(registered):
     np.testing.assert_array_equal(stacked.numpy().reshape(u.shape), wanted.action)
 
 
-@pytest.mark.slow
 def test_gradients_pass_gradcheck(registered):
     module, x, u = registered
     decided = module.safety_filter.filter(x, u)
@@ -159,7 +158,6 @@ def test_slopes_are_the_differences_of_the_filter(m, k, most):
     assert assert_slopes(module, x[chosen], u[chosen]) > 0.9 * len(chosen)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", [16, pytest.param(100, marks=pytest.mark.oracle)])
 @pytest.mark.parametrize("m", [1, 2, 4])
 def test_slopes_of_a_compromise(m, size):
@@ -181,7 +179,6 @@ def test_contradicting_rows_on_many_inputs_have_a_finite_slope():
     assert result.differentiable.all()
 
 
-@pytest.mark.slow
 def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for(monkeypatch):
     # No formula is exact to the last bit: so some are said not to agree.
     monkeypatch.setattr(torch_layer, "_AGREED", 0.0)
@@ -225,17 +222,28 @@ def test_floats_of_less_precision_are_computed_in_double():
     assert u.grad is not None
     assert u.grad.dtype == torch.float32
     assert module(x.double(), u).dtype == torch.float32
-    with pytest.raises(InvalidInputError, match=r"torch\.int64"):
-        module(torch.tensor([0, 0, 0]), u)
-    with pytest.raises(InvalidInputError, match="do not fit"):
-        module(x[:2], u)
-    with pytest.raises(InvalidInputError, match="finite"):
-        module(x * torch.nan, u)
-    for wrong in (None, "text", [0.5, 2.5, 1.2], x.numpy(), x.to(torch.complex64)):
-        with pytest.raises(InvalidInputError, match="give"):
-            module(wrong, u)
-        with pytest.raises(InvalidInputError, match="give"):
-            module(x, wrong)
+
+
+def of_dubins(x, u=(0.5,)):
+    given = [torch.tensor(part) if isinstance(part, list | tuple) else part for part in (x, u)]
+    return TorchFilter.for_problem(make_problem("safe_envs/StochasticDubins-v0"), "scbf")(*given)
+
+
+@pytest.mark.parametrize(
+    ("x", "fragment"),
+    [
+        ([0, 0, 0], "int64"),
+        ([0.5, 2.5], "do not fit"),
+        ([0.5, math.nan, 0.0], "finite"),
+        *((wrong, "give") for wrong in (None, "text", np.zeros(3), torch.zeros(3) + 0j)),
+    ],
+)
+def test_what_is_no_state_is_refused(x, fragment):
+    with pytest.raises(InvalidInputError, match=fragment):
+        of_dubins(x)
+    if fragment == "give":
+        with pytest.raises(InvalidInputError, match=fragment):
+            of_dubins([0.5, 2.5, 1.2], x)
 
 
 def test_a_state_where_no_row_acts_has_a_gradient_of_zero():
@@ -283,7 +291,7 @@ def test_a_minimum_has_the_gradients_of_its_pieces_and_a_maximum_is_refused():
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(30, 2)) / 2, rng.normal(size=(30, 2)) + 1
     assert assert_slopes(TorchFilter(minimum), states, inputs) > 25
-    with pytest.raises(ConfigurationError, match="cbf on h is of a maximum"):
+    with pytest.raises(ConfigurationError, match="maximum"):
         TorchFilter(SafetyFilter(model, sp.Max(x, y), "cbf", bounds=[(-9, 9)] * 2))
 
 
@@ -335,55 +343,38 @@ def test_learning_through_the_filter():
     assert losses[-1] < 0.3 * losses[0]
 
 
-def test_what_is_no_plain_row_is_refused():
-    problem = make_problem("safe_envs/CubicSDE-v0")
-    for condition, reason in (
-        ("srcbf", "reciprocal"),
-        ("scbf:sampling_margin=first-order", "first order"),
-    ):
-        with pytest.raises(ConfigurationError, match=reason):
-            TorchFilter.for_problem(problem, parse_conditions(condition, problem))
-    with pytest.raises(ConfigurationError, match="clf"):
-        TorchFilter(
-            SafetyFilter.for_problem(problem, parse_conditions("scbf", problem), objective="clf")
-        )
+X, U, P = sp.symbols("x u p", real=True)
 
 
-def test_functions_that_torch_lacks_are_refused():
-    x, u = sp.symbols("x u", real=True)
-    model = ControlAffineSDE((x,), (u,), [sp.erfc(x)], [[1]], [[0]])
-    with pytest.raises(ConfigurationError, match="erfc"):
-        TorchFilter(SafetyFilter(model, [(Barrier(1 - x), CBF(alpha=1.0))], bounds=[(-1.0, 1.0)]))
+def line(drift=0, h=1 - X, low=-1.0, **more):
+    return SafetyFilter(ControlAffineSDE((X,), (U,), [drift], [1], [0], **more), h, "cbf", (low, 1))
 
 
-def test_a_layer_takes_finite_bounds_and_nothing_at_each_call():
-    x, u, p = sp.symbols("x u p", real=True)
-    model = ControlAffineSDE((x,), (u,), [0], [[1]], [[0]], signals={p: 0})
-    with pytest.raises(ConfigurationError, match="takes p at each call"):
-        TorchFilter(SafetyFilter(model, p - x, "cbf", (-1.0, 1.0)))
-    still = ControlAffineSDE((x,), (u,), [0], [[1]], [[0]])
-    with pytest.raises(ConfigurationError, match="give finite ones"):
-        TorchFilter(SafetyFilter(still, 1 - x, "cbf", (-math.inf, 1.0)))
+def of_problem(name, text, measurement=None, **more):
+    problem = make_problem(f"safe_envs/{name}-v0", measurement=measurement)
+    return SafetyFilter.for_problem(problem, text, **more)
 
 
-def test_a_layer_takes_states():
-    problem = make_problem("safe_envs/Pendulum-v0", measurement="default")
-    for text, estimator, reason in (
-        ("scbf", "ekf", "has the estimator ekf"),
-        ("scbf:belief=0.1", None, "has conditions with belief"),
-    ):
-        with pytest.raises(ConfigurationError, match=reason):
-            TorchFilter(SafetyFilter.for_problem(problem, text, estimator=estimator))
+@pytest.mark.parametrize(
+    ("make", "fragment"),
+    [
+        (lambda: of_problem("CubicSDE", "srcbf"), "reciprocal"),
+        (lambda: of_problem("CubicSDE", "scbf:sampling_margin=first-order"), "first order"),
+        (lambda: of_problem("CubicSDE", "scbf", objective="clf"), "clf"),
+        (lambda: line(sp.erfc(X)), "erfc"),
+        (lambda: line(h=P - X, signals={P: 0}), "takes p"),
+        (lambda: line(low=-math.inf), "finite"),
+        (lambda: of_problem("Pendulum", "scbf", "default", estimator="ekf"), "estimator ekf"),
+        (lambda: of_problem("Pendulum", "scbf:belief=0.1", "default"), "belief"),
+        (guess, "PromiseFilter"),
+    ],
+)
+def test_a_filter_without_gradient_is_refused(make, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        TorchFilter(make())
 
 
-def test_the_backup_filter_has_no_gradient_either():
-    with pytest.raises(ConfigurationError, match=r"'backup'.*no gradient.*'scbf'"):
-        TorchFilter.for_problem(make_problem("safe_envs/DubinsDisk-v0"), "backup")
-
-
-def test_the_promise_filter_has_no_gradient_and_says_what_to_use():
-    problem = make_problem("safe_envs/Scalar-v0")
-    with pytest.raises(ConfigurationError, match=r"'promise:p=0\.9'.*no gradient.*'scbf'"):
-        TorchFilter.for_problem(problem, "promise:p=0.9")
-    with pytest.raises(ConfigurationError, match=r"'PromiseFilter'.*train an agent behind it"):
-        TorchFilter(guess())  # pyright: ignore[reportArgumentType]
+@pytest.mark.parametrize(("name", "text"), [("DubinsDisk", "backup"), ("Scalar", "promise:p=0.9")])
+def test_a_filter_by_itself_has_no_gradient(name, text):
+    with pytest.raises(ConfigurationError, match=text.split(":")[0]):
+        TorchFilter.for_problem(make_problem(f"safe_envs/{name}-v0"), text)

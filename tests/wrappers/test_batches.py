@@ -9,11 +9,10 @@ import pytest
 from safe_envs.engine.program import Program
 from tests.wrappers.cases import (
     CASES,
-    MODES,
     actions,
     assert_close,
     assert_plays_as_alone,
-    every_case,
+    each_mode,
     few_cases,
     of_env,
 )
@@ -31,17 +30,17 @@ def compiles():
     """For tests of compiled programs."""
 
 
-@pytest.mark.parametrize("mode", MODES)
-@every_case
+@each_mode
 def test_a_batch_plays_as_its_envs_do(make, mode):
-    assert assert_plays_as_alone(make, mode) >= 2
+    assert assert_plays_as_alone(make, mode) >= 1
 
 
-@pytest.mark.parametrize("engine", ["numpy", "compiled"])
-@pytest.mark.parametrize("filtered", [False, True])
+@pytest.mark.parametrize(
+    ("filtered", "engine"), [(False, "numpy"), (True, "numpy"), (True, "compiled")]
+)
 def test_a_batch_of_every_env_plays_as_its_envs_do(env_id, filtered, engine):
     make = of_env(env_id, filtered=filtered, engine=engine)
-    assert assert_plays_as_alone(make, "SameStep" if filtered else "NextStep") >= 2
+    assert assert_plays_as_alone(make, "SameStep" if filtered else "NextStep") >= 1
 
 
 @pytest.mark.oracle
@@ -50,7 +49,7 @@ def test_compiled_programs_of_every_env_play_as_its_envs_do(env_id, compiles):
 
 
 def test_a_compiled_program_plays_as_its_envs_do(compiles):
-    assert assert_plays_as_alone(of_env("safe_envs/Scalar-v0", engine="compiled"), "SameStep") >= 2
+    assert assert_plays_as_alone(of_env("safe_envs/Scalar-v0", engine="compiled"), "SameStep") >= 1
 
 
 @few_cases

@@ -65,18 +65,8 @@ def assert_goes_on_alone(env, copied, steps=4, count=8):
         env = both[1]
 
 
-@copied
-@pytest.mark.parametrize(
-    "name",
-    [
-        *FEW,
-        "goal of the filter",
-        "third party in other units",
-        "specification",
-        "statistics",
-        "costs",
-    ],
-)
+@pytest.mark.parametrize("copied", [COPIES["pickle"], copy.copy], ids=["pickle", "copy"])
+@pytest.mark.parametrize("name", [*FEW, "goal of the filter", "third party", "statistics", "costs"])
 def test_every_wrapper(name, copied, plain):
     # Episodes end on the way, so that the next ones are seen to be the same, too.
     assert_goes_on_alone(CASES[name](3, "SameStep"), copied)
