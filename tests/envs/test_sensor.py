@@ -50,6 +50,7 @@ def test_a_sensor_changes_nothing_but_what_is_observed(env_id, num_envs):
         return env.state.tobytes(), infos, [[np.array(v).tobytes() for v in row] for row in rest]
 
     plain, measured = (walked(problem_of(env_id, measurement=m)) for m in (None, COMPLETE))
+    assert made(problem_of(env_id), num_envs).measured is None
     assert (plain[0], plain[2]) == (measured[0], measured[2])
     for mine, other in zip(plain[1], measured[1], strict=True):
         added = set(other) - set(mine)
@@ -59,14 +60,6 @@ def test_a_sensor_changes_nothing_but_what_is_observed(env_id, num_envs):
     np.testing.assert_array_equal(
         measured[1][-1]["state"], np.frombuffer(measured[0]).reshape(np.shape(other["state"]))
     )
-
-
-def test_an_env_without_the_option_has_no_sensor():
-    env, batch = SafeEnv(problem_of(PENDULUM)), SafeVectorEnv(problem_of(PENDULUM), 2)
-    _, info = env.reset(seed=0)
-    batch.reset(seed=0)
-    assert (env.measured, batch.measured) == (None, None)
-    assert not {"state", "received"} & set(info)
 
 
 def test_the_errors_are_the_numbers_of_a_stream_of_their_own():

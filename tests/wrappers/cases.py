@@ -183,10 +183,10 @@ CASES: dict[str, Make] = {
     "measured": Filtered(ACC, options=short(ACC, measurement=SENSOR)),
     "measured and late": Filtered(PENDULUM, options=short(PENDULUM, delay=2, measurement=SENSOR)),
     "estimates": Filtered(
-        DUBINS, around=estimated("estimate"), options=short(DUBINS, measurement=SENSOR)
+        PENDULUM, around=estimated("estimate"), options=short(PENDULUM, measurement=SENSOR)
     ),
     "measurements": Filtered(
-        DUBINS, around=estimated("measurement"), options=short(DUBINS, measurement=SENSOR)
+        PENDULUM, around=estimated("measurement"), options=short(PENDULUM, measurement=SENSOR)
     ),
     "promise": Filtered(
         SCALAR,

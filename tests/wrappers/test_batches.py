@@ -54,10 +54,9 @@ def test_a_compiled_program_plays_as_its_envs_do(compiles):
 
 @few_cases
 def test_the_size_of_a_batch_changes_nothing(make):
-    rows, rng = [], np.random.default_rng(0)
-    given = [actions(make(1), rng) for _ in range(8)]
-    for count in (1, 4):
-        env = make(count)
+    rows, rng, envs = [], np.random.default_rng(0), [make(1), make(4)]
+    given = [actions(envs[0], rng) for _ in range(8)]
+    for count, env in zip((1, 4), envs, strict=True):
         found = [env.reset(seed=11)[0][0]]
         found += [env.step(np.tile(each, (count, 1)))[0][0] for each in given]
         rows.append(np.array(found))

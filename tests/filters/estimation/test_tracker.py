@@ -1,7 +1,5 @@
 """Beliefs in episodes: delays, losses, restarts, snapshots."""
 
-import copy
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -104,27 +102,6 @@ def test_values_that_are_no_numbers_are_lost():
     assert one.mean == other.mean
     assert one.lost == other.lost == 1
     assert list(one.received) == [True, False]
-
-
-def test_a_snapshot_goes_on():
-    tracker = tracked(2, 3)
-    rng = np.random.default_rng(0)
-
-    def sample():
-        return Sample(list(rng.normal(0.0, 0.1, (2, 3))), [np.ones(3, dtype=bool)] * 2)
-
-    tracker.begin(sample())
-    for _ in range(4):
-        tracker.advance([rng.uniform(-1, 1, 3)], sample())
-    kept, twin = tracker.snapshot(), copy.deepcopy(tracker)
-    state = rng.bit_generator.state
-    tracker.advance([np.ones(3)], sample())
-    expected = [c.copy() for c in tracker.mean]
-    for other in (twin, tracked(2, 3)):
-        rng.bit_generator.state = state
-        other.restore(kept)
-        other.advance([np.ones(3)], sample())
-        np.testing.assert_array_equal(other.mean, expected)
 
 
 def test_the_belief_ahead_is_that_of_the_next_sample():
