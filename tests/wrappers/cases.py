@@ -34,9 +34,7 @@ MODES = [mode.value for mode in AutoresetMode]
 SCALAR, DUBINS, LIMITS = (
     f"safe_envs/{name}-v0" for name in ("Scalar", "StochasticDubins", "QuadrotorLimits")
 )
-REACH, ACC, PENDULUM, CUBIC = (
-    f"safe_envs/{name}-v0" for name in ("DubinsReach", "ACC", "Pendulum", "CubicSDEDisk")
-)
+REACH, ACC, PENDULUM = (f"safe_envs/{name}-v0" for name in ("DubinsReach", "ACC", "Pendulum"))
 
 Make = Callable[..., Any]
 """Of a number of envs and a mode, for a batch; of nothing, for one env."""
@@ -77,42 +75,54 @@ def near() -> Any:
 
 @dataclass(frozen=True)
 class Filtered:
-    """An env, and a filter around it if any, made one by one or as a batch.
+    """An env of this project, a filter around it if any, and others around that.
 
     Attributes:
         env: id, or what returns a problem.
         filter: text, or what returns a filter.
-        around: further wrappers, of one env and of a batch.
         options: of the env.
         given: arguments of the filter's wrapper.
+        around: further wrappers, of one env and of a batch.
         engine: of the batch.
     """
 
     env: str | Callable[[], Any]
-    filter: Any = None
-    around: tuple[Any, Any] | None = None
-    options: dict[str, Any] | None = None
-    given: dict[str, Any] | None = None
-    engine: str = "numpy"
+    filter: str | Callable[[], Any] | None
+    options: dict[str, Any]
+    given: dict[str, Any]
+    around: tuple[Any, Any] | None
+    engine: str
 
     def __call__(self, count: int | None = None, mode: str = "NextStep") -> Any:
-        batched, options = count is not None, self.options or {}
-        if batched:
-            options = {**options, "autoreset_mode": mode, "engine": self.engine}
-        if isinstance(self.env, str):
-            found: Any = (
-                gym.make_vec(self.env, count, **options)
-                if batched
-                else gym.make(self.env, **options)
-            )
+        if count is None:
+            make, wrapper, options = gym.make, SafetyFilterWrapper, self.options
         else:
-            kind = partial(SafeVectorEnv, num_envs=count) if batched else SafeEnv
+            make, wrapper = partial(gym.make_vec, num_envs=count), SafetyFilterVectorWrapper
+            options = {**self.options, "autoreset_mode": mode, "engine": self.engine}
+        if isinstance(self.env, str):
+            found: Any = make(self.env, **options)
+        else:
+            kind = SafeEnv if count is None else partial(SafeVectorEnv, num_envs=count)
             found = kind(self.env(), **options)
         if self.filter is not None:
-            wrapper = SafetyFilterVectorWrapper if batched else SafetyFilterWrapper
             text = self.filter if isinstance(self.filter, str) else self.filter()
-            found = wrapper(found, text, **(self.given or {}))
-        return self.around[batched](found) if self.around else found
+            found = wrapper(found, text, **self.given)
+        return self.around[count is not None](found) if self.around else found
+
+
+def own(
+    env: Any,
+    filter: Any = None,  # noqa: A002
+    *,
+    given: Any = None,
+    around: Any = None,
+    engine: str = "numpy",
+    **options: Any,
+) -> Filtered:
+    """A case of this project, by default with episodes of six control periods."""
+    if isinstance(env, str) and not options.keys() & {"horizon", "terminate_on_violation"}:
+        options["horizon"] = 6 * problem_of(env).dt
+    return Filtered(env, filter, options, given or {}, around, engine)
 
 
 @dataclass(frozen=True)
@@ -158,78 +168,48 @@ def _at_estimates(estimator: Any, wrapper: Any, observe: str, env: Any) -> Any:
     return wrapper(estimator(env, "ekf", observe), "scbf:belief=0.05")
 
 
-def short(env_id: str, periods: int = 6, **more: Any) -> dict[str, Any]:
-    return {"horizon": periods * problem_of(env_id).dt, **more}
-
-
 SMALL = {"barrier": {"radius": 0.5}, "horizon": 0.25}
 """In which most states are unsafe."""
-LATE = {"delay": 3, "model_delay": 2, "slew_limit": (-30.0, 20.0)}
+SLEW = (-30.0, 20.0)
+VIOLATING = {"start": [0.98], "noise": 2.0, "terminate_on_violation": True}
 
 CASES: dict[str, Make] = {
-    "several barriers": Filtered(LIMITS, "hocbf", options=short(LIMITS, noise=0.05)),
-    "reached goal": Filtered(near, "hocbf"),
-    "ends at different times": Filtered(SCALAR, options={"noise": 9.0, "horizon": 0.1}),
-    "ended by violations": Filtered(
-        SCALAR, "scbf", options={"start": [0.98], "noise": 2.0, "terminate_on_violation": True}
+    "several barriers": own(LIMITS, "hocbf", noise=0.05),
+    "reached goal": own(near, "hocbf"),
+    "ends at different times": own(SCALAR, noise=9.0, horizon=0.1),
+    "ended by violations": own(SCALAR, "scbf", **VIOLATING),
+    "begun in a violation": own(SCALAR, **{**VIOLATING, "start": [1.1]}),
+    "goal of the filter": own(ACC, "cbf", given={"objective": "clf"}),
+    "late": own(PENDULUM, delay=3, slew_limit=SLEW),
+    "late, with a filter": own(PENDULUM, "szcbf:alphas=2", delay=3, model_delay=2, slew_limit=SLEW),
+    "late, with several barriers": own(LIMITS, "hocbf", delay=2),
+    "measured": own(ACC, measurement=SENSOR),
+    "measured and late": own(PENDULUM, delay=2, measurement=SENSOR),
+    "estimates": own(PENDULUM, around=estimated("estimate"), measurement=SENSOR),
+    "measurements": own(PENDULUM, around=estimated("measurement"), measurement=SENSOR),
+    "promise": own(
+        SCALAR, partial(guess, horizon=0.06), given={"observe_promise": True}, horizon=0.06
     ),
-    "begun in a violation": Filtered(
-        SCALAR, options={"start": [1.1], "noise": 1.0, "terminate_on_violation": True}
-    ),
-    "goal of the filter": Filtered(ACC, "cbf", options=short(ACC), given={"objective": "clf"}),
-    "late": Filtered(PENDULUM, options=short(PENDULUM, delay=3, slew_limit=(-30.0, 20.0))),
-    "late, with a filter": Filtered(PENDULUM, "szcbf:alphas=2", options=short(PENDULUM, **LATE)),
-    "late, with several barriers": Filtered(LIMITS, "hocbf", options=short(LIMITS, delay=2)),
-    "measured": Filtered(ACC, options=short(ACC, measurement=SENSOR)),
-    "measured and late": Filtered(PENDULUM, options=short(PENDULUM, delay=2, measurement=SENSOR)),
-    "estimates": Filtered(
-        PENDULUM, around=estimated("estimate"), options=short(PENDULUM, measurement=SENSOR)
-    ),
-    "measurements": Filtered(
-        PENDULUM, around=estimated("measurement"), options=short(PENDULUM, measurement=SENSOR)
-    ),
-    "promise": Filtered(
-        SCALAR,
-        partial(guess, horizon=0.06),
-        options={"horizon": 0.06},
-        given={"observe_promise": True},
-    ),
-    "backup": Filtered(partial(cart_problem, horizon=0.6), "backup"),
-    "specification": Filtered(near, "hocbf", around=judged("always safe & eventually goal")),
-    "bounded specification": Filtered(near, around=judged("eventually[3,6] goal")),
-    "statistics": Filtered(DUBINS, "scbf", around=STATISTICS, options=SMALL),
-    "costs": Filtered(DUBINS, around=COSTS, options=SMALL),
+    "backup": own(partial(cart_problem, horizon=0.6), "backup"),
+    "specification": own(near, "hocbf", around=judged("always safe & eventually goal")),
+    "bounded specification": own(near, around=judged("eventually[3,6] goal")),
+    "statistics": own(DUBINS, "scbf", around=STATISTICS, **SMALL),
+    "costs": own(DUBINS, around=COSTS, **SMALL),
     "third party": ThirdParty("Pendulum-v1", "cbf:alpha=2:sampling_margin=15", SWING),
     "third party in other units": ThirdParty("MountainCarContinuous-v0", "cbf:alpha=0.05", CAR),
-    "compiled": Filtered(DUBINS, options=short(DUBINS), engine="compiled"),
-    "compiled filter": Filtered(DUBINS, "scbf", options=short(DUBINS), engine="compiled"),
-    "compiled reciprocal filter": Filtered(
-        "safe_envs/CubicSDEDisk-v0",
-        "rcbf",
-        options=short("safe_envs/CubicSDEDisk-v0"),
-        engine="compiled",
-    ),
-    "compiled with several barriers": Filtered(
-        LIMITS, "hocbf", options=short(LIMITS, noise=0.05), engine="compiled"
-    ),
-    "compiled, ended by violations": Filtered(
-        SCALAR,
-        "scbf",
-        options={"start": [0.98], "noise": 2.0, "terminate_on_violation": True},
-        engine="compiled",
-    ),
+    "compiled": own(DUBINS, engine="compiled"),
+    "compiled filter": own(DUBINS, "scbf", engine="compiled"),
+    "compiled reciprocal filter": own("safe_envs/CubicSDEDisk-v0", "rcbf", engine="compiled"),
+    "compiled with several barriers": own(LIMITS, "hocbf", engine="compiled", noise=0.05),
+    "compiled, ended by violations": own(SCALAR, "scbf", engine="compiled", **VIOLATING),
 }
 """By what they show."""
 
 
 def of_env(env_id: str, *, filtered: bool = True, engine: str = "numpy") -> Make:
     """A registered env with noise and short episodes, and its own filter."""
-    return Filtered(
-        env_id,
-        problem_of(env_id).filter if filtered else None,
-        options=short(env_id, noise=0.05),
-        engine=engine,
-    )
+    text = problem_of(env_id).filter if filtered else None
+    return own(env_id, text, engine=engine, noise=0.05)
 
 
 FEW = (

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from safe_envs.engine.program import Program
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
-from tests.wrappers.cases import CASES, DUBINS, FEW, SCALAR, Filtered, actions, of_env
+from tests.wrappers.cases import CASES, DUBINS, FEW, SCALAR, actions, of_env, own
 
 COPIES = {
     "pickle": lambda given: pickle.loads(pickle.dumps(given)),
@@ -88,7 +88,7 @@ def test_every_env(env_id, copied):
 @pytest.mark.parametrize("count", [None, 2])
 def test_long_episodes_take_the_noise_from_where_it_was(count):
     """Noise is drawn in chunks of 256 control periods."""
-    make = Filtered(SCALAR, options={"start": [0.0], "noise": 0.01, "horizon": 1000.0})
+    make = own(SCALAR, start=[0.0], noise=0.01, horizon=1000.0)
     assert_goes_on_alone(make(count), copy.deepcopy, steps=250, count=20)
 
 
