@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError, SafeEnv, SafeVectorEnv
+from safe_envs.envs.episode import DelayLine
 from tests.conftest import problem_of
 
 PENDULUM = "safe_envs/Pendulum-v0"
@@ -66,6 +67,13 @@ def test_inputs_and_rates_stay_within_their_bounds(num_envs):
                 break
             last = now
         assert k > 20
+
+
+def test_what_is_under_way_is_nobody_elses_array():
+    line, given = DelayLine(2, (0.0,), num_envs=3), np.ones(3)
+    line.exchange((given,))
+    given[:] = 9.0
+    np.testing.assert_array_equal(line.under_way[-1], [np.ones(3)])
 
 
 @pytest.mark.parametrize(

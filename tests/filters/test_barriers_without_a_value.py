@@ -23,7 +23,6 @@ from safe_envs import (
 )
 from safe_envs.agents import evaluate
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.engine.program import Program
 from safe_envs.filters.decision_log import DecisionLog
 from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.problem.named_sets import NamedSets
@@ -136,8 +135,8 @@ def test_an_error_names_the_barrier_and_the_state():
         overflowing.filter([1e120, 0.0], [0.0])
 
 
-def test_filtered_envs_agree_in_every_engine(problem, monkeypatch):
-    monkeypatch.setattr(Program, "compiled", Program.plain)
+@pytest.mark.slow
+def test_filtered_envs_agree_in_every_engine(problem):
     states = np.array([LOST, KEPT, EDGE])
     batches = [
         SafetyFilterVectorWrapper(SafeVectorEnv(problem, 3, engine=engine), "cbf")

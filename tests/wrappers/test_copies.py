@@ -154,7 +154,7 @@ def stepped(envs):
     return found
 
 
-@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.oracle)])
 def test_filtered_envs_step_in_other_processes_as_here(method):
     here = DummyVecEnv([filtered_dubins] * 2)
     there = SubprocVecEnv([filtered_dubins] * 2, start_method=method)
