@@ -121,6 +121,27 @@ def test_a_filter_that_comes_late_says_what_it_says_at_rest(engine):
     assert not info["intervention"].any()
 
 
+@pytest.mark.parametrize("seed", [None, 5, [4, None, 2**70]])
+def test_each_engine_goes_on_from_the_snapshot_of_the_other(seed):
+    """Without a seed the noise goes on where it is."""
+    envs = [made(condition="scbf", engine=engine) for engine in ENGINES]
+    for env in envs:
+        env.reset(seed=7)
+        for _ in range(3):
+            env.step(np.full((3, 1), 0.4))
+    snapshots = [env.snapshot() for env in envs]
+    for env, snapshot in zip(envs, snapshots[::-1], strict=True):
+        for _ in range(2):
+            env.step(np.full((3, 1), 0.9))
+        env.restore(snapshot, seed)
+    for k in range(10):
+        theirs, ours = (env.step(np.full((3, 1), 0.2)) for env in envs)
+        assert_same(ours[0], theirs[0], f"step {k}")
+        assert_same(ours[4]["safe_action"], theirs[4]["safe_action"], f"step {k}")
+    for key, value in envs[0].snapshot().items():
+        assert_same(envs[1].snapshot()[key], value, key)
+
+
 @each_engine
 def test_any_array_is_taken(engine):
     env = made(condition="scbf", engine=engine)
