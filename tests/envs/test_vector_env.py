@@ -143,6 +143,24 @@ def test_each_engine_goes_on_from_the_snapshot_of_the_other(seed):
 
 
 @each_engine
+@with_and_without
+def test_a_seed_forgets_the_noise_that_was_drawn_before(engine, condition):
+    env, fresh = (made(condition=condition, engine=engine) for _ in range(2))
+    env.reset(seed=1)
+    for _ in range(3):
+        env.step(np.full((3, 1), 0.4))
+    np.testing.assert_array_equal(env.reset(seed=2)[0], fresh.reset(seed=2)[0])
+    for _ in range(3):
+        given = np.full((3, 1), 0.2)
+        np.testing.assert_array_equal(env.step(given)[0], fresh.step(given)[0])
+    snapshot = fresh.snapshot()
+    for each in (env, fresh):
+        each.restore(snapshot, seed=[None, 9, 9])
+    ours, theirs = (each.step(given)[0] for each in (env, fresh))
+    np.testing.assert_array_equal(ours, theirs)
+
+
+@each_engine
 def test_any_array_is_taken(engine):
     env = made(condition="scbf", engine=engine)
     everywhere = np.broadcast_to(True, (3,))

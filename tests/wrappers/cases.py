@@ -198,6 +198,7 @@ CASES: dict[str, Make] = {
     "third party": ThirdParty("Pendulum-v1", "cbf:alpha=2:sampling_margin=15", SWING),
     "third party in other units": ThirdParty("MountainCarContinuous-v0", "cbf:alpha=0.05", CAR),
     "compiled": own(DUBINS, engine="compiled"),
+    "compiled with substeps": own(DUBINS, engine="compiled", substeps=3),
     "compiled filter": own(DUBINS, "scbf", engine="compiled"),
     "compiled reciprocal filter": own("safe_envs/CubicSDEDisk-v0", "rcbf", engine="compiled"),
     "compiled with several barriers": own(LIMITS, "hocbf", engine="compiled", noise=0.05),
