@@ -277,8 +277,19 @@ class ScalarEnvs:
 
 def assert_close(ours: Any, theirs: Any, where: str) -> None:
     """Compare to the last bits, in which functions of NumPy and of `math` differ."""
+    if isinstance(theirs, dict):
+        assert ours.keys() == theirs.keys(), where
+        for key, value in theirs.items():
+            assert_close(ours[key], value, f"{where}: {key}")
+        return
     ours, theirs = np.asarray(ours), np.asarray(theirs)
     assert ours.shape == theirs.shape, where
+    if theirs.dtype == object:
+        for mine, other in zip(ours, theirs, strict=True):
+            assert (mine is None) == (other is None), where
+            if other is not None:
+                assert_close(mine, other, where)
+        return
     exact = theirs.dtype == bool or np.issubdtype(theirs.dtype, np.integer)
     tolerances = {"rtol": 0.0, "atol": 0.0} if exact else {"rtol": 1e-6, "atol": 1e-9}
     np.testing.assert_allclose(ours, theirs, err_msg=where, **tolerances)
