@@ -11,7 +11,7 @@ from safe_envs.dynamics.codegen import Components, filled, finite, settled, stac
 from safe_envs.envs.episode import Actuators, Episodes
 from safe_envs.envs.info import VectorStep
 from safe_envs.envs.noise import NoiseStreams
-from safe_envs.envs.sensor import batch_sensor_of
+from safe_envs.envs.sensor import BatchSensor
 from safe_envs.envs.simulation import Simulation, require_sound
 from safe_envs.envs.spaces import BatchActions, observation_box
 from safe_envs.envs.starts import EpisodeStreams, StartingPoints
@@ -54,7 +54,8 @@ class ArrayBatch:
         self._simulation = Simulation(problem, "arrays")
         self._actions = BatchActions(problem, streams.num_envs)
         self.noise = NoiseStreams(streams, self._simulation.integrator.channels, limit)
-        self.sensor = batch_sensor_of(problem, streams, limit)
+        measured = problem.measurement
+        self.sensor = measured and BatchSensor(problem, measured, streams, limit)
         observed = {f.expression for f in problem.features}
         self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
 

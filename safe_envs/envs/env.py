@@ -13,7 +13,7 @@ from safe_envs.dynamics.noise import Key, StreamReader, key_of
 from safe_envs.envs.episode import Actuators, Episode
 from safe_envs.envs.info import Info
 from safe_envs.envs.noise import NoiseStream
-from safe_envs.envs.sensor import Sample, sensor_of
+from safe_envs.envs.sensor import Sample, Sensor
 from safe_envs.envs.simulation import LARGEST, Simulation, require_sound, steps_until
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import OwnSpec
@@ -86,7 +86,8 @@ class SafeEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
         self._number = 0
         self.sent = self.executed = ()
         self._actuators = None if problem.direct else Actuators(problem)
-        self._sensor = sensor_of(problem, self._limit)
+        measured = problem.measurement
+        self._sensor = measured and Sensor(problem, measured, self._limit)
         self._x: tuple[float, ...] | None = None
         self._episode = Episode()
         self._reset_options = ResetOptions(problem, self._limit)

@@ -171,13 +171,7 @@ class NoiseStreams:
         return np.concatenate([later, others]) if later.size else later
 
     def _draw(self, now: np.ndarray, later: np.ndarray, left: np.ndarray) -> None:
-        """Draw for some envs.
-
-        Args:
-            now: those that need more for their episodes.
-            later: those that need the beginnings of their next episodes.
-            left: what every env still has for its episode.
-        """
+        """Draw for some envs."""
         n, envs, nothing = len(now), np.concatenate([now, later]), np.zeros_like(later)
         drawn = np.concatenate([self._drawn[now], nothing])
         kept = np.concatenate([left[now], nothing])
@@ -214,17 +208,7 @@ class NoiseStreams:
     def _normals(
         self, envs: np.ndarray, episodes: np.ndarray, periods: np.ndarray, counts: np.ndarray
     ) -> np.ndarray:
-        """Return the numbers of some control periods of each env, one after the other.
-
-        Args:
-            envs: their indices.
-            episodes: of each.
-            periods: the first control period of each.
-            counts: number of control periods of each.
-
-        Returns:
-            Shape (sum of the counts, channels).
-        """
+        """Return the numbers of some control periods of each env, one after the other."""
         found = np.empty((int(counts.sum()), self._channels))
         keys, reader = self._streams.keys, self._streams.reader
         first, words = 0, (periods * self._channels).tolist()

@@ -309,28 +309,3 @@ class BatchSensor(_Sensor):
             for d, low, value in zip(draws[k:], self._lost_below, values, strict=True)
         ]
         return Sample(values, received)
-
-
-def sensor_of(problem: SafetyProblem, periods: int) -> Sensor | None:
-    """Return the sensor of one env; None where the observation is of the true state.
-
-    Args:
-        problem: which is simulated.
-        periods: of an episode.
-    """
-    measured = problem.measurement
-    return None if measured is None else Sensor(problem, measured, periods)
-
-
-def batch_sensor_of(
-    problem: SafetyProblem, streams: EpisodeStreams, periods: int
-) -> BatchSensor | None:
-    """Return the sensor of a batch; see `sensor_of`.
-
-    Args:
-        problem: see there.
-        streams: of the envs.
-        periods: see there.
-    """
-    measured = problem.measurement
-    return None if measured is None else BatchSensor(problem, measured, streams, periods)

@@ -39,97 +39,6 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
 
-class VectorInterface(  # pyright: ignore[reportIncompatibleVariableOverride]
-    OwnSpec, IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
-):
-    """Spaces, metadata, spec and seeds of a batch of envs; base of `SafeVectorEnv`.
-
-    Attributes:
-        problem: that is simulated.
-        autoreset_mode: when ended episodes restart, as of Gymnasium's Sync- and AsyncVectorEnv.
-        viewer: what is drawn, and its caption; None without a render mode.
-
-    Args:
-        problem: see above.
-        num_envs: size of the batch.
-        autoreset_mode: when ended episodes restart.
-        max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: "rgb_array" or None.
-
-    Raises:
-        ConfigurationError: an argument is out of range.
-    """
-
-    def __init__(
-        self,
-        problem: SafetyProblem,
-        num_envs: int,
-        autoreset_mode: str | AutoresetMode,
-        max_episode_steps: int | None,
-        render_mode: str | None,
-    ) -> None:
-        self.viewer = open_viewer(problem, render_mode, num_envs)
-        self.render_mode = render_mode
-        self.autoreset_mode = _mode(autoreset_mode)
-        self._limit = steps_until(problem, max_episode_steps)
-        self.problem, self.num_envs = problem, num_envs
-        self.metadata = {
-            "render_modes": [*RENDER_MODES[1:]],
-            "render_fps": frames_a_second(problem),
-            "autoreset_mode": self.autoreset_mode,
-        }
-        self.single_observation_space = observation_box(problem)
-        self.single_action_space = action_box(problem)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._actions = BatchActions(problem, num_envs)
-        self._streams = EpisodeStreams(num_envs)
-
-    @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """A generator of each env, seeded as Gymnasium does; the env does not draw from it."""
-        self._streams.seed([None] * self.num_envs)
-        return self._streams.generators()
-
-    @property
-    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The seed of each env."""
-        self._streams.seed([None] * self.num_envs)
-        return tuple(self._streams.seeds)
-
-    @property
-    def components(self) -> Components:
-        """The exact states: for each state an array (num_envs,), not to be written to."""
-        raise NotImplementedError
-
-    def render(self) -> tuple[np.ndarray, ...] | None:
-        """Draw every env, with the trail of its episode and what a filter decided.
-
-        Returns:
-            For each env uint8 of shape (height, width, 3); None, with a warning, without a render
-            mode.
-
-        Raises:
-            gymnasium.error.DependencyNotInstalled: pygame is missing.
-            ResetNeeded: there is no state yet.
-        """
-        if self.viewer is None:
-            gym.logger.warn(
-                "render() draws nothing without a render mode; make the envs with"
-                ' render_mode="rgb_array"'
-            )
-            return None
-        return self.viewer.frames() if self.components else None
-
-    def physical_action(self, actions: Any) -> Components:
-        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
-        return self._actions.physical(actions)
-
-    def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
-        """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
-        return self._actions.normalized(physical)
-
-
 def _mode(given: str | AutoresetMode) -> AutoresetMode:
     try:
         return AutoresetMode(given)
@@ -141,7 +50,9 @@ def _mode(given: str | AutoresetMode) -> AutoresetMode:
 _Stepper = ArrayBatch | CompiledBatch | BatchStepper
 
 
-class SafeVectorEnv(VectorInterface):
+class SafeVectorEnv(  # pyright: ignore[reportIncompatibleVariableOverride]
+    OwnSpec, IndependentCopies, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
+):
     """`num_envs` copies of a problem, stepped together.
 
     Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i,
@@ -150,6 +61,9 @@ class SafeVectorEnv(VectorInterface):
     of `SafeEnv` with the batch in front.
 
     Attributes:
+        problem: that is simulated.
+        autoreset_mode: when ended episodes restart, as of Gymnasium's Sync- and AsyncVectorEnv.
+        viewer: what is drawn, and its caption; None without a render mode.
         engine: that was asked for.
 
     Args:
@@ -181,7 +95,22 @@ class SafeVectorEnv(VectorInterface):
         terminate_on_violation: bool = False,
     ) -> None:
         require_whole("num_envs", num_envs, 1)
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
+        self.viewer = open_viewer(problem, render_mode, num_envs)
+        self.render_mode = render_mode
+        self.autoreset_mode = _mode(autoreset_mode)
+        self._limit = steps_until(problem, max_episode_steps)
+        self.problem, self.num_envs = problem, num_envs
+        self.metadata = {
+            "render_modes": [*RENDER_MODES[1:]],
+            "render_fps": frames_a_second(problem),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space = observation_box(problem)
+        self.single_action_space = action_box(problem)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._actions = BatchActions(problem, num_envs)
+        self._streams = EpisodeStreams(num_envs)
         self._ends_on_violation = flag("terminate_on_violation", terminate_on_violation)
         self.episodes = Episodes(num_envs)
         self._reset_options = ResetOptions(problem, self._limit, num_envs)
@@ -190,6 +119,45 @@ class SafeVectorEnv(VectorInterface):
         parts = (problem, self._streams, self.episodes, self._limit)
         compiled = compiled_or_none(engine, math.inf, lambda: CompiledBatch(*parts))
         self._batch = ArrayBatch(*parts) if compiled is None else compiled
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """A generator of each env, seeded as Gymnasium does; the env does not draw from it."""
+        self._streams.seed([None] * self.num_envs)
+        return self._streams.generators()
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The seed of each env."""
+        self._streams.seed([None] * self.num_envs)
+        return tuple(self._streams.seeds)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw every env, with the trail of its episode and what a filter decided.
+
+        Returns:
+            For each env uint8 of shape (height, width, 3); None, with a warning, without a render
+            mode.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ResetNeeded: there is no state yet.
+        """
+        if self.viewer is None:
+            gym.logger.warn(
+                "render() draws nothing without a render mode; make the envs with"
+                ' render_mode="rgb_array"'
+            )
+            return None
+        return self.viewer.frames() if self.components else None
+
+    def physical_action(self, actions: Any) -> Components:
+        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
+        return self._actions.physical(actions)
+
+    def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
+        """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
+        return self._actions.normalized(physical)
 
     @property
     def components(self) -> Components:

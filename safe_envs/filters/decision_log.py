@@ -9,7 +9,7 @@ import math
 import re
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.util import find_spec
@@ -39,6 +39,7 @@ from safe_envs.text import finite_number
 _FLAGS = ("intervention", "feasible", "cause")
 _BRACKETED_END = re.compile(r" \[([^][]*)\]$")
 _HEADING = re.compile(r"(\w+):(.*?)(?: \[([^][]*)\])?", re.DOTALL)
+_MOST_COLUMNS = 1000
 _SECTIONS = ("state", "parameter", "nominal", "action", "low", "high", "h", "slack")
 
 
@@ -165,6 +166,8 @@ class LogColumns:
         Raises:
             ValueError: They are not those of a log.
         """
+        if len(headings) > _MOST_COLUMNS:
+            raise ValueError(f"it has {len(headings)} columns; {_MOST_COLUMNS} are the most")
         twice = [heading for heading, count in Counter(headings).items() if count > 1]
         if twice:
             raise ValueError(f"it has the column {shown(twice[0])} twice")
@@ -186,11 +189,7 @@ class LogColumns:
 
 
 def printable(text: str) -> str:
-    """Return a text with spaces in the place of characters that cannot be printed.
-
-    Args:
-        text: of anybody; it may hold control characters and halves of surrogate pairs.
-    """
+    """Return a text with spaces for control characters and halves of surrogate pairs."""
     return "".join([c if c.isprintable() else " " for c in text])
 
 
@@ -211,83 +210,10 @@ def _numbered(names: Sequence[str]) -> list[str]:
     return found
 
 
-_ADVICE = "give what `DecisionLog.to_csv` or `to_parquet` wrote"
-_MOST_COLUMNS = 1000
-
-
-def write_csv(path: Path, columns: LogColumns, table: np.ndarray) -> None:
-    """Write a log as CSV; see `DecisionLog.to_csv`.
-
-    Args:
-        path: of the file.
-        columns: of the log.
-        table: shape (periods, columns).
-    """
-
-    def write(part: Path) -> None:
-        with part.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(columns.headings)
-            # The last three are whole numbers.
-            writer.writerows([*row[:-3], *map(int, row[-3:])] for row in table.tolist())
-
-    write_atomically(path, write)
-
-
-def write_parquet(path: Path, columns: LogColumns, table: np.ndarray) -> None:
-    """Write a log as Parquet; see `DecisionLog.to_parquet`.
-
-    Args:
-        path: of the file.
-        columns: of the log.
-        table: shape (periods, columns).
-    """
-    _require_pyarrow()
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    kinds = [*[np.float64] * (len(columns.headings) - 3), np.bool_, np.bool_, np.int64]
-    found = pa.table(
-        [pa.array(values.astype(kind)) for values, kind in zip(table.T, kinds, strict=True)],
-        names=columns.headings,
-    )
-    write_atomically(path, lambda part: pq.write_table(found, part))
-
-
-def read_log(path: Path) -> tuple[LogColumns, np.ndarray]:
-    """Return the columns and the table of a log's file; see `DecisionLog.read`.
-
-    Args:
-        path: of the file.
-    """
-    readers: dict[str, Callable[[bytes], tuple[LogColumns, np.ndarray]]] = {
-        ".csv": _read_csv,
-        ".parquet": _read_parquet,
-    }
-    if path.suffix not in readers:
-        raise ConfigurationError(
-            f"{shortened(path)} is neither FILE.csv nor FILE.parquet; {_ADVICE}"
-        )
-    try:
-        columns, table = readers[path.suffix](read_bytes(path))
-        _require_log(columns, table)
-    except OSError as error:
-        raise ConfigurationError(
-            f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}"
-        ) from error
-    except (ValueError, csv.Error) as error:
-        if isinstance(error, ConfigurationError):
-            raise
-        raise ConfigurationError(
-            f"{shortened(path)} holds no log: {shortened(error)}; {_ADVICE}"
-        ) from error
-    return columns, table
-
-
 def _read_csv(content: bytes) -> tuple[LogColumns, np.ndarray]:
     lines = io.TextIOWrapper(io.BytesIO(content), "utf-8", newline="")
     headings = next(csv.reader(lines), [])
-    columns = _columns(headings)
+    columns = LogColumns.read(headings)
     first = lines.readline()
     if not first:
         return columns, np.empty((0, len(headings)))
@@ -305,7 +231,7 @@ def _read_parquet(content: bytes) -> tuple[LogColumns, np.ndarray]:
     try:
         file = pq.ParquetFile(io.BytesIO(content))
         schema, count = file.schema_arrow, file.metadata.num_rows
-        columns = _columns(schema.names)
+        columns = LogColumns.read(schema.names)
         allowed = {pa.float64(), pa.int64(), pa.bool_()}
         if not set(schema.types) <= allowed:
             raise ValueError("its columns are no numbers")
@@ -318,12 +244,6 @@ def _read_parquet(content: bytes) -> tuple[LogColumns, np.ndarray]:
     if any(column.null_count for column in table.columns):
         raise ValueError("numbers are missing in it")
     return columns, np.column_stack([c.to_numpy().astype(np.float64) for c in table.columns])
-
-
-def _columns(headings: list[str]) -> LogColumns:
-    if len(headings) > _MOST_COLUMNS:
-        raise ValueError(f"it has {len(headings)} columns; {_MOST_COLUMNS} are the most")
-    return LogColumns.read(headings)
 
 
 def _require_log(columns: LogColumns, table: np.ndarray) -> None:
@@ -369,16 +289,8 @@ Defaults = Sequence[tuple[sp.Symbol, str, float | None]]
 """Each symbol of run time, its name, and its value where none is given."""
 
 
-def runtime_values(known: Defaults, parameters: Mapping[Any, float]) -> list[float]:
-    """Return what was given at run time, in order.
-
-    Args:
-        known: to the filter.
-        parameters: as given to the filter.
-
-    Raises:
-        InvalidInputError: A value is missing, given twice, or of a name that is unknown.
-    """
+def _runtime_values(known: Defaults, parameters: Mapping[Any, float]) -> list[float]:
+    """Return what was given at run time, in order; raises where not each is there once."""
     found, used = [], 0
     for symbol, name, default in known:
         value = parameters.get(name)
@@ -397,41 +309,6 @@ def runtime_values(known: Defaults, parameters: Mapping[Any, float]) -> list[flo
             f" {', '.join([name for _, name, _ in known]) or 'none'} once"
         )
     return found
-
-
-def require_finite(headings: Sequence[str], values: Sequence[float]) -> None:
-    """Raise InvalidInputError unless the time, the state and the parameters are finite.
-
-    Args:
-        headings: of the first columns of a log, and of others.
-        values: of the first columns.
-    """
-    for heading, value in zip(headings, values, strict=False):
-        if not math.isfinite(value):
-            raise InvalidInputError(
-                f"{heading} is {value}, of which a filter decides nothing; give what it decided"
-                " about"
-            )
-
-
-def pairs_of(bounds: Any, m: int) -> tuple[Sequence[float], Sequence[float]]:
-    """Return lower and upper bounds.
-
-    Args:
-        bounds: one pair, or one for each input.
-        m: number of inputs.
-    """
-    pairs = np.broadcast_to(np.asarray(bounds, dtype=float), (m, 2))
-    return pairs[:, 0].tolist(), pairs[:, 1].tolist()
-
-
-def endless(bounds: Sequence[float]) -> list[float]:
-    """Return bounds with infinities where a filter has `WIDEST`.
-
-    Args:
-        bounds: of a filter.
-    """
-    return [math.copysign(math.inf, b) if abs(b) == WIDEST else b for b in bounds]
 
 
 class DecisionLog(IndependentCopies):
@@ -490,7 +367,12 @@ class DecisionLog(IndependentCopies):
         runtime = [symbol for symbol in qp.runtime if symbol not in (TIME, *belief)]
         names = [barrier.name for barrier, _ in safety_filter.pairs]
         log = cls(LogColumns.of(model.states, model.inputs, names, runtime, units))
-        log._bounds = endless(qp.low), endless(qp.high)
+        # A filter has `WIDEST` where it was given no bound.
+        low, high = (
+            [math.copysign(math.inf, b) if abs(b) == WIDEST else b for b in bounds]
+            for bounds in (qp.low, qp.high)
+        )
+        log._bounds = low, high
         log._defaults = [(s, s.name, model.parameters.get(s)) for s in runtime]
         log._inputs += len(runtime)
         log._believed = frozenset(each for s in belief for each in (s, s.name) if s in qp.runtime)
@@ -523,14 +405,16 @@ class DecisionLog(IndependentCopies):
                 parameters = {k: v for k, v in parameters.items() if k not in self._believed}
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
             intervened = decision.cause >= 0 and action != proposed
-            low, high = self._bounds if bounds is None else pairs_of(bounds, len(action))
+            low, high = self._bounds
+            if bounds is not None:
+                low, high = np.broadcast_to(np.asarray(bounds, float), (len(action), 2)).T.tolist()
             known = self._defaults
             values = array(
                 "d",
                 [
                     t,
                     *x,
-                    *(runtime_values(known, parameters or {}) if known or parameters else ()),
+                    *(_runtime_values(known, parameters or {}) if known or parameters else ()),
                     *proposed,
                     *action,
                     *low,
@@ -555,8 +439,13 @@ class DecisionLog(IndependentCopies):
                 f" takes {self._width}: a finite t, {len(self.columns.states)} states, and the"
                 " decision of the filter that the log was made for"
             )
-        if not math.isfinite(sum(values[: self._inputs])):
-            require_finite(self.columns.headings, values[: self._inputs])
+        if not math.isfinite(sum(values[: self._inputs])):  # which may be of finite numbers
+            for heading, value in zip(self.columns.headings, values[: self._inputs], strict=False):
+                if not math.isfinite(value):
+                    raise InvalidInputError(
+                        f"{heading} is {value}, of which a filter decides nothing; give what it"
+                        " decided about"
+                    )
         self._extend(values)
 
     def append(self, values: Sequence[float]) -> None:
@@ -677,7 +566,16 @@ class DecisionLog(IndependentCopies):
         Raises:
             ConfigurationError: The file cannot be written.
         """
-        write_csv(path_of(path, "FILE.csv"), self.columns, self.table())
+
+        def write(part: Path) -> None:
+            with part.open("w", newline="", encoding="utf-8") as stream:
+                writer = csv.writer(stream, lineterminator="\n")
+                writer.writerow(self.columns.headings)
+                # The last three are whole numbers.
+                rows = self.table().tolist()
+                writer.writerows([*row[:-3], *map(int, row[-3:])] for row in rows)
+
+        write_atomically(path_of(path, "FILE.csv"), write)
 
     def to_parquet(self, path: Path | str) -> None:
         """Write a Parquet file, whole or not at all; needs pyarrow.
@@ -688,7 +586,18 @@ class DecisionLog(IndependentCopies):
         Raises:
             ConfigurationError: pyarrow is not installed, or the file cannot be written.
         """
-        write_parquet(path_of(path, "FILE.parquet"), self.columns, self.table())
+        target = path_of(path, "FILE.parquet")
+        _require_pyarrow()
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        headings, columns = self.columns.headings, self.table().T
+        kinds = [*[np.float64] * (len(headings) - 3), np.bool_, np.bool_, np.int64]
+        found = pa.table(
+            [pa.array(values.astype(kind)) for values, kind in zip(columns, kinds, strict=True)],
+            names=headings,
+        )
+        write_atomically(target, lambda part: pq.write_table(found, part))
 
     @classmethod
     def read(cls, path: Path | str) -> DecisionLog:
@@ -700,10 +609,25 @@ class DecisionLog(IndependentCopies):
         Raises:
             ConfigurationError: The file cannot be read, is too large, or holds no log.
         """
-        columns, table = read_log(path_of(path, "FILE.csv or FILE.parquet"))
+        place = path_of(path, "FILE.csv or FILE.parquet")
+        advice = "give what `DecisionLog.to_csv` or `to_parquet` wrote"
+        reader = {".csv": _read_csv, ".parquet": _read_parquet}.get(place.suffix)
+        name = shortened(place)
+        if reader is None:
+            raise ConfigurationError(f"{name} is neither FILE.csv nor FILE.parquet; {advice}")
+        try:
+            columns, table = reader(read_bytes(place))
+            _require_log(columns, table)
+        except OSError as error:
+            raise ConfigurationError(
+                f"{name} cannot be read: {error.strerror}; {advice}"
+            ) from error
+        except ConfigurationError:
+            raise
+        except (ValueError, csv.Error) as error:
+            raise ConfigurationError(
+                f"{name} holds no log: {shortened(error)}; {advice}"
+            ) from error
         log = cls(columns)
         log._values.frombytes(np.ascontiguousarray(table, dtype=np.float64).tobytes())
         return log
-
-
-__all__ = ["DecisionLog", "LogColumns"]

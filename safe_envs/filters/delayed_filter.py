@@ -22,6 +22,7 @@ from safe_envs.errors import (
     require_whole,
     shown,
 )
+from safe_envs.filters.measurement_filter import components_of
 from safe_envs.filters.qp import FilterDecision, FilterQP
 from safe_envs.filters.runtime import RuntimeArguments, doubles, require_finite
 from safe_envs.filters.safety_filter import SafetyFilter
@@ -234,7 +235,7 @@ class DelayedFilter:
         if self.delay:
             state, later = self._predicted(state, line, parameters, t)
         decision = self.safety_filter.filter(state, u, bounds=bounds, **later)
-        line.exchange(self._components(decision.action))
+        line.exchange(components_of(decision.action))
         self._batch, self._line, self._unknown = state.shape[:-1], line, 0
         return decision
 
@@ -262,7 +263,7 @@ class DelayedFilter:
                 f" {(*batch, m) if self._batch is not None else f'(..., {m})'}"
             )
         line = self._line if self._batch is not None else self._empty_line(batch)
-        sent = tuple(self._components(given))
+        sent = tuple(components_of(given))
         if self._unknown:
             line.exchange(sent)
             self._unknown -= 1
@@ -296,7 +297,7 @@ class DelayedFilter:
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the predicted states, and the values that a call of the filter takes there."""
         batch = x.shape[:-1] if x.ndim > 1 else None
-        now = [*self._components(x), *self._given.values(parameters, t, batch)]
+        now = [*components_of(x), *self._given.values(parameters, t, batch)]
         under_way = line.under_way
         if batch is None:
             found = self._prediction.of_one(now, under_way)
@@ -310,12 +311,6 @@ class DelayedFilter:
         values = {s: np.reshape(c, batch or ()) for s, c in zip(runtime, found[n:], strict=True)}
         later = {"t": values.pop(TIME, None), "parameters": values or None}
         return np.stack(found[:n], axis=-1).reshape(x.shape), later
-
-    def _components(self, values: np.ndarray) -> Sequence[Any]:
-        """Return components of arrays (..., k): floats of one, arrays (B,) of a batch, copied."""
-        if values.ndim == 1:
-            return values.tolist()
-        return list(np.array(values.reshape(-1, values.shape[-1]).T, order="C"))
 
     def _resting(self, given: Any, box: Sequence[tuple[float, float]]) -> list[float]:
         values = real_array("rest", given)

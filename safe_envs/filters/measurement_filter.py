@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -16,6 +16,13 @@ from safe_envs.filters.estimation.estimator import Estimator, require_fixed, unp
 from safe_envs.filters.estimation.tracker import BeliefTracker
 from safe_envs.filters.qp import FilterDecision
 from safe_envs.filters.runtime import doubles
+
+
+def components_of(values: np.ndarray) -> Sequence[Any]:
+    """Return components of arrays (..., k): floats of one, arrays (B,) of a batch, copied."""
+    if values.ndim == 1:
+        return values.tolist()
+    return list(np.array(values.reshape(-1, values.shape[-1]).T, order="C"))
 
 
 class MeasurementFilter:
@@ -112,10 +119,10 @@ class MeasurementFilter:
         self._waiting = True
         given = dict(parameters or {})
         if self._believed:
-            found = self._known.believed(self._components(u))
+            found = self._known.believed(components_of(u))
             given |= {name: np.reshape(found[at], batch) for name, at in self._believed.items()}
         decision = self._filter.filter(self.mean, u, bounds=bounds, parameters=given or None, t=t)
-        self._sent, self._waiting = self._components(decision.action), False
+        self._sent, self._waiting = components_of(decision.action), False
         return decision
 
     def override(self, u: Any) -> None:
@@ -136,7 +143,7 @@ class MeasurementFilter:
                 f"the input {shown(u)} does not fit; give finite numbers of shape"
                 f" {(*self._batch, self.estimator.model.m)}"
             )
-        self._sent, self._waiting = self._components(given), False
+        self._sent, self._waiting = components_of(given), False
 
     @property
     def _known(self) -> BeliefTracker:
@@ -161,7 +168,7 @@ class MeasurementFilter:
         return values
 
     def _take_in(self, values: np.ndarray, batch: tuple[int, ...]) -> None:
-        parts = self._components(values)
+        parts = components_of(values)
         # A value that is not finite counts as lost.
         sample = Sample(parts, [True if not batch else np.ones(len(p), dtype=bool) for p in parts])
         if self._batch is None:
@@ -176,11 +183,6 @@ class MeasurementFilter:
             )
         self._tracker.advance(self._sent, sample)
         self._sent = None
-
-    def _components(self, values: np.ndarray) -> Any:
-        if values.ndim == 1:
-            return values.tolist()
-        return list(np.array(values.reshape(-1, values.shape[-1]).T, order="C"))
 
 
 def certain_states(estimator: Any) -> tuple[int, ...]:

@@ -164,11 +164,7 @@ class SafeSet:
 
 
 def _to_edge(h: np.ndarray) -> np.ndarray:
-    """Return the distance from the nearest edge in pixels, to first order.
-
-    Args:
-        h: shape (barriers, rows, columns).
-    """
+    """Return the distance from the nearest edge in pixels, to first order."""
     down, across = np.gradient(h, _CELL, axis=(1, 2))
     slope = np.sqrt(np.maximum(down * down + across * across, 1e-24))
     return (h / slope).min(axis=0).astype(np.float32)

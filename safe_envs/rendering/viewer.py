@@ -336,13 +336,7 @@ class Picture:
 
 
 def _photograph(canvas: Canvas, pixels: np.ndarray, box: Box) -> None:
-    """Show a picture as large as it fits into a box.
-
-    Args:
-        canvas: to draw on.
-        pixels: uint8 of shape (height, width, 3).
-        box: left, top, width and height.
-    """
+    """Show a picture as large as it fits into a box."""
     left, top, width, height = box
     shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
     scale = min(width / shown.get_width(), height / shown.get_height())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -40,8 +40,81 @@ from safe_envs.wrappers.monitor import MonitorLayer
 _KEY = "filter_under_way"
 
 
-class DelayMemory:
-    """A filter that decides at the predicted state; see `DelayedFilter` and `EpisodeFilter`.
+class EpisodeFilter:
+    """A filter of a batch of envs, or of one env, which follows their episodes.
+
+    This one decides by state and proposed input alone, and remembers nothing. States and inputs are
+    components: floats of one env, or arrays (num_envs,) of a batch. `PromiseMemory` has the same
+    methods.
+
+    Args:
+        safety_filter: which decides.
+
+    Attributes:
+        safety_filter: as given.
+        text: of its conditions or settings.
+        judges_episodes: whether what it keeps is of whole episodes, so that none can begin late.
+    """
+
+    judges_episodes = False
+
+    def __init__(self, safety_filter: SafetyFilter | BackupFilter) -> None:
+        self.safety_filter = safety_filter
+        self.text = (
+            safety_filter.text
+            if isinstance(safety_filter, BackupFilter)
+            else spec_of([each for _, each in safety_filter.pairs])
+        )
+
+    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
+        """Begin episodes.
+
+        Args:
+            x: n components of the states of all envs.
+            envs: which begin an episode, bool (num_envs,); None for all.
+            instants: control periods of each episode that have passed, int or (num_envs,).
+        """
+
+    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
+        """Go on from states that no decision led to: somebody set them; see `begin`."""
+
+    def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
+        """Decide for one env; see `SafetyFilter.decide_floats`."""
+        return self.safety_filter.decide_floats(x, u)
+
+    def decide_arrays(self, x: Components, u: Components) -> FilterDecision:
+        """Decide for a batch; see `SafetyFilter.decide_arrays`."""
+        return self.safety_filter.decide_arrays(x, u)
+
+    def advance(self, x: Sequence[Any], ended: Any) -> None:
+        """Go on to the states that the decided inputs led to.
+
+        Args:
+            x: n components of the states, before any of them is replaced by a start.
+            ended: the envs whose episode is over, bool (num_envs,).
+        """
+
+    def report(self) -> Info:
+        """Return what the filter adds to the info of the states reached, arrays (num_envs,)."""
+        return {}
+
+    def source(self, data: Data) -> Source:
+        """Return the compiled form of the filter, or raise NotCompilableError."""
+        found = self.safety_filter
+        return (
+            found.source(data) if isinstance(found, BackupFilter) else filter_source(found.qp, data)
+        )
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Return what the filter remembers, in arrays with the batch in front."""
+        return {}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Remember what a snapshot holds."""
+
+
+class DelayMemory(EpisodeFilter):
+    """A filter that decides at the predicted state; see `DelayedFilter`.
 
     It remembers what it sent itself: the delay that it believes need not be that of the env.
 
@@ -50,87 +123,35 @@ class DelayMemory:
         problem: of the envs.
         delay: that is believed, in control periods.
         num_envs: size of the batch.
-
-    Attributes:
-        safety_filter: as given.
-        text: of its conditions.
     """
-
-    judges_episodes = False
 
     def __init__(
         self, safety_filter: SafetyFilter, problem: SafetyProblem, delay: int, num_envs: int
     ) -> None:
-        self.safety_filter = safety_filter
-        self.text = spec_of([each for _, each in safety_filter.pairs])
+        super().__init__(safety_filter)
         self._prediction = Prediction(safety_filter.model, problem.dt, problem.substeps)
         rest = resting_input(problem.box)
         self._one, self._batch = DelayLine(delay, rest), DelayLine(delay, rest, num_envs)
 
     def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
-        """Put resting inputs under way.
-
-        Args:
-            x: not used.
-            envs: which begin an episode, bool (num_envs,); None for all.
-            instants: not used.
-        """
+        """Put resting inputs under way. Where a state is set, what is under way goes on."""
         self._batch.restart(envs)
         if envs is None or len(envs) == 1:
             self._one.restart()
 
-    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
-        """Do nothing: what is under way goes on, as in an env whose state is set.
-
-        Args:
-            x: not used.
-            envs: not used.
-            instants: not used.
-        """
-
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
-        """Decide for one env; see `DelayedFilter.filter`.
-
-        Args:
-            x: n components of the state.
-            u: m components of the proposed input.
-
-        Returns:
-            The decision at the predicted state.
-        """
-        decision = self.safety_filter.decide_floats(
-            self._prediction.of_one(x, self._one.under_way), u
-        )
+        """Decide for one env, at the predicted state."""
+        ahead = self._prediction.of_one(x, self._one.under_way)
+        decision = self.safety_filter.decide_floats(ahead, u)
         self._one.exchange(decision.action)
         return decision
 
     def decide_arrays(self, x: Components, u: Components) -> FilterDecision:
-        """Decide for the batch; see `decide_floats`.
-
-        Args:
-            x: components (num_envs,) of the states.
-            u: of the proposed inputs.
-
-        Returns:
-            The decisions at the predicted states.
-        """
-        decision = self.safety_filter.decide_arrays(
-            self._prediction.of_batch(x, self._batch.under_way), u
-        )
+        """Decide for the batch, at the predicted states."""
+        ahead = self._prediction.of_batch(x, self._batch.under_way)
+        decision = self.safety_filter.decide_arrays(ahead, u)
         self._batch.exchange(decision.action)
         return decision
-
-    def advance(self, x: Sequence[Any], ended: Any) -> None:
-        """Do nothing.
-
-        Args:
-            x: not used.
-            ended: not used.
-        """
-
-    def report(self) -> dict[str, Any]:
-        """Return nothing."""
-        return {}
 
     def source(self, data: Data) -> Source:
         """Raise NotCompilableError: NumPy decides."""
@@ -209,141 +230,6 @@ FilterChoice = Conditions | FilterSettings | LoneFilter
 """Conditions or their text; or a filter that acts by itself, its settings or their text."""
 
 
-class EpisodeFilter(Protocol):
-    """A filter of a batch of envs, or of one env, which follows their episodes.
-
-    States and inputs are components: floats of one env, or arrays (num_envs,) of a batch.
-
-    Attributes:
-        text: of the filter.
-        judges_episodes: whether what it keeps is of whole episodes, so that none can begin late.
-    """
-
-    text: str
-    judges_episodes: bool
-
-    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
-        """Begin episodes.
-
-        Args:
-            x: n components of the states of all envs.
-            envs: which begin an episode, bool (num_envs,); None for all.
-            instants: control periods of each episode that have passed, int or (num_envs,).
-        """
-        ...
-
-    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
-        """Go on from states that no decision led to: somebody set them.
-
-        Args:
-            x: see `begin`.
-            envs: whose states were set.
-            instants: see `begin`.
-        """
-        ...
-
-    def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> FilterDecision:
-        """Decide for one env; see `SafetyFilter.decide_floats`."""
-        ...
-
-    def decide_arrays(self, x: Components, u: Components) -> FilterDecision:
-        """Decide for a batch; see `SafetyFilter.decide_arrays`."""
-        ...
-
-    def advance(self, x: Sequence[Any], ended: Any) -> None:
-        """Go on to the states that the decided inputs led to.
-
-        Args:
-            x: n components of the states, before any of them is replaced by a start.
-            ended: the envs whose episode is over, bool (num_envs,).
-        """
-        ...
-
-    def report(self) -> Info:
-        """Return what the filter adds to the info of the states reached, arrays (num_envs,)."""
-        ...
-
-    def source(self, data: Data) -> Source:
-        """Return the compiled form of the filter, or raise NotCompilableError."""
-        ...
-
-    def snapshot(self) -> dict[str, np.ndarray]:
-        """Return what the filter remembers, in arrays with the batch in front."""
-        ...
-
-    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Remember what a snapshot holds."""
-        ...
-
-
-class Memoryless:
-    """A filter that decides by state and proposed input alone; see `EpisodeFilter`.
-
-    Args:
-        safety_filter: which decides.
-
-    Attributes:
-        safety_filter: as given.
-        text: of its conditions or settings.
-    """
-
-    judges_episodes = False
-
-    def __init__(self, safety_filter: SafetyFilter | BackupFilter) -> None:
-        self.safety_filter = safety_filter
-        self.text = (
-            safety_filter.text
-            if isinstance(safety_filter, BackupFilter)
-            else spec_of([each for _, each in safety_filter.pairs])
-        )
-        self.decide_floats = safety_filter.decide_floats
-        self.decide_arrays = safety_filter.decide_arrays
-
-    def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
-        """Do nothing.
-
-        Args:
-            x: not used.
-            envs: not used.
-            instants: not used.
-        """
-
-    def resume(self, x: Sequence[Any], envs: np.ndarray, instants: Any) -> None:
-        """Do nothing.
-
-        Args:
-            x: not used.
-            envs: not used.
-            instants: not used.
-        """
-
-    def advance(self, x: Sequence[Any], ended: Any) -> None:
-        """Do nothing.
-
-        Args:
-            x: not used.
-            ended: not used.
-        """
-
-    def report(self) -> Info:
-        """Return nothing."""
-        return {}
-
-    def source(self, data: Data) -> Source:
-        """Return the compiled form of the filter, or raise NotCompilableError."""
-        found = self.safety_filter
-        return (
-            found.source(data) if isinstance(found, BackupFilter) else filter_source(found.qp, data)
-        )
-
-    def snapshot(self) -> dict[str, np.ndarray]:
-        """Return nothing."""
-        return {}
-
-    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
-        """Do nothing."""
-
-
 def episode_filter(
     problem: SafetyProblem,
     given: FilterChoice,
@@ -353,7 +239,7 @@ def episode_filter(
     num_envs: int,
     delay: int | None = None,
     estimator: Estimator | None = None,
-) -> Memoryless | DelayMemory | PromiseMemory:
+) -> EpisodeFilter | PromiseMemory:
     """Return a filter for the episodes of envs.
 
     Args:
@@ -391,15 +277,14 @@ def episode_filter(
             given = lone_filter_for(problem, given, knowledge)
         given.settings.require_fit(problem, objective)
         given.require_problem(problem)
-        return (
-            Memoryless(given) if isinstance(given, BackupFilter) else PromiseMemory(given, num_envs)
-        )
+        lone = isinstance(given, BackupFilter)
+        return EpisodeFilter(given) if lone else PromiseMemory(given, num_envs)
     if delay != problem.believed_delay:
         problem = replace(problem, model_delay=delay)  # which conditions may refuse
     found = SafetyFilter.for_problem(
         problem, given, knowledge, objective, priorities, estimator=estimator
     )
-    return DelayMemory(found, problem, delay, num_envs) if delay else Memoryless(found)
+    return DelayMemory(found, problem, delay, num_envs) if delay else EpisodeFilter(found)
 
 
 _POINTS = 9
@@ -686,16 +571,11 @@ def third_party_spec(
     return FilterSpec.of(view)
 
 
-def resting_action(problem: SafetyProblem) -> np.ndarray:
-    """Return the input within its bounds nearest to 0, reported before any action."""
-    return np.array(resting_input(problem.box))
-
-
 def rest_info(problem: SafetyProblem) -> Info:
     """Return what a filter reports at reset."""
     return filter_info(
-        nominal_action=resting_action(problem),
-        safe_action=resting_action(problem),
+        nominal_action=np.array(resting_input(problem.box)),
+        safe_action=np.array(resting_input(problem.box)),
         intervention=False,
         filter_active=False,
         feasible=True,

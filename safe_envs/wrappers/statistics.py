@@ -214,14 +214,14 @@ class CostReturnWrapper(IndependentCopies):
                 f"info of {self.env} has no 'cost', but {', '.join(info) or 'nothing'}; use an env"
                 " of this project"
             )
-        cost, masks = self._costs(info), {}
+        cost, added = self._costs(info), {}
         self._before = np.array(info.get("episode_cost", 0.0), dtype=np.float64)
         if self._mode is None:
-            cost = float(cost)
+            cost = added["cost_sum"] = float(cost)
         else:
-            self._ended, masks = terminated | truncated, {"_cost_sum": info["_cost"]}
-        info = {**info, "cost_sum": cost, **masks}
-        return observation, reward, cost, terminated, truncated, info
+            self._ended = terminated | truncated
+            added = {"cost_sum": np.array(cost), "_cost_sum": np.array(info["_cost"])}
+        return observation, reward, cost, terminated, truncated, {**info, **added}
 
     def _costs(self, info: dict[str, Any]) -> np.ndarray:
         """Return the cost of each env, where the info may be that of a reset."""

@@ -7,9 +7,7 @@ from gymnasium.utils import seeding
 
 from safe_envs import ConfigurationError
 from safe_envs.dynamics.noise import NOISE, StreamReader, key_of, standard_normals
-from safe_envs.envs.noise import NoiseStream, NoiseStreams
 from safe_envs.envs.simulation import Simulation
-from safe_envs.envs.starts import EpisodeStreams
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 
@@ -43,68 +41,52 @@ def zero(env):
     return np.zeros(env.action_space.shape)
 
 
-@pytest.mark.parametrize(("channels", "periods"), [(2, 1000), (1, 3), (3, 300)])
-def test_the_noise_of_one_env(channels, periods):
-    stream, expected = NoiseStream(channels, periods), Expected(channels)
-    for key, episode in (((7, 0), 0), ((7, 0), 1), ((8, 5), 0)):
-        stream.begin(key, episode)
-        # An episode that is played on after its end has noise too.
-        for k in range(periods + 5):
-            assert stream.next() == expected(key, episode, k).tolist()
+def at_random(env_id, periods, resets=0.02, num_envs=4):
+    """A batch whose envs are reset, and one of them seeded, now and then.
 
-
-@pytest.mark.parametrize(
-    ("num_envs", "channels", "periods"), [(4, 2, 1000), (9, 2, 100), (5, 1, 3), (3, 3, 300)]
-)
-def test_the_noise_of_a_batch(num_envs, channels, periods):
-    """Episodes of all envs but one end at random, and one env is seeded again now and then."""
-    rng, streams = np.random.default_rng(0), EpisodeStreams(num_envs)
-    noise, expected = NoiseStreams(streams, channels, periods), Expected(channels)
-    period, restarts = np.zeros(num_envs, dtype=int), 0
-
-    def begin(envs):
-        streams.begin_episodes(envs)
-        noise.begin(envs)
-        period[envs] = 0
-
-    streams.seed([*range(num_envs)])
-    begin(np.arange(num_envs))
-    for t in range(700):
-        # Some are played on after the horizon.
-        due = (period >= periods + 20 * (t % 2)) | (rng.random(num_envs) < 0.02)
-        due[0] = period[0] >= periods
-        draws = noise.next(~due if due.any() else None)
-        for i in np.flatnonzero(~due):
-            key, episode = streams.keys[i], streams.episodes[i]
-            np.testing.assert_array_equal(draws[:, i], expected(key, episode, period[i]))
-        period += ~due
+    Returns:
+        Their states, and seed, episode and period of each.
+    """
+    env = gym.make_vec(env_id, num_envs, horizon=1e3, noise=0.01, max_episode_steps=350).unwrapped
+    rng, seeds, episodes = np.random.default_rng(0), np.arange(num_envs), np.zeros(num_envs, int)
+    env.reset(seed=0)
+    for k in range(periods):
+        due = rng.random(num_envs) < resets
+        due[0] = False
         if due.any():
-            begin(np.flatnonzero(due))
-            restarts += np.count_nonzero(streams.episodes[due] > 1)
-        if t % 100 == 99:
-            (seeded,) = streams.seed([t if i == 1 else None for i in range(num_envs)])
-            if t % 200 == 99:
-                begin(np.array([seeded]))
-            else:
-                streams.begin_episodes([seeded])
-                noise.seek([seeded], np.array([2]))
-                period[seeded] = 2
-    assert restarts > 10
+            env.reset(options={"reset_mask": due})
+            episodes += due
+        if k % 150 == 149:
+            mask = np.arange(num_envs) == 1
+            env.reset(seed=[k] * num_envs, options={"reset_mask": mask})
+            seeds[1], episodes[1] = k, 0
+        restarts = env.episodes.ended.copy()
+        env.step(zero(env))
+        episodes += restarts
+    return env, seeds, episodes
 
 
-def test_a_scalar_env_counts_its_episodes():
-    env = gym.make(ENV_ID)
+@pytest.mark.parametrize("env_id", [ENV_ID, "safe_envs/Scalar-v0"])
+def test_the_noise_of_a_batch_is_that_of_seed_episode_and_period(env_id):
+    """Beyond the 256 periods for which noise is drawn at once."""
+    env, seeds, episodes = at_random(env_id, 620)
+    assert env.episodes.steps.max() > 256 or env_id == ENV_ID
+    assert episodes.max() > 10
+    for i, (seed, episode) in enumerate(zip(seeds, episodes, strict=True)):
+        expected = expected_state(env.problem, int(seed), episode, env.episodes.steps[i])
+        np.testing.assert_allclose(env.state[i], expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("last", [7, 300])
+def test_a_scalar_env_counts_its_episodes(last):
+    """Also in episodes that are played on after their end."""
+    env, seed = gym.make(ENV_ID, horizon=12.0).unwrapped, 2**64 + 5
     for episode in range(3):
-        env.reset(seed=2**64 + 5 if episode == 0 else None)
-        problem = env.unwrapped.problem
-        np.testing.assert_array_equal(
-            env.unwrapped.state, expected_state(problem, 2**64 + 5, episode, 0)
-        )
-        for _ in range(7):
+        env.reset(seed=seed if episode == 0 else None)
+        np.testing.assert_array_equal(env.state, expected_state(env.problem, seed, episode, 0))
+        for _ in range(last):
             env.step(zero(env))
-        np.testing.assert_array_equal(
-            env.unwrapped.state, expected_state(problem, 2**64 + 5, episode, 7)
-        )
+        np.testing.assert_array_equal(env.state, expected_state(env.problem, seed, episode, last))
 
 
 def test_a_vector_env_counts_the_episodes_of_each_env():

@@ -6,34 +6,25 @@ from functools import partial
 from typing import Generic, TypeVar
 
 import gymnasium as gym
-import numpy as np
 import pytest
-import sympy as sp
-from gymnasium.vector import AutoresetMode
 
-import safe_envs
-from safe_envs import ConfigurationError, ControlAffineSDE, SafeEnv, SafetyFilter, SafeVectorEnv
+from safe_envs import ConfigurationError, SafeEnv, SafetyFilter, SafeVectorEnv
 from safe_envs.agents import make_sb3_env
 from safe_envs.envs.registered import SystemEnv, SystemVectorEnv
 from safe_envs.registry import env_class, make_problem
 from safe_envs.systems import CUSTOM_ID
 from safe_envs.wrappers import (
-    FilterSpec,
-    RecordSafetyStatisticsVector,
     SafetyFilterVectorWrapper,
     SafetyFilterWrapper,
-    SafetyMonitorVector,
-    SpecificationMonitorVector,
-    StateEstimatorVectorWrapper,
     make_vec_with_cost,
     make_with_cost,
 )
-from tests.conftest import problem_of
+from tests.conftest import EVERY_ENV, problem_of
 
 SCALAR = "safe_envs/Scalar-v0"
 
 
-@pytest.mark.parametrize("env_id", [*safe_envs.ENV_IDS, CUSTOM_ID])
+@pytest.mark.parametrize("env_id", [*EVERY_ENV, CUSTOM_ID])
 @pytest.mark.parametrize(
     "make",
     [
@@ -86,13 +77,6 @@ def test_constructors_refuse_it_in_the_same_words(make):
 
 T = TypeVar("T")
 
-theta, rate, torque = sp.symbols("theta rate torque", real=True)
-PENDULUM = {
-    "model": ControlAffineSDE((theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0]),
-    "barriers": 64 - rate**2,
-    "state_fn": lambda o: np.stack([np.arctan2(o[..., 1], o[..., 0]), o[..., 2]], axis=-1),
-}
-
 
 class Mixed(SafeEnv, Generic[T]):
     pass
@@ -102,7 +86,6 @@ class Renamed(SafeVectorEnv):
     pass
 
 
-@pytest.mark.parametrize("env_id", safe_envs.ENV_IDS)
 def test_gymnasiums_class_is_a_direct_base_of_every_env(env_id: str):
     """By those skrl recognises an env."""
     assert gym.Env in env_class(env_id).__bases__
@@ -116,24 +99,3 @@ def test_it_is_one_of_classes_of_users_too():
     for kind in (SafeVectorEnv, SystemVectorEnv, Renamed):
         assert gym.vector.VectorEnv in kind.__bases__
     assert isinstance(Mixed(problem_of(SCALAR)), gym.Env)
-
-
-@pytest.mark.parametrize("mode", AutoresetMode)
-def test_vector_envs_and_wrappers_say_when_they_reset(mode: AutoresetMode):
-    def made(**options):
-        return gym.make_vec(SCALAR, 2, autoreset_mode=mode, **options)
-
-    third_party = gym.make_vec("Pendulum-v1", 2, "sync", vector_kwargs={"autoreset_mode": mode})
-    batches = [
-        made(),
-        SafeVectorEnv(problem_of(SCALAR), 2, mode.value),
-        SafetyFilterVectorWrapper(made(), "cbf"),
-        SpecificationMonitorVector(made(), "always safe"),
-        RecordSafetyStatisticsVector(made()),
-        StateEstimatorVectorWrapper(made(measurement="default"), "ekf"),
-        SafetyFilterVectorWrapper(third_party, "cbf", **PENDULUM),
-        SafetyMonitorVector(third_party, FilterSpec(**PENDULUM)),
-        make_vec_with_cost(SCALAR, 2, autoreset_mode=mode),
-    ]
-    for envs in batches:
-        assert envs.autoreset_mode is mode, type(envs).__name__

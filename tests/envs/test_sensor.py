@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 import json
 import math
-import pickle
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import sympy as sp
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
 from scipy.stats import binomtest, chi2, kstest
 
 from safe_envs import SafeEnv, SafeVectorEnv
 from safe_envs.dynamics.noise import NOISE, SENSOR, StreamReader, key_of
-from safe_envs.envs.array_batch import ArrayBatch
-from safe_envs.errors import NotCompilableError
 from safe_envs.problem.measurement import Channel, Measurement
-from safe_envs.systems import ENV_IDS
 from tests.conftest import problem_of
-from tests.envs.test_vector_env import assert_same, only_where_present, pair
 
 PENDULUM, ACC = "safe_envs/Pendulum-v0", "safe_envs/ACC-v0"
 DUBINS = "safe_envs/StochasticDubins-v0"
 COMPLETE = ["default:bias=.03:dropout=.3", "delay=2"]
+
+
+def made(problem, num_envs):
+    return SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
 
 
 def walk(env, count, seed=3):
@@ -46,15 +42,15 @@ def walk(env, count, seed=3):
     return samples, infos, rest
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
 @pytest.mark.parametrize("num_envs", [None, 3])
 def test_a_sensor_changes_nothing_but_what_is_observed(env_id, num_envs):
     def walked(problem):
-        env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+        env = made(problem, num_envs)
         _, infos, rest = walk(env, 6)
         return env.state.tobytes(), infos, [[np.array(v).tobytes() for v in row] for row in rest]
 
     plain, measured = (walked(problem_of(env_id, measurement=m)) for m in (None, COMPLETE))
+    assert made(problem_of(env_id), num_envs).measured is None
     assert (plain[0], plain[2]) == (measured[0], measured[2])
     for mine, other in zip(plain[1], measured[1], strict=True):
         added = set(other) - set(mine)
@@ -64,51 +60,6 @@ def test_a_sensor_changes_nothing_but_what_is_observed(env_id, num_envs):
     np.testing.assert_array_equal(
         measured[1][-1]["state"], np.frombuffer(measured[0]).reshape(np.shape(other["state"]))
     )
-
-
-def test_an_env_without_the_option_has_no_sensor():
-    env, batch = SafeEnv(problem_of(PENDULUM)), SafeVectorEnv(problem_of(PENDULUM), 2)
-    _, info = env.reset(seed=0)
-    batch.reset(seed=0)
-    assert (env.measured, batch.measured) == (None, None)
-    assert not {"state", "received"} & set(info)
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("env_id", [PENDULUM, "safe_envs/DubinsObstacle-v0"])
-def test_batches_equal_single_envs_with_autoreset(env_id, mode):
-    dt = problem_of(env_id).dt
-    ours, theirs = pair(env_id, mode, False, 3, measurement=COMPLETE, horizon=7 * dt)
-    mine, other = (env.reset(seed=7) for env in (ours, theirs))
-    assert_same(mine[0], other[0], "reset")
-    assert_same(only_where_present(mine[1]), only_where_present(other[1]), "reset info")
-    rng = np.random.default_rng(0)
-    for step in range(18):
-        actions = rng.uniform(-1.0, 1.0, ours.action_space.shape).astype(np.float32)
-        *mine, my_info = ours.step(actions)
-        *other, other_info = theirs.step(actions)
-        for a, b in zip(mine, other, strict=True):
-            assert_same(a, b, f"step {step}")
-        assert_same(
-            only_where_present(my_info), only_where_present(other_info), f"step {step}: info"
-        )
-
-
-def test_samples_do_not_depend_on_the_number_of_envs():
-    problem = problem_of(ACC, measurement=COMPLETE)
-    batches, env = [SafeVectorEnv(problem, n) for n in (1, 4)], SafeEnv(problem)
-    for batch in batches:
-        batch.reset(seed=[*range(8, 9 - batch.num_envs, -1), 5][-batch.num_envs :])
-    env.reset(seed=5)
-    for _ in range(300):
-        env.step(np.array([0.1]))
-        for batch in batches:
-            batch.step(np.full((batch.num_envs, 1), 0.1))
-        one, four = ([np.array([v[-1] for v in part]) for part in b.measured] for b in batches)
-        np.testing.assert_array_equal(one, four)
-        np.testing.assert_array_equal(one[1], env.measured.received)
-        # To the rounding of a square, as the states.
-        np.testing.assert_allclose(one[0], env.measured.values, rtol=1e-12)
 
 
 def test_the_errors_are_the_numbers_of_a_stream_of_their_own():
@@ -152,7 +103,7 @@ def test_errors_have_the_stated_mean_deviation_and_share_of_losses():
 def test_samples_arrive_exactly_so_many_periods_late(delay, num_envs):
     def samples(items):
         problem = problem_of(ACC, measurement=items)
-        env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+        env = made(problem, num_envs)
         return walk(env, 20)[0]
 
     prompt, late = (
@@ -173,9 +124,7 @@ def test_samples_arrive_exactly_so_many_periods_late(delay, num_envs):
 @pytest.mark.parametrize("num_envs", [None, 2])
 def test_a_lost_sample_repeats_the_last_value(num_envs):
     problem = problem_of(PENDULUM, measurement="default:dropout=.7")
-    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
-    samples, _, _ = walk(env, 40)
-    for before, now in itertools.pairwise(samples):
+    for before, now in itertools.pairwise(walk(made(problem, num_envs), 40)[0]):
         same = np.equal(before.values, now.values)
         np.testing.assert_array_equal(same, ~np.array(now.received))
 
@@ -204,7 +153,7 @@ def test_a_sample_without_a_value_is_lost(num_envs):
     problem = problem_of(
         PENDULUM, measurement=["root=sqrt(theta):noise=.1", "default"], start=(0.3, -2.0)
     )
-    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+    env = made(problem, num_envs)
     samples, infos, _ = walk(env, 40)
     lost = 0
     for (values, received), info in zip(samples, infos, strict=True):
@@ -218,7 +167,7 @@ def test_a_sample_without_a_value_is_lost(num_envs):
 @pytest.mark.parametrize("num_envs", [None, 2])
 def test_an_episode_from_a_later_time_has_the_errors_of_that_instant(num_envs):
     problem = problem_of(ACC, measurement=["default:dropout=.3"])
-    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
+    env = made(problem, num_envs)
     samples, infos, _ = walk(env, 12)
     action = np.zeros(env.action_space.shape)
     env.reset(seed=3, options={"state": infos[5]["state"], "t": 5 * problem.dt})
@@ -252,74 +201,6 @@ def test_a_state_that_is_set_is_measured_from_the_next_step_on():
         np.testing.assert_array_equal(np.moveaxis(each.state, -1, 0), each.measured.values)
 
 
-def test_a_restored_batch_goes_on_with_the_samples_under_way():
-    problem = problem_of(ACC, measurement=COMPLETE)
-    first, second = (SafeVectorEnv(problem, 2, max_episode_steps=9) for _ in range(2))
-    first.reset(seed=5)
-    actions = np.random.default_rng(1).uniform(-1.0, 1.0, (14, 2, 1))
-    for k in range(4):
-        first.step(actions[k])
-    second.reset(seed=99)
-    second.restore(first.snapshot(), seed=5)
-    np.testing.assert_array_equal(first.measured.values, second.measured.values)
-    for k in range(4, 14):
-        mine, other = (env.step(actions[k]) for env in (first, second))
-        for a, b in zip(mine[:4], other[:4], strict=True):
-            np.testing.assert_array_equal(a, b)
-        np.testing.assert_array_equal(mine[4]["received"], other[4]["received"])
-
-
-@pytest.mark.parametrize(
-    "copied", [copy.copy, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))]
-)
-@pytest.mark.parametrize("num_envs", [None, 2])
-def test_copies_go_on_alone(copied, num_envs):
-    problem = problem_of(ACC, measurement=COMPLETE)
-    env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
-    env.reset(seed=0)
-    action = np.full(env.action_space.shape, 0.3)
-    for _ in range(5):
-        env.step(action)
-    other = copied(env)
-    mine = [env.step(action)[0].tolist() for _ in range(10)]
-    assert [other.step(action)[0].tolist() for _ in range(10)] == mine
-
-
-def test_a_reset_of_some_envs_leaves_the_samples_of_the_others():
-    problem = problem_of(ACC, measurement=COMPLETE)
-    env, plain = (SafeVectorEnv(problem, 3, "Disabled") for _ in range(2))
-    for each in (env, plain):
-        each.reset(seed=2)
-        for _ in range(4):
-            each.step(np.zeros((3, 1)))
-    before = np.array(env.measured.values)
-    _, info = env.reset(options={"reset_mask": np.array([False, True, False])})
-    np.testing.assert_array_equal(np.array(env.measured.values)[:, [0, 2]], before[:, [0, 2]])
-    assert not np.array(env.measured.values)[:, 1].any()
-    assert not info["received"][1].any()
-    for _ in range(6):
-        for each in (env, plain):
-            each.step(np.zeros((3, 1)))
-        for mine, other in zip(env.measured, plain.measured, strict=True):
-            np.testing.assert_array_equal(np.array(mine)[:, [0, 2]], np.array(other)[:, [0, 2]])
-
-
-def test_same_step_autoreset_keeps_the_last_samples():
-    problem = problem_of(ACC, measurement=["default:dropout=.2"], horizon=0.15)
-    env, plain = SafeVectorEnv(problem, 2, "SameStep"), SafeVectorEnv(problem, 2, "Disabled")
-    for each in (env, plain):
-        each.reset(seed=4)
-    for _ in range(3):
-        results = [each.step(np.zeros((2, 1))) for each in (env, plain)]
-    np.testing.assert_array_equal(env.episodes.last_sample.values, plain.measured.values)
-    np.testing.assert_array_equal(env.episodes.last_sample.received, plain.measured.received)
-    np.testing.assert_array_equal(np.stack(results[0][4]["final_obs"]), results[1][0])
-    np.testing.assert_array_equal(
-        np.stack(results[0][4]["final_info"]["received"]), results[1][4]["received"]
-    )
-    assert not np.array_equal(env.measured.values, plain.measured.values)
-
-
 def test_a_violation_ends_the_episode_by_the_true_state():
     blind = Measurement((Channel("y", problem_of(DUBINS).states[0].symbol, 100.0),))
     ends = []
@@ -331,17 +212,6 @@ def test_a_violation_ends_the_episode_by_the_true_state():
             steps += 1
         ends.append(steps)
     assert ends[0] == ends[1]
-
-
-@pytest.mark.parametrize("env_id", ENV_IDS)
-def test_envs_pass_the_checks_of_gymnasium(env_id):
-    env = gym.make(env_id, measurement="default", horizon=problem_of(env_id).dt * 20)
-    check_env(env.unwrapped, skip_render_check=True)
-
-
-def test_envs_pass_the_check_of_stable_baselines():
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    checker.check_env(gym.make(ACC, measurement=COMPLETE).unwrapped)
 
 
 @pytest.mark.parametrize(
@@ -356,15 +226,7 @@ def test_envs_are_made_again_of_their_spec(given):
     np.testing.assert_array_equal(batch.reset(seed=0)[0][0], again.reset(seed=0)[0])
 
 
-def test_the_compiled_engine_leaves_sensors_to_numpy():
-    problem = problem_of(ACC, measurement="default")
-    with pytest.raises(NotCompilableError, match="has a sensor"):
-        SafeVectorEnv(problem, 2, engine="compiled")
-    assert isinstance(SafeVectorEnv(problem, 2, engine="auto")._batch, ArrayBatch)
-
-
 def test_pictures_are_of_the_true_state():
-    pytest.importorskip("pygame")
     frames = []
     for measurement in (None, ["default:bias=.5"]):
         env = SafeEnv(problem_of(PENDULUM, measurement=measurement), render_mode="rgb_array")

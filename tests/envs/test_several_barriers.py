@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -29,14 +30,6 @@ def test_number_of_obstacles_is_respected(count):
     assert observation.shape == (4 + 2 * count,)
     assert info["barrier"].shape == (count,)
     assert [b.name for b in problem.barriers] == [f"h_{i}" for i in range(1, count + 1)]
-
-
-@pytest.mark.parametrize("count", [0, 21, -1, 2.0, True, "3", None])
-def test_number_of_obstacles_is_checked(count):
-    with pytest.raises(
-        ConfigurationError, match=r"num_obstacles = .*; give a whole number from 1 to 20"
-    ):
-        gym.make(FIELD, num_obstacles=count)
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.8])
@@ -97,20 +90,27 @@ def test_tilt_barrier_is_the_cosine_from_the_thrust_to_the_vertical_less_its_lim
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("env_id", "arguments", "fragment"),
     [
-        ({"floor": 7.5}, r"floor = 7.5 and ceiling = 7.0; give 0.0 < floor < ceiling < 10.0"),
-        ({"floor": 0.0}, "floor = 0"),
-        ({"ceiling": 10.0}, "ceiling = 10"),
-        ({"ceiling": math.nan}, "ceiling = nan"),
-        ({"tilt": 0.0}, "tilt = 0"),
-        ({"tilt": 1.1}, r"tilt = 1.1; give an angle between 0 and 1.047 rad"),
-        ({"tilt": "flat"}, "tilt = 'flat' is not a number"),
+        *(
+            (FIELD, {"num_obstacles": n}, "num_obstacles")
+            for n in (0, 21, -1, 2.0, True, "3", None)
+        ),
+        (LIMITS, {"floor": 7.5}, "floor = 7.5"),
+        (LIMITS, {"floor": 0.0}, "floor = 0"),
+        (LIMITS, {"ceiling": 10.0}, "ceiling = 10"),
+        (LIMITS, {"ceiling": math.nan}, "ceiling = nan"),
+        (LIMITS, {"tilt": 0.0}, "tilt = 0"),
+        (LIMITS, {"tilt": 1.1}, "1.047"),
+        (LIMITS, {"tilt": "flat"}, "'flat'"),
+        (FIELD, {"num_obstacle": 3}, "did you mean 'num_obstacles'"),
+        (FIELD, {"barrier": {"num_obstacle": 3}}, "did you mean 'num_obstacles'"),
+        (FIELD, {"tilt": 0.2}, "'tilt'"),
     ],
 )
-def test_limits_are_checked(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
-        gym.make(LIMITS, **arguments)
+def test_arguments_are_checked(env_id, arguments, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        gym.make(env_id, **arguments)
 
 
 def test_gains_may_be_given_for_each_barrier_or_for_all():
@@ -122,9 +122,7 @@ def test_gains_may_be_given_for_each_barrier_or_for_all():
         replace(limits, gains=((1.0, 1.0), (1.0, 1.0)))
 
 
-@pytest.mark.parametrize(
-    "make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)]
-)
+@pytest.mark.parametrize("make", [gym.make, partial(gym.make_vec, num_envs=2)])
 @pytest.mark.parametrize(
     ("env_id", "arguments"),
     [
@@ -141,25 +139,9 @@ def test_factory_arguments_may_stand_by_themselves_or_in_barrier(make, env_id, a
     assert by_itself != make(env_id).unwrapped.problem
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"num_obstacle": 3}, "argument 'num_obstacle'; did you mean 'num_obstacles'"),
-        (
-            {"barrier": {"num_obstacle": 3}},
-            "no barrier argument 'num_obstacle'; did you mean 'num_obstacles'",
-        ),
-        ({"tilt": 0.2}, "keyword argument 'tilt'"),
-    ],
-)
-def test_unknown_factory_arguments_are_refused(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
-        gym.make(FIELD, **arguments)
-
-
-@pytest.mark.parametrize("env_id", [FIELD, LIMITS])
+@pytest.mark.parametrize("env_id", [FIELD, pytest.param(LIMITS, marks=pytest.mark.oracle)])
 def test_natural_filter_keeps_safe_what_the_nominal_controller_does_not(env_id):
-    bare, filtered = evaluate(env_id, episodes=30, bounds=False).rows
+    bare, filtered = evaluate(env_id, episodes=20, bounds=False, engine="numpy").rows
     assert bare.safety_rate < 0.6
     assert filtered.safety_rate > 0.95
     assert filtered.infeasible_rate < 0.01

@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 
 from safe_envs import ControlAffineSDE, NumericalError, SafeEnv, SafeVectorEnv, state_problem
-from safe_envs.dynamics.integrators import Integrator
+from safe_envs.dynamics.noise import NOISE, StreamReader, key_of, standard_normals
 from safe_envs.problem.signals import Feature
 
 x, v, u = sp.symbols("x v u", real=True)
@@ -130,35 +130,14 @@ def test_envs_take_the_substeps_of_their_problem_without_noise(make, substeps):
 
 @both
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_envs_take_the_substeps_of_their_problem_with_noise(make, substeps, monkeypatch):
-    drawn = np.random.default_rng(1).standard_normal((substeps, 2))
+def test_envs_take_the_substeps_of_their_problem_with_noise(make, substeps):
     env = make(swinging(0.3, substeps))
-    env.reset(seed=0)
-    row = drawn.ravel()
-    monkeypatch.setattr(
-        env._noise if isinstance(env, SafeEnv) else env._batch.noise,
-        "next",
-        lambda *_: row.tolist() if isinstance(env, SafeEnv) else np.array([row, row]).T,
-    )
+    env.reset(seed=6)
+    uniforms = StreamReader().seek(key_of(6), 0, NOISE).uniforms((1, 2 * substeps))
+    drawn = standard_normals(uniforms).reshape(substeps, 2)
     act(env, 0.5)
     expected = by_hand([0.4, -0.3], 1.0, 0.2, substeps, drawn, 0.3)
     np.testing.assert_allclose(np.reshape(env.state, (-1, 2))[0], expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("flavour", ["floats", "arrays"])
-def test_a_control_period_of_shared_noise_is_that_of_euler_and_maruyama(flavour):
-    problem, drawn = swinging(0.3, 4), np.random.default_rng(2).standard_normal((4, 2))
-    integrator = Integrator(problem.plant, 0.2, 4, flavour)
-    assert integrator.channels == 8
-    state, draws = (
-        ([0.4, -0.3], list(drawn.ravel()))
-        if flavour == "floats"
-        else (np.array([[0.4], [-0.3]]), drawn.reshape(8, 1))
-    )
-    found = integrator.step(tuple(state), [1.0] if flavour == "floats" else [np.ones(1)], draws)
-    np.testing.assert_allclose(
-        np.ravel(found), by_hand([0.4, -0.3], 1.0, 0.2, 4, drawn, 0.3), rtol=1e-12
-    )
 
 
 def forgetful():

@@ -1,5 +1,7 @@
-"""The native vector env does what Gymnasium's SyncVectorEnv over the scalar envs does, autoreset
-included."""
+"""The vector env by itself: seeds, masks, refused actions and states, in each engine.
+
+That it plays as its envs do is in `tests/wrappers/test_batches.py`.
+"""
 
 from __future__ import annotations
 
@@ -8,267 +10,291 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import (
+    DictInfoToList,
+    NormalizeObservation,
+    RecordEpisodeStatistics,
+)
 
-from safe_envs import ConfigurationError
-from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs import ConfigurationError, InvalidInputError, NumericalError, SafeVectorEnv
+from safe_envs.engine import choice as engines
+from safe_envs.engine.program import Program
+from safe_envs.errors import NotCompilableError
 from safe_envs.systems import vectors
-from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+from safe_envs.wrappers import SafetyFilterVectorWrapper, filter_layers
 from tests.conftest import problem_of
+from tests.wrappers.cases import assert_close as assert_same
 
-NUM_ENVS = 5
-
-
-def pair(env_id, mode, filtered, num_envs=NUM_ENVS, **arguments):
-    def scalar():
-        env = gym.make(env_id, **arguments)
-        return SafetyFilterWrapper(env, env.unwrapped.problem.filter) if filtered else env
-
-    native = gym.make_vec(env_id, num_envs=num_envs, autoreset_mode=mode.value, **arguments)
-    if filtered:
-        native = SafetyFilterVectorWrapper(native, native.unwrapped.problem.filter)
-    return native, SyncVectorEnv([scalar] * num_envs, autoreset_mode=mode)
+SCALAR, DUBINS = "safe_envs/Scalar-v0", "safe_envs/StochasticDubins-v0"
+ENGINES = ("numpy", "compiled")
+each_engine = pytest.mark.parametrize("engine", ENGINES)
+with_and_without = pytest.mark.parametrize("condition", [None, "scbf"])
 
 
-def assert_same(ours, theirs, where):
-    """Compare arrays, or infos key by key; floats to rounding, since NumPy and `math` differ in the
-    last bit of a sine."""
-    if isinstance(theirs, dict):
-        assert set(ours) == set(theirs), where
-        for key in theirs:
-            assert_same(ours[key], theirs[key], f"{where}[{key}]")
-        return
-    assert ours.dtype == theirs.dtype, where
-    assert ours.shape == theirs.shape, where
-    if ours.dtype == object:
-        for mine, other in zip(ours, theirs, strict=True):
-            assert (mine is None) == (other is None), where
-            if other is not None:
-                assert_same(mine, other, where)
-    elif ours.dtype == bool or np.issubdtype(ours.dtype, np.integer):
-        np.testing.assert_array_equal(ours, theirs, err_msg=where)
-    elif not np.array_equal(ours, theirs):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9, err_msg=where)
+@pytest.fixture(autouse=True)
+def plain(monkeypatch):
+    """Run programs as plain Python."""
+    monkeypatch.setattr(Program, "compiled", Program.plain)
 
 
-def only_where_present(info):
-    """Leave out what is masked: SyncVectorEnv has zeros where an env reported nothing."""
-    result = {}
-    for key, value in info.items():
-        if key.startswith("_"):
-            result[key] = value
-        elif isinstance(value, dict):
-            result[key] = only_where_present(value)
-        elif value.dtype == object:
-            result[key] = value
-        else:
-            mask = info[f"_{key}"].reshape(-1, *[1] * (value.ndim - 1))
-            result[key] = np.where(mask, value, np.zeros_like(value))
-    return result
+def made(env_id=DUBINS, condition=None, count=3, engine="numpy", **options):
+    env = gym.make_vec(env_id, count, engine=engine, **options)
+    return env if condition is None else SafetyFilterVectorWrapper(env, condition)
 
 
-@pytest.mark.parametrize("filtered", [False, True])
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_equals_sync_vector_env(env_id, mode, filtered):
-    dt = gym.make(env_id).unwrapped.problem.dt
-    ours, theirs = pair(env_id, mode, filtered, num_envs=3, noise=0.05, horizon=11 * dt)
-    assert_same(*[e.reset(seed=7)[0] for e in (ours, theirs)], "reset")
-    rng = np.random.default_rng(0)
-    # Three episodes, and what comes after them.
-    for step in range(38):
-        actions = rng.uniform(-1.0, 1.0, ours.action_space.shape).astype(np.float32)
-        *mine, my_info = ours.step(actions)
-        *other, other_info = theirs.step(actions)
-        for name, a, b in zip(
-            ("observation", "reward", "terminated", "truncated"), mine, other, strict=True
-        ):
-            assert_same(a, b, f"step {step}: {name}")
-        assert_same(
-            only_where_present(my_info), only_where_present(other_info), f"step {step}: info"
-        )
-
-
-def test_equals_sync_vector_env_when_episodes_end_at_different_steps():
-    # Random actions drive the scalar system out of its workspace at different times, so that noise
-    # streams drift apart.
-    ours, theirs = pair(
-        "safe_envs/Scalar-v0", AutoresetMode.NEXT_STEP, False, noise=0.5, horizon=1.7
-    )
-    assert_same(*[e.reset(seed=3)[0] for e in (ours, theirs)], "reset")
-    ends = set()
-    for step in range(600):
-        actions = np.linspace(0.2, 1.0, NUM_ENVS, dtype=np.float32)[:, None]
-        *mine, _ = ours.step(actions)
-        *other, _ = theirs.step(actions)
-        for a, b in zip(mine, other, strict=True):
-            assert_same(a, b, f"step {step}")
-        ends |= {step for done in mine[2] | mine[3] if done}
-    assert len(ends) > 10
-
-
-@pytest.mark.parametrize("filtered", [False, True])
-@pytest.mark.parametrize("start", [[0.9], [1.1]])
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_equals_sync_vector_env_when_violations_end_episodes(mode, start, filtered):
-    # Reset does not end an episode, wherever it begins.
-    ours, theirs = pair(
-        "safe_envs/Scalar-v0", mode, filtered, start=start, noise=1.0, terminate_on_violation=True
-    )
-    assert_same(*[e.reset(seed=3)[0] for e in (ours, theirs)], "reset")
-    ends = 0
-    for step in range(60):
-        actions = np.linspace(0.2, 1.0, NUM_ENVS, dtype=np.float32)[:, None]
-        *mine, my_info = ours.step(actions)
-        *other, other_info = theirs.step(actions)
-        for a, b in zip(mine, other, strict=True):
-            assert_same(a, b, f"step {step}")
-        assert_same(only_where_present(my_info), only_where_present(other_info), f"step {step}")
-        ends += mine[2].sum()
-    # Behind the filter there are fewer.
-    assert ends >= NUM_ENVS
-
-
-@pytest.mark.parametrize("filtered", [False, True])
-def test_disabled_autoreset_waits_for_a_masked_reset(filtered):
-    ours, theirs = pair(
-        "safe_envs/StochasticDubins-v0", AutoresetMode.DISABLED, filtered, horizon=0.5
-    )
-    for env in (ours, theirs):
-        env.reset(seed=5)
-    actions = np.full((NUM_ENVS, 1), 0.4, dtype=np.float32)
-    for _ in range(10):
-        *_, truncated, _ = ours.step(actions)
-        theirs.step(actions)
-    assert truncated.all()
-    with pytest.raises(gym.error.ResetNeeded):
-        ours.step(actions)
-    for mask in ([True, False, True, False, False], [False, True, False, True, True]):
-        results = [
-            e.reset(seed=None, options={"reset_mask": np.array(mask)}) for e in (ours, theirs)
-        ]
-        assert_same(results[0][0], results[1][0], "masked reset")
-        assert_same(
-            only_where_present(results[0][1]),
-            only_where_present(results[1][1]),
-            "masked reset info",
-        )
-    for _ in range(9):
-        mine, other = ours.step(actions), theirs.step(actions)
-        assert_same(mine[0], other[0], "after the reset")
-        assert_same(
-            only_where_present(mine[4]), only_where_present(other[4]), "info after the reset"
-        )
-
-
-def test_trajectories_do_not_depend_on_the_size_of_the_batch(env_id):
-    results = []
-    for num_envs in (1, 3, 64):
-        env = gym.make_vec(env_id, num_envs=num_envs, noise=0.05)
-        observation, _ = env.reset(seed=11)
-        rows = [observation[0]]
-        for _ in range(20):
-            observation, *_ = env.step(np.full(env.action_space.shape, 0.2, dtype=np.float32))
-            rows.append(observation[0])
-        results.append(np.array(rows))
-    np.testing.assert_array_equal(results[0], results[1])
-    np.testing.assert_array_equal(results[0], results[2])
-
-
-def test_what_was_handed_out_does_not_change_afterwards():
-    env = SafetyFilterVectorWrapper(
-        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf"
-    )
-    handed_out = [
-        env.reset(seed=0),
-        *(env.step(np.full((3, 1), 0.9, dtype=np.float32)) for _ in range(12)),
-    ]
-    again = SafetyFilterVectorWrapper(
-        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf"
-    )
-    for step in range(13):
-        fresh = (
-            again.reset(seed=0) if step == 0 else again.step(np.full((3, 1), 0.9, dtype=np.float32))
-        )
-        for old, new in zip(handed_out[step][:-1], fresh[:-1], strict=True):
-            np.testing.assert_array_equal(old, new)
-        assert_same(handed_out[step][-1], fresh[-1], f"info of step {step}")
-
-
-def test_what_a_user_writes_into_an_info_stays_there():
-    env = SafetyFilterVectorWrapper(
-        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf"
-    )
-    again = SafetyFilterVectorWrapper(
-        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf"
-    )
+@each_engine
+@with_and_without
+def test_refused_actions_change_nothing(engine, condition):
+    env, twin = (made(condition=condition, engine=engine, horizon=0.15) for _ in range(2))
     env.reset(seed=0)
-    again.reset(seed=0)
+    twin.reset(seed=0)
+    for _ in range(5):  # also where an episode begins, and the action is not used
+        for bad in (
+            np.array([[0.0], [np.nan], [np.inf]]),
+            np.zeros((3, 2)),
+            np.zeros(3),
+            [["a"], [0], [0]],
+        ):
+            with pytest.raises(InvalidInputError, match="action"):
+                env.step(bad)
+        ours, theirs = (each.step(np.full((3, 1), 0.2)) for each in (env, twin))
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        np.testing.assert_array_equal(ours[3], theirs[3])
+
+
+@each_engine
+@with_and_without
+def test_states_that_leave_the_finite_numbers_are_errors(engine, condition):
+    env = made(condition=condition, engine=engine)
+    env.reset(seed=1)
+    snapshot = env.snapshot()
+    snapshot["state"][1] = [1e200, 0.0, 0.0]
+    env.restore(snapshot)
+    with np.errstate(all="ignore"), pytest.raises(NumericalError, match=r"envs \[1\]"):
+        env.step(np.full((3, 1), -1.0))
+    env.reset(options={"reset_mask": np.array([False, True, False])})
+    assert np.isfinite(env.step(np.full((3, 1), -1.0))[0]).all()
+
+
+@each_engine
+def test_constraints_without_a_finite_value_are_errors(engine):
+    env = made(condition="scbf", engine=engine)
+    env.reset(seed=1)
+    snapshot = env.snapshot()
+    snapshot["state"][1, 0] = 1e308
+    env.restore(snapshot)
+    with np.errstate(all="ignore"), pytest.raises(NumericalError, match=r"x = 1e\+308"):
+        env.step(np.zeros((3, 1)))
+
+
+@each_engine
+def test_inputs_in_physical_units_are_held_as_they_are(engine):
+    env = made(engine=engine, horizon=0.1).unwrapped
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step_physical((np.full(3, 3.0),))
+        np.testing.assert_array_equal(env.executed, [np.full(3, 3.0)])
+
+
+@each_engine
+def test_without_a_state_there_is_no_step(engine):
+    env = made(engine=engine)
+    for act in (
+        lambda: env.step(np.zeros((3, 1))),
+        lambda: env.unwrapped.components,
+        lambda: env.reset(options={"reset_mask": np.array([True, False, False])}),
+    ):
+        with pytest.raises(gym.error.ResetNeeded):
+            act()
+
+
+@each_engine
+def test_a_filter_that_comes_late_says_what_it_says_at_rest(engine):
+    env = made(engine=engine)
+    env.reset(seed=0)
+    mask = np.array([False, True, False])
+    _, info = SafetyFilterVectorWrapper(env, "scbf").reset(options={"reset_mask": mask})
+    for key in ("nominal_action", "safe_action", "slacks", "slack", "episode_interventions"):
+        np.testing.assert_array_equal(info[key], np.zeros_like(info[key]))
+    np.testing.assert_array_equal(info["active_barrier"], [-1, -1, -1])
+    assert info["feasible"].all()
+    assert not info["intervention"].any()
+
+
+@pytest.mark.parametrize("seed", [None, 5, [4, None, 2**70]])
+def test_each_engine_goes_on_from_the_snapshot_of_the_other(seed):
+    """Without a seed the noise goes on where it is."""
+    envs = [made(condition="scbf", engine=engine) for engine in ENGINES]
+    for env in envs:
+        env.reset(seed=7)
+        for _ in range(3):
+            env.step(np.full((3, 1), 0.4))
+    snapshots = [env.snapshot() for env in envs]
+    for env, snapshot in zip(envs, snapshots[::-1], strict=True):
+        for _ in range(2):
+            env.step(np.full((3, 1), 0.9))
+        env.restore(snapshot, seed)
+    for k in range(10):
+        theirs, ours = (env.step(np.full((3, 1), 0.2)) for env in envs)
+        assert_same(ours[0], theirs[0], f"step {k}")
+        assert_same(ours[4]["safe_action"], theirs[4]["safe_action"], f"step {k}")
+    for key, value in envs[0].snapshot().items():
+        assert_same(envs[1].snapshot()[key], value, key)
+
+
+@each_engine
+@with_and_without
+def test_a_seed_forgets_the_noise_that_was_drawn_before(engine, condition):
+    env, fresh = (made(condition=condition, engine=engine) for _ in range(2))
+    env.reset(seed=1)
     for _ in range(3):
-        actions = np.full((3, 1), 0.9, dtype=np.float32)
-        info, expected = env.step(actions)[4], again.step(actions)[4]
-        assert_same(info, expected, "info")
-        for value in info.values():
-            value[...] = 0
+        env.step(np.full((3, 1), 0.4))
+    np.testing.assert_array_equal(env.reset(seed=2)[0], fresh.reset(seed=2)[0])
+    for _ in range(3):
+        given = np.full((3, 1), 0.2)
+        np.testing.assert_array_equal(env.step(given)[0], fresh.step(given)[0])
+    snapshot = fresh.snapshot()
+    for each in (env, fresh):
+        each.restore(snapshot, seed=[None, 9, 9])
+    ours, theirs = (each.step(given)[0] for each in (env, fresh))
+    np.testing.assert_array_equal(ours, theirs)
+
+
+@each_engine
+def test_any_array_is_taken(engine):
+    env = made(condition="scbf", engine=engine)
+    everywhere = np.broadcast_to(True, (3,))
+    env.reset(seed=0, options={"reset_mask": everywhere})
+    first = env.step(np.broadcast_to(0.5, (3, 1)))[0]
+    env.restore({key: np.asfortranarray(v) for key, v in env.snapshot().items()})
+    env.step(np.zeros((6, 1))[::2])
+    env.restore({key: v.tolist() for key, v in env.snapshot().items()})
+    env.reset(options={"reset_mask": np.array([True, False] * 3)[::2]})
+    env.step([[0.1]] * 3)
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.step([[0.5]] * 3)[0], first)
+
+
+def test_wrappers_of_gymnasium_take_both_engines():
+    shown = []
+    for engine in ENGINES:
+        env = made(condition="scbf", engine=engine, horizon=0.2)
+        wrapped = DictInfoToList(RecordEpisodeStatistics(NormalizeObservation(env)))
+        wrapped.reset(seed=0)
+        found = [wrapped.step(np.full((3, 1), 0.9, dtype=np.float32)) for _ in range(9)]
+        shown.append([(step[0], step[4]) for step in found])
+    for (theirs, infos), (ours, my_infos) in zip(*shown, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+        for info, mine in zip(infos, my_infos, strict=True):
+            assert mine.keys() == info.keys()
+            assert_same(mine["h_min"], info["h_min"], "h_min")
+    assert shown[1][3][1][0]["episode"]["l"] == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "fragment"),
+    [
+        ({"delay": 1}, "delay"),
+        ({"slew_limit": (-9.0, 9.0)}, "slew"),
+        ({"measurement": "default"}, "sensor"),
+    ],
+)
+def test_what_has_no_compiled_form_is_left_to_numpy_or_refused(options, fragment):
+    with pytest.raises(NotCompilableError, match=fragment):
+        made(engine="compiled", **options)
+    plain, auto = (made(engine=engine, **options) for engine in ("numpy", "auto"))
+    for env in (plain, auto):
+        env.reset(seed=0)
+    given = np.full((3, 1), 0.5)
+    np.testing.assert_array_equal(plain.step(given)[0], auto.step(given)[0])
+
+
+@pytest.mark.parametrize("given", [{"delay": 1}, {"render_mode": "rgb_array"}, {}])
+def test_a_filter_without_compiled_form_is_left_to_numpy(given, monkeypatch):
+    def refuse(*_):
+        raise NotCompilableError("no method for learned terms")
+
+    if not given:
+        monkeypatch.setattr(filter_layers, "filter_source", refuse)
+    options = {key: given[key] for key in ("render_mode",) if key in given}
+    over = {key: given[key] for key in ("delay",) if key in given}
+    found = []
+    for engine in ("numpy", "auto"):
+        env = SafetyFilterVectorWrapper(made(engine=engine, **options), "scbf", **over)
+        env.reset(seed=0)
+        found.append([env.step(np.full((3, 1), 0.7))[0] for _ in range(3)])
+        if options:
+            found[-1].append(np.array(env.render()))
+    for ours, theirs in zip(*found, strict=True):
+        assert_same(ours, theirs, "filtered")
+    if not options:
+        with pytest.raises(NotCompilableError):
+            SafetyFilterVectorWrapper(made(engine="compiled"), "scbf", **over)
+
+
+def test_the_engine_is_part_of_the_spec(monkeypatch):
+    env = made(SCALAR, engine="auto")
+    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.engine == "auto"
+    monkeypatch.setattr(engines, "is_available", lambda: False)
+    made(SCALAR, engine="auto").reset(seed=0)
 
 
 def test_seeds_may_be_a_list():
-    env = gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2)
+    env = made(count=2)
     first, _ = env.reset(seed=[4, 9])
     np.testing.assert_array_equal(first[1], env.reset(seed=[9, 4])[0][0])
     np.testing.assert_array_equal(first, env.reset(seed=np.array([4, 9]))[0])
     np.testing.assert_array_equal(env.reset(seed=np.int64(4))[0], env.reset(seed=4)[0])
-    with pytest.raises(ConfigurationError, match="3 seeds were given for 2 envs"):
-        env.reset(seed=[1, 2, 3])
-    for seed in (1.5, [4, 9.7], "ab", [True, 1], [-1, 1]):
-        with pytest.raises(ConfigurationError, match="give a whole number from 0"):
-            env.reset(seed=seed)
+
+
+MASKS = (np.array([True]), np.array([1, 0]), np.array([False, False]))
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("call", "fragment"),
     [
-        ({"num_envs": 0}, "num_envs = 0"),
-        ({"num_envs": 2, "autoreset_mode": "never"}, "autoreset_mode = 'never'"),
+        (lambda: made(SCALAR, count=0), "num_envs = 0"),
+        (lambda: made(SCALAR, autoreset_mode="never"), "'never'"),
+        (lambda: made(SCALAR, engine="fast"), "'fast'"),
+        (lambda: made(count=2).reset(seed=[1, 2, 3]), "3 seeds"),
+        *(
+            (lambda seed=seed: made(count=2).reset(seed=seed), "seed")
+            for seed in (1.5, [4, 9.7], "ab", [True, 1], [-1, 1], -1)
+        ),
+        *((lambda mask=mask: _reset(made(count=2), mask), "reset_mask") for mask in MASKS),
     ],
 )
-def test_arguments_out_of_range_are_named(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
-        gym.make_vec("safe_envs/Scalar-v0", **arguments)
+def test_arguments_out_of_range_are_named(call, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        call()
+
+
+def _reset(env, mask):
+    env.reset(seed=0)
+    return env.reset(options={"reset_mask": mask})
 
 
 def test_reset_masks_may_be_used_again():
-    env = gym.make_vec("safe_envs/Scalar-v0", num_envs=2)
-    env.reset(seed=0)
     mask = np.array([True, False])
-    _, info = env.reset(options={"reset_mask": mask})
+    _, info = _reset(made(SCALAR, count=2), mask)
     mask[:] = False
     np.testing.assert_array_equal(info["_cost"], [True, False])
 
 
-def test_reset_masks_are_checked():
-    env = gym.make_vec("safe_envs/Scalar-v0", num_envs=2)
-    with pytest.raises(gym.error.ResetNeeded):
-        env.reset(options={"reset_mask": np.array([True, False])})
-    env.reset(seed=0)
-    for mask in (np.array([True]), np.array([1, 0]), np.array([False, False])):
-        with pytest.raises(ConfigurationError, match="reset_mask"):
-            env.reset(options={"reset_mask": mask})
-
-
 def test_a_fixed_start_is_that_of_every_env():
-    envs = SafeVectorEnv(
-        problem_of("safe_envs/DubinsObstacle-v0", start=[2.0, 1.3, 0.3, 0.5, 1.0]), 3
-    )
+    start = [2.0, 1.3, 0.3, 0.5, 1.0]
+    envs = SafeVectorEnv(problem_of("safe_envs/DubinsObstacle-v0", start=start), 3)
     envs.reset(seed=0)
-    np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
+    np.testing.assert_array_equal(envs.state, [start] * 3)
     envs.reset(options={"reset_mask": np.array([True, False, True])})
-    np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
+    np.testing.assert_array_equal(envs.state, [start] * 3)
 
 
 def test_the_batched_class_is_one_object_by_name(env_id):
-    made = type(gym.make_vec(env_id, num_envs=1).unwrapped)
-    assert made is getattr(vectors, made.__name__) is pickle.loads(pickle.dumps(made))
-    assert gym.spec(env_id).vector_entry_point == f"{made.__module__}:{made.__name__}"
+    kind = type(gym.make_vec(env_id, num_envs=1).unwrapped)
+    assert kind is getattr(vectors, kind.__name__) is pickle.loads(pickle.dumps(kind))
+    assert gym.spec(env_id).vector_entry_point == f"{kind.__module__}:{kind.__name__}"
 
 
 @pytest.mark.parametrize("name", ["Scalar", "NobodyVector", "Vector"])

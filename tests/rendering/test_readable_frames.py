@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from safe_envs.rendering.scenes.top_view import TopView
-from safe_envs.systems import ENV_IDS
 from tests.readable import unreadable
 from tests.rendering.readable_frames import frame_texts
 
-IDS = [env_id for env_id in ENV_IDS if "Custom" not in env_id]
 UNREADABLE = "is on a line"
 
 
@@ -30,7 +28,6 @@ def played(env_id: str, steps: int):
 
 
 @pytest.mark.parametrize("steps", [0, 40])
-@pytest.mark.parametrize("env_id", IDS)
 def test_every_text_of_a_frame_can_be_read(env_id, steps):
     texts, without, covered = frame_texts(lambda: played(env_id, steps))
     assert len(texts) > 10

@@ -10,19 +10,28 @@ from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, Sa
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.problem.starts import Start
 from safe_envs.rendering import style
+from safe_envs.rendering.scenes import make_scene
+from safe_envs.rendering.scenes.quadrotor import rotation
 from tests.conftest import problem_of
 from tests.rendering.drawn import SCENE, shown, stepped
+
+
+def drawn(problem) -> SafeEnv:
+    env = SafeEnv(problem, render_mode="rgb_array")
+    env.reset(seed=0)
+    return env
+
+
+def is_near(pixels, color, most=60) -> bool:
+    """Whether some pixel has nearly a colour."""
+    return bool((np.abs(pixels.astype(int) - color).sum(axis=-1) < most).any())
 
 
 def test_the_disk_is_to_scale():
     from safe_envs.rendering.viewer import Picture
 
     for radius in (1.0, 2.5):
-        env = SafeEnv(
-            problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]),
-            render_mode="rgb_array",
-        )
-        env.reset(seed=0)
+        env = drawn(problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]))
         frame = env.render()
         picture = Picture(env.problem)
         axes = picture._scene._plane.background(picture._canvas, env.viewer._histories[0].snapshot)
@@ -30,9 +39,7 @@ def test_the_disk_is_to_scale():
         for angle in (0.3, 2.0, 4.0):
             x, y = axes.place(radius * np.cos(angle), radius * np.sin(angle))
             around = frame[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2]
-            assert (np.abs(around.astype(int) - style.EDGE).sum(axis=-1) < 60).any(), (
-                "the edge is not where h = 0"
-            )
+            assert is_near(around, style.EDGE), "the edge is not where h = 0"
             for share, safe in ((0.97, True), (1.03, False)):
                 x, y = axes.place(share * radius * np.cos(angle), share * radius * np.sin(angle))
                 pixel = frame[int(y), int(x)].astype(int)
@@ -40,8 +47,7 @@ def test_the_disk_is_to_scale():
 
 
 def test_obstacles_and_goal_are_to_scale():
-    env = SafeEnv(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7), render_mode="rgb_array")
-    env.reset(seed=0)
+    env = drawn(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7))
     frame = env.render()
     scene = env.viewer._picture._scene
     axes = next(iter(scene._plane._views))
@@ -49,20 +55,16 @@ def test_obstacles_and_goal_are_to_scale():
     assert scene._disks["goal"].radius == pytest.approx(0.3)
     center = env.state[3:5]
     x, y = axes.place(center[0], center[1] - 0.7)
-    column = frame[int(y) - 3 : int(y) + 4, int(x)].astype(int)
-    assert (np.abs(column - style.VIOLATION).sum(axis=-1) < 60).any()
+    assert is_near(frame[int(y) - 3 : int(y) + 4, int(x)], style.VIOLATION)
     x, y = axes.place(3.0, 1.5 - 0.3)
-    assert (
-        np.abs(frame[int(y) - 3 : int(y) + 4, int(x)].astype(int) - style.GOAL).sum(axis=-1) < 60
-    ).any()
+    assert is_near(frame[int(y) - 3 : int(y) + 4, int(x)], style.GOAL)
 
 
 def test_regions_are_outlined_to_scale():
     problem = problem_of("safe_envs/DubinsReach-v0")
     frames = []
     for regions in ({}, problem.regions):
-        env = SafeEnv(replace(problem, regions=regions), render_mode="rgb_array")
-        env.reset(seed=0)
+        env = drawn(replace(problem, regions=regions))
         frames.append(env.render().astype(int))
     scene = env.viewer._picture._scene
     axes = next(iter(scene._plane._views))
@@ -75,8 +77,6 @@ def test_regions_are_outlined_to_scale():
 
 
 def test_required_gap_is_where_the_barrier_vanishes():
-    from safe_envs.rendering.scenes import make_scene
-
     road = make_scene(problem_of("safe_envs/ACC-v0", tau=1.5))
     states = np.array([[20.0, 20.0, 100.0], [10.0, 20.0, 3.0]])
     np.testing.assert_allclose(road.required(states), [30.0, 15.0], atol=1e-3)
@@ -106,8 +106,7 @@ def own_problem(**changes) -> SafetyProblem:
 
 @pytest.mark.parametrize("plane", [None, ("p", "v")])
 def test_any_problem_is_drawn(plane):
-    env = SafeEnv(own_problem(plane=plane), render_mode="rgb_array")
-    env.reset(seed=0)
+    env = drawn(own_problem(plane=plane))
     first = env.render()
     assert shown(first[:, SCENE], style.EDGE) > 20
     assert (stepped(env, 3, 1.0).render()[:, SCENE] != first[:, SCENE]).any()
@@ -117,22 +116,20 @@ def test_any_problem_is_drawn(plane):
 def test_states_without_bounds_are_drawn(plane):
     p, v, c = own_problem().plant.states
     states = tuple(Variable(s, -np.inf, np.inf) for s in (p, v, c))
-    env = SafeEnv(
-        own_problem(plane=plane, states=states, features=(Feature("p", p, -1.0, 1.0),)),
-        render_mode="rgb_array",
-    )
-    env.reset(seed=0)
+    features = (Feature("p", p, -1.0, 1.0),)
+    env = drawn(own_problem(plane=plane, states=states, features=features))
     before = env.render()
     assert (stepped(env, 30, 1.0).render()[:, SCENE] != before[:, SCENE]).any()
     assert env.state[0] > 2.0
 
 
-def test_a_wrong_scene_is_named():
-    for scene, message in (("top", "top-view"), ("road", "has p, v, c"), ("pendulum", "'theta'")):
-        env = SafeEnv(own_problem(scene=scene), render_mode="rgb_array")
-        env.reset(seed=0)
-        with pytest.raises(ConfigurationError, match=message):
-            env.render()
+@pytest.mark.parametrize(
+    ("scene", "fragment"), [("top", "top-view"), ("road", "p, v, c"), ("pendulum", "'theta'")]
+)
+def test_a_wrong_scene_is_named(scene, fragment):
+    env = drawn(own_problem(scene=scene))
+    with pytest.raises(ConfigurationError, match=fragment):
+        env.render()
 
 
 def test_the_view_grows_with_the_trail():
@@ -160,8 +157,6 @@ def four_states(**changes) -> SafetyProblem:
 
 
 def test_states_without_a_workspace_are_shown_with_the_edges_of_the_safe_set():
-    from safe_envs.rendering.scenes import make_scene
-
     scene = make_scene(four_states())
     x, v, theta, rate = (scene.range_of(i) for i in range(4))
     assert x[0] < 20.0
@@ -178,8 +173,7 @@ def test_states_without_a_workspace_are_shown_with_the_edges_of_the_safe_set():
 
 
 def test_bars_fill_the_scene_with_trails():
-    env = SafeEnv(four_states(), render_mode="rgb_array")
-    env.reset(seed=0)
+    env = drawn(four_states())
     first = env.render()
     # The edges are drawn on the bars of x, theta and rate.
     assert shown(first[:, SCENE], style.EDGE) > 50
@@ -205,8 +199,7 @@ def test_bars_fill_the_scene_with_trails():
 def test_the_name_of_the_smallest_barrier_is_apart_from_its_value(monkeypatch):
     from safe_envs.rendering.canvas import Canvas
 
-    env = SafeEnv(four_states(), render_mode="rgb_array")
-    env.reset(seed=0)
+    env = drawn(four_states())
     env.render()
     boxes, blit = {}, Canvas.text
 
@@ -226,43 +219,38 @@ def test_the_name_of_the_smallest_barrier_is_apart_from_its_value(monkeypatch):
 
 
 def test_an_obstacle_is_outlined_where_the_first_violation_was():
-    env = SafeEnv(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7), render_mode="rgb_array")
-    env.reset(seed=0)
+    env = drawn(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7))
     state = env.state.copy()
     ahead = np.array(state)
     ahead[3:5] += (1.5, -2.0)
 
-    def drawn(*states):
+    def outlined(*states):
         env.viewer.restart([states[0]], [0.0], [0])
         for k, each in enumerate(states[1:], start=1):
             env.viewer.advance([each], [0.05 * k], [[0.0]])
         frame = env.render()
         axes = next(iter(env.viewer._picture._scene._plane._views))
         x, y = axes.place(state[3] - 0.7, state[4])
-        around = frame[int(y) - 1 : int(y) + 2, int(x) - 3 : int(x) + 4].astype(int)
-        return (
-            np.abs(around - style.mix(style.VIOLATION, style.PAPER, 0.6)).sum(axis=-1) < 90
-        ).any()
+        around = frame[int(y) - 1 : int(y) + 2, int(x) - 3 : int(x) + 4]
+        return is_near(around, style.mix(style.VIOLATION, style.PAPER, 0.6), 90)
 
     hit = np.array(state)
     hit[:2] = state[3:5] + 0.1
     away = np.array(ahead)
     away[:2] = ahead[3:5] + 3.0
-    assert drawn(hit, away)
+    assert outlined(hit, away)
     apart = np.array(state)
     apart[:2] = state[3:5] + 3.0
-    assert not drawn(apart, away), "there was no violation"
+    assert not outlined(apart, away), "there was no violation"
 
 
-def test_charts_of_roads_are_bounded():
-    from safe_envs.rendering.scenes import road
-
-    env = stepped(SafeEnv(problem_of("safe_envs/ACC-v0", horizon=0.5), render_mode="rgb_array"), 1)
-    env.render()
-    road._furniture.cache_clear()
-    for _ in range(30):
-        env.step([0.0])
-        env.render()
-    assert 1 <= road._furniture.cache_info().currsize <= 8
-    (scene,) = (env.viewer._picture._scene,)
-    assert not any(len(value) > 8 for value in vars(scene).values() if isinstance(value, dict))
+def test_the_drawn_quadrotor_leans_where_its_thrust_goes():
+    plant = problem_of("safe_envs/Quadrotor-v0").plant
+    by_name = {s.name: s for s in plant.states}
+    for angles in np.random.default_rng(0).uniform(-1.4, 1.4, (5, 3)):
+        at = dict(zip((by_name[name] for name in ("phi", "theta", "psi")), angles, strict=True))
+        push = np.array(plant.numeric(plant.input_matrix).subs(at), dtype=float)[3:6].sum(axis=1)
+        turned = rotation(*angles)
+        assert turned[:, 2] == pytest.approx(push / np.linalg.norm(push))
+        assert turned @ turned.T == pytest.approx(np.eye(3), abs=1e-12)
+        assert np.linalg.det(turned) == pytest.approx(1.0)

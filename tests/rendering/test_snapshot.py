@@ -5,13 +5,13 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-import sympy as sp
 
-from safe_envs import ControlAffineSDE, SafeEnv, SafeVectorEnv
+from safe_envs import SafeEnv, SafeVectorEnv
 from safe_envs.rendering import style
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
 from tests.rendering.drawn import DUBINS, stepped, written
+from tests.wrappers.cases import SWING, rate
 
 
 def test_a_restored_snapshot_is_what_is_drawn():
@@ -112,31 +112,11 @@ def test_numbers_have_three_digits_that_count(value, scale, text):
     assert style.number(value, scale) == text
 
 
-def test_trails_of_endless_episodes_are_bounded():
-    env = SafeEnv(
-        problem_of("safe_envs/Scalar-v0", noise=0.0, start=[0.0]), render_mode="rgb_array"
-    )
-    env.reset(seed=0)
-    for _ in range(12_000):
-        env.step([0.0])
-    moment = env.viewer._histories[0].snapshot
-    assert 5000 <= len(moment.times) <= 10_000
-    assert moment.times[-1] == pytest.approx(120.0)
-    assert env.render().shape == (540, 960, 3)
-
-
 @pytest.mark.parametrize("limited", [True, False])
 def test_an_env_without_a_limit_of_time_has_no_horizon(monkeypatch, limited):
     bare = gym.make("Pendulum-v1", render_mode="rgb_array")
-    theta, rate, torque = sp.symbols("theta rate torque", real=True)
-    model = ControlAffineSDE((theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0])
-    env = SafetyFilterWrapper(
-        bare if limited else bare.unwrapped,
-        "cbf",
-        model=model,
-        barriers=4 - rate,
-        state_fn=lambda seen: seen[:2],
-    )
+    view = {**SWING, "barriers": 4 - rate}
+    env = SafetyFilterWrapper(bare if limited else bare.unwrapped, "cbf", **view)
     env.reset(seed=0)
     env.step([0.0])
     texts = written(monkeypatch)

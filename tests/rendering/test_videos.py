@@ -1,16 +1,13 @@
-"""Videos of envs, by Gymnasium and by Stable-Baselines3."""
+"""Videos by Stable-Baselines3; for those of Gymnasium see tests/wrappers/test_wrapper_order.py."""
 
 from __future__ import annotations
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import RecordVideo
 from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from safe_envs.agents import make_sb3_env
-from safe_envs.wrappers import SafetyFilterWrapper
-from tests.rendering.drawn import DUBINS, stepped
+from tests.rendering.drawn import DUBINS
 
 pytestmark = pytest.mark.slow
 
@@ -21,23 +18,6 @@ def frames_in(path) -> list[np.ndarray]:
     reader = imageio_ffmpeg.read_frames(str(path))
     width, height = next(reader)["size"]
     return [np.frombuffer(frame, dtype=np.uint8).reshape(height, width, 3) for frame in reader]
-
-
-@pytest.mark.filterwarnings(
-    "ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
-)
-def test_gymnasium_records_a_video(tmp_path):
-    env = RecordVideo(
-        SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "scbf"),
-        str(tmp_path / "videos"),
-        video_length=4,
-    )
-    stepped(env, 4)
-    env.close()
-    (video,) = (tmp_path / "videos").glob("*.mp4")
-    frames = frames_in(video)
-    assert len(frames) >= 4
-    assert frames[0].shape == (540, 960, 3)
 
 
 @pytest.mark.filterwarnings(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
-import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SafeEnv, SafeVectorEnv
+from safe_envs import ConfigurationError, SafeEnv, SafeVectorEnv
 from safe_envs.rendering import style
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 from tests.rendering.drawn import DUBINS, FILTER_STATUS, PANEL, SAFETY_STATUS, SCENE, shown, stepped
+from tests.wrappers.cases import SWING
 
 pytestmark = pytest.mark.slow
 
@@ -65,42 +65,34 @@ def test_a_reset_in_the_step_leaves_no_trace():
     for _ in range(2):
         envs.step(np.ones((1, 1), dtype=np.float32))
     (frame,) = envs.render()
-    env = SafeEnv(problem, render_mode="rgb_array")
-    env.reset(options=None)
-    env._x = tuple(float(x[0]) for x in envs.unwrapped.components)
-    env.viewer.restart([env._x], [0.0], [0])
-    env.viewer.caption = "scbf"
+    env = SafetyFilterWrapper(SafeEnv(problem, render_mode="rgb_array"), "scbf")
+    env.reset(options={"state": envs.unwrapped.state[0]})
     np.testing.assert_array_equal(frame, env.render())
 
 
+def color_of(info):
+    """The colour in which the panel says what a filter did."""
+    if not info["feasible"]:
+        return style.INFEASIBLE
+    return style.INTERVENING if info["intervention"] else None
+
+
 def test_warning_colors_say_what_the_filter_does():
-    env = SafetyFilterWrapper(
-        gym.make(DUBINS, render_mode="rgb_array", start=[2.5, 0.0, 0.0]), "scbf"
-    )
+    inner = gym.make(DUBINS, render_mode="rgb_array", start=[2.5, 0.0, 0.0])
+    env = SafetyFilterWrapper(inner, "scbf")
     env.reset(seed=0)
     assert shown(env.render(), style.INTERVENING) == 0
     seen = set()
     for _ in range(60):
-        _, _, _, _, info = env.step(np.zeros(1, dtype=np.float32))
-        frame = env.render()
-        status = frame[FILTER_STATUS]
-        expected = (
-            style.INFEASIBLE
-            if not info["feasible"]
-            else style.INTERVENING
-            if info["intervention"]
-            else None
-        )
+        *_, info = env.step(np.zeros(1, dtype=np.float32))
+        frame, expected = env.render(), color_of(info)
         for color in (style.INFEASIBLE, style.INTERVENING):
-            assert (shown(status, color) > 1000) == (color == expected)
-        if expected is not None:
-            assert shown(frame[:148, PANEL], expected) < shown(frame[:, PANEL], expected), (
-                "the bar of the action has another colour"
-            )
+            assert (shown(frame[FILTER_STATUS], color) > 1000) == (color == expected)
+        if expected is not None:  # the bar of the action has that colour, too
+            assert shown(frame[:148, PANEL], expected) < shown(frame[:, PANEL], expected)
         assert (shown(frame[SAFETY_STATUS], style.VIOLATION) > 1000) == info["violation"]
         seen.add(expected)
-    assert style.INTERVENING in seen
-    assert style.INFEASIBLE in seen
+    assert {style.INTERVENING, style.INFEASIBLE} <= seen
 
 
 def test_without_a_filter_there_is_no_nominal_action():
@@ -108,70 +100,51 @@ def test_without_a_filter_there_is_no_nominal_action():
     bare = stepped(env, 1).render()
     filtered = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "szcbf:alphas=9,9")
     assert (stepped(filtered, 1).render()[170:210, PANEL] != bare[170:210, PANEL]).any()
-    moment = env.viewer._histories[0].snapshot
-    assert moment.decision is None
-    assert moment.executed is not None
 
 
-@pytest.mark.parametrize("mode", ["ansi", "rgb", 3])
+@pytest.mark.parametrize("mode", ["ansi", "rgb", 3, "human"])
 def test_unknown_modes_are_named(mode):
-    problem = problem_of(DUBINS)
-    with pytest.raises(ConfigurationError, match=r"allowed: None, 'human', 'rgb_array'"):
-        SafeEnv(problem, render_mode=mode)
-    with pytest.raises(ConfigurationError, match=r"allowed: None, 'rgb_array'"):
-        SafeVectorEnv(problem, 2, render_mode=mode)
+    with pytest.raises(ConfigurationError, match="rgb_array"):
+        SafeVectorEnv(problem_of(DUBINS), 2, render_mode=mode)
+    if mode != "human":
+        with pytest.raises(ConfigurationError, match="rgb_array"):
+            SafeEnv(problem_of(DUBINS), render_mode=mode)
 
 
-def test_no_mode_draws_nothing(env_id):
-    problem = problem_of(env_id)
-    for env in (SafeEnv(problem), SafeVectorEnv(problem, 2)):
-        env.reset(seed=0)
-        with pytest.warns(UserWarning, match="without a render mode"):
-            assert env.render() is None
+@pytest.mark.parametrize("count", [None, 2])
+def test_there_is_nothing_to_draw_without_a_mode_or_before_a_reset(count):
+    def made(mode):
+        problem = problem_of(DUBINS)
+        return (
+            SafeEnv(problem, render_mode=mode)
+            if count is None
+            else SafeVectorEnv(problem, count, render_mode=mode)
+        )
 
-
-def test_there_is_nothing_to_draw_before_a_reset():
-    for env in (
-        SafeEnv(problem_of(DUBINS), render_mode="rgb_array"),
-        SafeVectorEnv(problem_of(DUBINS), 2, render_mode="rgb_array"),
-    ):
-        with pytest.raises(gym.error.ResetNeeded):
-            env.render()
+    with pytest.raises(gym.error.ResetNeeded):
+        made("rgb_array").render()
+    env = made(None)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
 
 
 def test_a_filter_over_another_env_is_shown_beside_its_picture():
-    theta, rate, torque = sp.symbols("theta rate torque", real=True)
-    view = {
-        "model": ControlAffineSDE(
-            (theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0]
-        ),
-        "barriers": 4 - rate**2 + 30 * (1 - sp.cos(theta)),
-        "state_fn": lambda seen: np.stack(
-            [np.arctan2(seen[..., 1], seen[..., 0]), seen[..., 2]], axis=-1
-        ),
-    }
-    env = SafetyFilterWrapper(
-        gym.make("Pendulum-v1", render_mode="rgb_array"), "cbf:alpha=2:sampling_margin=15", **view
-    )
+    text = "cbf:alpha=2:sampling_margin=15"
+    env = SafetyFilterWrapper(gym.make("Pendulum-v1", render_mode="rgb_array"), text, **SWING)
     env.reset(seed=1)
     frames, colors = [], set()
     for _ in range(60):
         *_, info = env.step([2.0])
         frames.append(env.render())
         assert frames[-1].shape == (540, 960, 3)
-        color = (
-            style.INFEASIBLE
-            if not info["feasible"]
-            else style.INTERVENING
-            if info["intervention"]
-            else None
-        )
+        color = color_of(info)
         colors.add(color)
         assert color is None or shown(frames[-1][FILTER_STATUS], color)
     assert colors >= {None, style.INTERVENING}
     assert (frames[0][:, SCENE] != frames[-1][:, SCENE]).any()
     envs = gym.make_vec("Pendulum-v1", 2, "sync", vector_kwargs=None, render_mode="rgb_array")
-    batch = SafetyFilterVectorWrapper(envs, "cbf:alpha=2:sampling_margin=15", **view)
+    batch = SafetyFilterVectorWrapper(envs, text, **SWING)
     batch.reset(seed=1)
     for _ in range(60):
         batch.step(np.full((2, 1), 2.0, dtype=np.float32))

@@ -106,7 +106,7 @@ def test_windows_that_ended_do_not_end_new_ones():
     import pygame
 
     envs = [stepped(gym.make(DUBINS, render_mode="human", dt=0.001), 1) for _ in range(3)]
-    for _ in range(120):
+    for _ in range(25):
         # SDL likes to give a new window the address of one that ended.
         pygame.quit()
         for env in envs:
@@ -162,27 +162,14 @@ def test_no_display_is_an_error(monkeypatch):
         env.reset(seed=0)
 
 
-def test_a_window_for_a_batch_is_refused():
-    with pytest.raises(ConfigurationError, match="make a scalar one"):
-        gym.make_vec(DUBINS, 2, render_mode="human")
-
-
-def test_missing_pygame_says_what_to_install(monkeypatch):
-    env = stepped(SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), 1)
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(
-        gym.error.DependencyNotInstalled, match=r'pip install --editable "\.\[render\]"'
-    ):
-        env.render()
-
-
-def test_the_other_pygame_is_refused(monkeypatch):
+@pytest.mark.parametrize("missing", [True, False])
+def test_without_the_right_pygame_it_is_said_what_to_install(monkeypatch, missing):
     import pygame
 
-    monkeypatch.delattr(pygame.draw, "aacircle")
     env = stepped(SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), 1)
-    with pytest.raises(
-        gym.error.DependencyNotInstalled,
-        match=r'pip uninstall pygame.*pip install --editable "\.\[render\]"',
-    ):
+    if missing:
+        monkeypatch.setitem(sys.modules, "pygame", None)
+    else:  # the other one
+        monkeypatch.delattr(pygame.draw, "aacircle")
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r"\.\[render\]"):
         env.render()

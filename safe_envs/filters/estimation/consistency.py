@@ -65,25 +65,6 @@ def consistency_of(
     return Consistency(mean, mean - half, mean + half, expected)
 
 
-def chi_square_interval(freedom: int, episodes: int, confidence: float) -> tuple[float, float]:
-    """Return where the mean of independent chi-square numbers lies with some probability.
-
-    Of an honest estimator it is the acceptance region of the NEES at one control instant: of N
-    episodes N times the mean is chi-square distributed with N n degrees of freedom.
-
-    Args:
-        freedom: n.
-        episodes: N.
-        confidence: of the interval.
-
-    Source: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation,
-        2001, Sec. 5.4.
-    """
-    tails = (0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence)
-    low, high = stats.chi2.ppf(tails, freedom * episodes) / episodes
-    return float(low), float(high)
-
-
 def nees(
     estimator: Estimator, x: np.ndarray, mean: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

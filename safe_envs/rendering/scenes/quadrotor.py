@@ -180,14 +180,7 @@ class SideView(Scene):
 def _name_reference(
     canvas: Canvas, axes: Axes, at: tuple[float, float], quadrotor: tuple[float, float]
 ) -> None:
-    """Write the name of the reference where nothing covers it and it covers nothing.
-
-    Args:
-        canvas: to draw on.
-        axes: that the name is to be inside of.
-        at: pixel of the reference.
-        quadrotor: pixel of the quadrotor.
-    """
+    """Write the name of the reference where nothing covers it and it covers nothing."""
     width, height = text_size("reference", SMALL)
     left, top, across, down = axes.box
     x, y, radius = _DIAL

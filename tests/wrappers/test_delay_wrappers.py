@@ -1,0 +1,127 @@
+"""Wrappers whose filter predicts over the delay of an env, or over another one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from safe_envs import SafeEnv, SafeVectorEnv
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.rare_events.estimate import estimate_rare
+from safe_envs.errors import ConfigurationError
+from safe_envs.filters.conditions import parse_conditions
+from safe_envs.proofs.posterior import guarantee_of
+from safe_envs.values.reduction import reduced
+from safe_envs.wrappers import (
+    DelayedFilter,
+    SafetyFilter,
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+)
+from tests.conftest import problem_of
+from tests.wrappers.cases import PENDULUM
+
+
+def run(problem, actions, condition="hocbf", **arguments):
+    env = SafetyFilterWrapper(SafeEnv(problem), condition, **arguments)
+    env.reset(seed=0)
+    states, sent = [env.unwrapped.state], []
+    for action in actions:
+        *_, info = env.step(action)
+        states.append(env.unwrapped.state)
+        sent.append(info["safe_action"])
+        np.testing.assert_array_equal(info.get("sent_action", sent[-1]), sent[-1])
+    return np.array(states), np.array(sent), info["h_min"]
+
+
+def proposals(count):
+    return np.random.default_rng(0).uniform(-1.0, 1.0, (count, 1))
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_without_noise_the_delay_is_made_up_for_to_the_last_bit(delay):
+    problem = problem_of(PENDULUM, noise=0.0, start=[0.1, 0.1])
+    resting = SafeEnv(problem)
+    resting.reset()
+    for _ in range(delay):
+        resting.step([0.0])
+    late, sent, lowest = run(problem.configured(delay=delay), proposals(150))
+    prompt, decided, _ = run(problem.configured(start=resting.state.tolist()), proposals(150))
+    np.testing.assert_array_equal(late[delay:], prompt[:-delay])
+    np.testing.assert_array_equal(sent, decided)
+    assert lowest > 0.0
+
+
+def test_a_filter_may_believe_another_delay():
+    problem = problem_of(PENDULUM, noise=0.0, start=[0.1, 0.1], delay=3)
+    actions = proposals(100)
+    aware, unaware = run(problem, actions)[1], run(problem, actions, delay=0)[1]
+    assert not np.array_equal(aware, unaware)
+    of_model = problem.configured(model_delay=0)
+    np.testing.assert_array_equal(run(of_model, actions)[1], unaware)
+    np.testing.assert_array_equal(run(of_model, actions, knowledge="plant")[1], aware)
+    np.testing.assert_array_equal(run(of_model, actions, delay=3)[1], aware)
+    # Believed alone, it is the filter that is late for nothing.
+    undelayed = problem.configured(delay=0, model_delay=2)
+    states = run(undelayed, actions)[0]
+    assert not np.array_equal(states, run(undelayed.configured(model_delay=0), actions)[0])
+
+
+def test_a_wrapped_filter_is_a_delayed_one_also_where_a_state_is_set():
+    problem = problem_of(PENDULUM, delay=3)
+    one = SafetyFilterWrapper(SafeEnv(problem), "hocbf")
+    batch = SafetyFilterVectorWrapper(SafeVectorEnv(problem, 2), "hocbf")
+    late = DelayedFilter(
+        SafetyFilter.for_problem(problem, "hocbf"), 3, problem.dt, problem.substeps
+    )
+    one.reset(seed=0)
+    batch.reset(seed=0)
+    sent, high = [0.0] * 3, problem.box[0][1]
+    for k, action in enumerate(proposals(9)):
+        if k == 4:
+            one.unwrapped.state = [0.3, -0.2]
+            batch.unwrapped.state = [0.3, -0.2]
+        expected = late.filter(one.unwrapped.state, high * action).action
+        *_, info = one.step(action)
+        *_, infos = batch.step(np.tile(action, (2, 1)))
+        # One env and the first of a batch have the same seed.
+        np.testing.assert_allclose(info["safe_action"], expected, rtol=1e-12)
+        np.testing.assert_allclose(infos["safe_action"][0], expected, rtol=1e-9)
+        sent.append(info["safe_action"].item())
+        assert info["executed_action"] == sent.pop(0)
+
+
+DELAYED = [{"delay": 1}, {"model_delay": 1}, {"slew_limit": (-1.0, 1.0)}]
+
+
+@pytest.mark.parametrize("options", DELAYED)
+def test_proofs_tables_and_rare_events_refuse_a_delay(options):
+    problem = problem_of(PENDULUM, **options)
+    for ask in (
+        lambda: reduced(problem),
+        lambda: guarantee_of(problem, parse_conditions("scbf", problem)),
+        lambda: SafetyFilterWrapper(SafeEnv(problem), "promise:p=0.9"),
+        lambda: SafetyFilterWrapper(SafeEnv(problem), "certified"),
+        lambda: SafetyFilter.for_problem(problem, "certified"),
+        lambda: estimate_rare(problem, filters="scbf"),
+    ):
+        with pytest.raises(ConfigurationError, match="delay or a slew limit"):
+            ask()
+
+
+@pytest.mark.parametrize(
+    ("text", "delay", "fragment"),
+    [("promise:p=0.9", 1, "promise"), ("certified", 1, "certificates"), ("scbf", -1, "delay = -1")],
+)
+def test_delays_that_a_filter_cannot_believe_are_refused(text, delay, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        SafetyFilterWrapper(SafeEnv(problem_of(PENDULUM)), text, delay=delay)
+
+
+def test_an_evaluation_says_why_there_is_no_bound_and_counts_what_is_executed():
+    problem = problem_of(PENDULUM, noise=0.0, delay=2, horizon=0.02)
+    found = evaluate(problem, "random", ["none", "scbf"], episodes=5)
+    # Two periods at rest.
+    assert [row.effort_mean for row in found.rows] == [0.0, 0.0]
+    assert "delay" in str(found.rows[1].held_note)
+    assert found.config["problem"]["actuators"] == "delay 2, model_delay 2"
