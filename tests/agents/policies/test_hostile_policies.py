@@ -23,7 +23,7 @@ from safe_envs.filters.learning.data import load, save
 from safe_envs.registry import make_problem
 from tests.agents.policies.test_network import small
 from tests.test_bounded_reading import damaged_by
-from tests.wrappers.learning.data.test_hostile_files import altered, changed
+from tests.filters.learning.test_learned_files import altered, changed
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates import checker
 from safe_envs.filters.certificates.checker import Bands, check
-from tests.wrappers.certificates.examples import (
+from tests.filters.certificates.examples import (
     FALSE,
     TRUE,
     UNDECIDED,

@@ -22,7 +22,7 @@ from safe_envs.values.promise_filter import PromiseFilter, PromiseSettings
 from safe_envs.values.promise_kernel import promise_decision
 from safe_envs.values.promise_source import promise_program
 from tests.conftest import problem_of
-from tests.wrappers.export.test_export import COMPILERS, NEEDS_COMPILER, STRICT, run_selftest
+from tests.export.test_export import COMPILERS, NEEDS_COMPILER, STRICT, run_selftest
 from tests.wrappers.value.systems import s, scalar, solved, u, v, x, y
 from tests.wrappers.value.test_look_ahead import pursued
 

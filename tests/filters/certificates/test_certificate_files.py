@@ -18,7 +18,7 @@ from safe_envs.filters.certificates.files import checksum, load_certificate, sav
 from safe_envs.filters.certificates.matching import difference, env_difference, plant_of
 from safe_envs.registry import make_problem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
-from tests.wrappers.certificates.examples import TRUE, brownian, disk, in_line, with_plant, x
+from tests.filters.certificates.examples import TRUE, brownian, disk, in_line, with_plant, x
 
 
 def saved(certificate, tmp_path):

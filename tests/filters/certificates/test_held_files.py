@@ -7,8 +7,8 @@ import pytest
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates.files import load_certificate
 from safe_envs.filters.certificates.matching import env_difference
-from tests.wrappers.certificates.held_examples import scalar_certificate, with_numbers
-from tests.wrappers.certificates.test_files import rewritten, saved
+from tests.filters.certificates.held_examples import scalar_certificate, with_numbers
+from tests.filters.certificates.test_certificate_files import rewritten, saved
 
 
 def test_a_file_states_what_was_written(tmp_path) -> None:

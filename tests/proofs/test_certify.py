@@ -28,7 +28,7 @@ from safe_envs.proofs.certify import (
 from safe_envs.proofs.held_synthesis import certify_held
 from safe_envs.proofs.linear_program import Domain
 from safe_envs.registry import make_problem
-from tests.wrappers.synthesis.systems import brownian, survival
+from tests.proofs.brownian_motion import brownian, survival
 
 HORIZON = 1.0
 BEST = math.exp(-HORIZON / 2)

@@ -8,7 +8,7 @@ import pytest
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates.balls import check_with_balls
-from tests.wrappers.certificates.examples import FALSE, TRUE, UNDECIDED
+from tests.filters.certificates.examples import FALSE, TRUE, UNDECIDED
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):

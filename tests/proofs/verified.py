@@ -1,4 +1,4 @@
-"""Problems and findings that the tests of the verification share."""
+"""Problems, and what is found of them, that the tests of proofs share."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def made(problem, text="scbf", **options):
     return verify(problem, parse_conditions(text, problem), **options)
 
 
-def made_bound(problem, text="scbf"):
+def made_bound(problem, text="scbf", **options):
     """The estimated bound of a problem under a filter."""
-    return guarantee_of(problem, parse_conditions(text, problem))
+    return guarantee_of(problem, parse_conditions(text, problem), **options)
 
 
 def findings(env_id, text=None, knowledge="model", samples=analysis.SAMPLES, **options):
@@ -76,35 +76,20 @@ def findings(env_id, text=None, knowledge="model", samples=analysis.SAMPLES, **o
     )
 
 
-def hurried(env_id):
-    """What is found of a registered id by a search that was hurried, once for all tests; of many
-    obstacles, with two."""
-    problem = problem_of(env_id, **({"num_obstacles": 2} if "DubinsObstacles" in env_id else {}))
-    return verify_once(problem, parse_conditions(problem.filter, problem), samples=128)
-
-
 def verify_once(problem, conditions, knowledge="model", samples=analysis.SAMPLES, seed=0):
     """`verify`, once for all tests that ask for the same."""
-    start = problem.starts[problem.start]
-    of_problem = (
-        problem.name,
-        problem.plant,
-        problem.model,
-        problem.barriers,
-        problem.states,
-        problem.box,
-        problem.start,
-        repr(start),
-    )
-    key = (of_problem, problem.dt, problem.horizon, tuple(conditions), knowledge, samples, seed)
+    parts = (problem.name, problem.plant, problem.model, problem.barriers, problem.states)
+    numbers = (problem.box, repr(problem.starts[problem.start]), problem.dt, problem.horizon)
+    key = (parts, numbers, problem.start, tuple(conditions), knowledge, samples, seed)
     if key not in _FOUND:
         _FOUND[key] = verify(problem, conditions, knowledge, samples, seed)
     return _FOUND[key]
 
 
-def estimated(env_id, text=None, knowledge="model", **options):
+def estimated(env_id, text=None, **options):
+    """The estimated bound of a registered id."""
     problem = problem_of(env_id, **options)
-    return guarantee_of(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return made_bound(problem, text or problem.filter)
 
 
 def by_name(bounds, part):
@@ -134,3 +119,8 @@ def system_in_a_box(count=1, high=5.0, noise=0.6, half_width=1.0):
         noise=("s",),
         filter="scbf",
     )
+
+
+def starts_of(problem, count):
+    """Initial states of a problem, shape (count, n)."""
+    return safe_set.draw_starts(problem, count)

@@ -11,7 +11,7 @@ import sympy as sp
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.proofs.held import check_held, held_certificate, stated_bound, why_not_proved
-from tests.wrappers.certificates.held_examples import scalar_certificate, with_numbers
+from tests.filters.certificates.held_examples import scalar_certificate, with_numbers
 
 
 def test_a_proved_bound_is_checked_again() -> None:
