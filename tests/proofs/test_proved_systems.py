@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import SafeEnvsError
-from safe_envs.proofs import analysis
-from safe_envs.proofs.guarantees import ChainProof
-from safe_envs.proofs.posterior import guarantee_of
-from safe_envs.proofs.safe_set import Formulas
-from safe_envs.wrappers import parse_conditions
+from safe_envs.wrappers import SafetyFilter, parse_conditions
 from tests.oracles import false_bounds
 from tests.oracles.nasty_systems import NASTY, REFUSED, UNPROVED
 from tests.oracles.random_systems import (
@@ -20,6 +16,7 @@ from tests.oracles.random_systems import (
     random_system,
     rates,
 )
+from tests.proofs.verified import hurry, made_bound
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
 
@@ -75,43 +72,45 @@ def test_what_has_no_derivatives_is_refused(name):
 
 @pytest.mark.parametrize("name", UNPROVED)
 def test_the_judge_does_not_rely_on_the_search_for_kinks_and_poles(name, monkeypatch):
-    monkeypatch.setattr(analysis, "roughness", lambda *_: "")
+    hurry(monkeypatch)
     problem, text = NASTY[name]()
-    formulas = Formulas(problem, parse_conditions(text, problem), "model")
-    proof = ChainProof(formulas, [1.0] * len(formulas.names), 0.0, np.empty((0, problem.plant.n)))
+    proof = made_bound(problem, text).proof
     verdicts = [proof.smooth, proof.continuous]
     assert "undecided" in [verdict.word for verdict in verdicts]
     assert any("where evaluation meets a kink, a jump, a pole" in v.reason for v in verdicts)
 
 
+def _slack(problem, text, state):
+    """By how much the filter's action violates its conditions at a state."""
+    found = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
+    return found.filter(state, np.zeros(problem.plant.m)).slack.max()
+
+
 def test_a_second_peak_makes_the_supremum_right_and_refutes_that_the_condition_can_be_met():
     problem = false_bounds.island()
-    guarantee = guarantee_of(problem, parse_conditions("scbf", problem))
+    guarantee = made_bound(problem)
     (peak,) = guarantee.proof.suprema
     assert peak.verdict.word == "proved"
     assert 28.66 < peak.value < 29
     verdict = guarantee.proof.feasible
     assert verdict.word == "refuted"
-    assert guarantee.formulas.chain(verdict.state[None])[0, 0] > 0.0
-    assert guarantee.formulas.shortfall(verdict.state[None])[0] > 0.0
+    assert _slack(problem, "scbf", verdict.state) > 0.0
     assert guarantee.at(np.array([[1.5, 0.3]]), 0.5)[0] == 0.0
 
 
 def test_a_shortfall_of_turned_axes_is_refuted_with_a_state():
-    problem = false_bounds.rotated()
-    formulas = Formulas(problem, parse_conditions("cbf:alpha=0.1", problem), "model")
-    start = np.array(problem.starts[problem.start].proposals(1), dtype=float).reshape(1, -1)
-    verdict = ChainProof(formulas, [1.0], 0.0, start).feasible
+    problem, text = false_bounds.rotated(), "cbf:alpha=0.1"
+    verdict = made_bound(problem, text).proof.feasible
     assert verdict.word == "refuted"
-    assert formulas.shortfall(verdict.state[None])[0] > 0.0
+    assert _slack(problem, text, verdict.state) > 0.0
 
 
 def test_margins_of_first_order_are_not_proved():
     problem = false_bounds.corridor()
     text = "cbf:alpha=10:sampling_margin=first-order"
-    guarantee = guarantee_of(problem, parse_conditions(text, problem))
-    assert guarantee.proof.feasible.word == "undecided"
-    assert "margin of first order" in guarantee.proof.feasible.reason
+    verdict = made_bound(problem, text).proof.feasible
+    assert verdict.word == "undecided"
+    assert "margin of first order" in verdict.reason
 
 
 def test_a_false_bound_would_be_contradicted_at_any_step():
