@@ -17,8 +17,17 @@ from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates.certificate import Plant
 from safe_envs.filters.certificates.held_step import HeldStep
-from safe_envs.proofs.held import HeldBound, prove_held_bound, tail_bound
+from safe_envs.proofs.held import (
+    HeldBound,
+    check_held,
+    held_certificate,
+    prove_held_bound,
+    stated_bound,
+    tail_bound,
+    why_not_proved,
+)
 from safe_envs.proofs.judge import Budget
+from tests.filters.certificates.held_examples import scalar_certificate, with_numbers
 
 X, Y, U = sp.symbols("x y u", real=True)
 DT = Fraction(1, 100)
@@ -70,21 +79,14 @@ def test_the_numbers_are_those_of_a_dense_grid(bound: HeldBound) -> None:
 def test_false_numbers_are_refuted_and_proved_ones_stand(bound: HeldBound) -> None:
     assert {verdict.word for _, verdict in bound.judged()} == {"proved"}
     # At 0 both ends move the state by .1, and psi falls by (.1/.9)^4.
-    least = float((Fraction(1, 9)) ** 4)
-    lower = replace(bound, shortfall=Fraction(least * 0.99).limit_denominator(10**12))
-    words = dict(lower.judged())
-    refuted = words["E psi(X') >= psi - m at an end of the bounds"]
-    assert refuted.word == "refuted"
-    assert refuted.state is not None
+    least = Fraction(float(Fraction(1, 9) ** 4) * 0.99).limit_denominator(10**12)
     lifted = {**bound.psi.coefficients, (0,): Fraction(3, 2)}
-    for name, wrong in (
-        ("psi <= c", replace(bound, supremum=Fraction(9, 10))),
-        (
-            "psi <= 0 outside the workspace",
-            replace(bound, psi=replace(bound.psi, coefficients=lifted)),
-        ),
+    for name, changes in (
+        ("E psi(X') >= psi - m at an end of the bounds", {"shortfall": least}),
+        ("psi <= c", {"supremum": Fraction(9, 10)}),
+        ("psi <= 0 outside the workspace", {"psi": replace(bound.psi, coefficients=lifted)}),
     ):
-        assert dict(wrong.judged())[name].word == "refuted"
+        assert dict(replace(bound, **changes).judged())[name].word == "refuted"
 
 
 def test_psi_is_lowered_where_it_is_not_safe() -> None:
@@ -139,23 +141,18 @@ def test_a_policy_has_its_own_bound() -> None:
     assert away.held_bounds_at(np.zeros((1, 1)), 100)[0] == 0.0
 
 
-def test_a_box_that_is_too_small_is_refused() -> None:
-    small = hump(Fraction(9, 10))
-    found = prove_held_bound(line(), small, DT)
+def test_what_has_no_proof_has_no_bound() -> None:
+    found = prove_held_bound(line(), hump(Fraction(9, 10)), DT)
     assert "make the box larger" in found.reason
     assert found.held_bounds_at(np.zeros((1, 1)), 1).tolist() == [0.0]
+    with pytest.raises(ConfigurationError, match="make the box larger"):
+        held_certificate(found, 50)
     assert prove_held_bound(line(), hump(), DT, budget=Budget(boxes=1)).reason
-
-
-def test_several_inputs_need_a_policy() -> None:
-    two = replace(
-        line(),
-        inputs=(U, Y),
-        bounds=((sp.Integer(-1), sp.Integer(1)),) * 2,
-        input_matrix=((sp.Integer(1), sp.Integer(1)),),
-    )
+    two = {"inputs": (U, Y), "bounds": ((sp.Integer(-1), sp.Integer(1)),) * 2}
     with pytest.raises(ConfigurationError, match="2 inputs"):
-        prove_held_bound(two, hump(), DT)
+        prove_held_bound(
+            replace(line(), input_matrix=((sp.Integer(1), sp.Integer(1)),), **two), hump(), DT
+        )
 
 
 @pytest.mark.parametrize("distance", [3.0, 6.0, 9.0])
@@ -173,3 +170,45 @@ def test_tails_hold_those_of_the_normal_law(distance: float) -> None:
     bound = tail_bound(psi, [nu], [distance])
     assert exact <= bound <= 1e3 * exact**0.8
     assert tail_bound(psi, [0.0], [math.inf]) == 0.0
+
+
+# Certificates.
+
+
+def test_a_proved_bound_is_checked_again() -> None:
+    certificate = scalar_certificate()
+    found = check_held(certificate, 20.0)
+    assert found.word == "checked", found
+    assert len(found.parts) >= 5
+    assert why_not_proved(certificate) == ""
+    bound = stated_bound(certificate)
+    assert held_certificate(bound, 50, certificate.env_id, certificate.options) == certificate
+    # At 0 psi is .9, and an input at its bounds moves the state by .1.
+    expected = 1.0 - 50 * float(certificate.shortfall + certificate.sag) / 0.9
+    at = bound.held_bounds_at(np.zeros((1, 1)), certificate.steps)[0]
+    assert at == pytest.approx(expected, abs=1e-4)
+    assert 0.95 < at < 0.995
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "word"),
+    [
+        ("shortfall", Fraction(1, 10**6), "refuted"),
+        ("supremum", Fraction(8, 10), "refuted"),
+        ("tail", Fraction(0), "undecided"),
+        ("sag", Fraction(-1), "refuted"),
+        ("period", Fraction(1, 10), "refuted"),
+    ],
+)
+def test_a_false_number_is_found(name: str, value: Fraction, word: str) -> None:
+    certificate = with_numbers(**{name: value})
+    assert check_held(certificate, 2.0).word == word
+    assert name not in ("sag", "tail") or why_not_proved(certificate)
+
+
+def test_a_policy_is_judged_within_the_bounds_of_the_input() -> None:
+    plant = scalar_certificate().plant
+    policy = (sp.Integer(-1000) * plant.states[0],)
+    stated = stated_bound(with_numbers(plant=replace(plant, policy=policy)))
+    (law,) = stated.plant.policy
+    assert [law.subs(plant.states[0], x) for x in (-1, 1)] == [10, -10]

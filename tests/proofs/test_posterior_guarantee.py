@@ -17,8 +17,7 @@ from safe_envs.filters.learning.bayesian import identify
 from safe_envs.proofs.posterior import posterior_guarantee
 from safe_envs.wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVectorWrapper
 from tests.conftest import problem_of
-
-pytestmark = pytest.mark.slow
+from tests.proofs.verified import hurry
 
 START = (0.0, 0.6)
 
@@ -73,14 +72,6 @@ def best_rows(problem, posterior, simultaneous, x):
     return best.max(axis=0)
 
 
-def test_its_parts(found):
-    assert found.delta == pytest.approx(0.05, abs=1e-15)
-    # A proved upper bound of sup h = 1, and so not below it.
-    assert 1.0 <= found.supremum <= 1.001
-    assert found.word == "proved"
-    assert f"{found.shortfall:.3g}" in found.remark
-
-
 @pytest.mark.parametrize("simultaneous", [0.5, 0.95])
 def test_the_shortfall_is_the_worst_of_a_dense_grid(cubic, posterior, found, looser, simultaneous):
     searched = found if simultaneous == 0.95 else looser
@@ -102,6 +93,10 @@ def test_the_shortfall_is_the_worst_of_a_dense_grid(cubic, posterior, found, loo
 
 
 def test_the_probability_by_hand(found):
+    assert found.word == "proved"
+    assert found.delta == pytest.approx(0.05, abs=1e-15)
+    # A proved upper bound of sup h = 1, and so not below it.
+    assert 1.0 <= found.supremum <= 1.001
     starts = np.array([[0.0, 0.0], [-0.1, 0.7], [0.6, -0.5], [0.0, 1.0], [0.9, 0.9], [1.5, 0.0]])
     for horizon in (0.0, 0.5, 1.0, 5.0, 50.0):
         h = 1.0 - (starts**2).sum(axis=1)
@@ -113,27 +108,18 @@ def test_the_probability_by_hand(found):
     assert ((found.at(starts, 0.0) >= 0.0) & (found.at(starts, 0.0) <= 0.95)).all()
 
 
-def test_it_is_hardly_another_with_another_seed(cubic, posterior, found):
-    other = posterior_guarantee(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
-    assert other.shortfall == pytest.approx(found.shortfall, rel=1e-3)
-
-
 def test_plant_and_model_do_not_matter(cubic, posterior, found):
     blind = cubic.configured(model={"a": 5.0}, plant={"a": 9.0}, noise=3.0)
     other = posterior_guarantee(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
     assert (other.shortfall, other.supremum) == (found.shortfall, found.supremum)
 
 
-@pytest.mark.slow
-def test_more_data_give_a_larger_bound(cubic, found):
-    few = posterior_guarantee(
-        cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)]
-    )
+def test_more_data_and_a_smaller_probability_give_a_larger_bound(cubic, found, looser, monkeypatch):
+    hurry(monkeypatch)
+    data = identify(cubic, starts=200, repetitions=50)
+    few = posterior_guarantee(cubic, [BayesianSCBF(data, simultaneous=0.95)])
     assert few.shortfall > 1.2 * found.shortfall
     assert few.at(np.array([START]), 0.5) < found.at(np.array([START]), 0.5)
-
-
-def test_a_smaller_probability_of_the_regions_asks_for_less(found, looser):
     assert looser.shortfall < found.shortfall
     assert looser.delta == pytest.approx(0.5)
 
@@ -150,25 +136,23 @@ def test_what_has_no_bound_is_refused(cubic, posterior):
         (cubic, [SCBF()]),
         (cubic, []),
     ):
-        with pytest.raises(
-            ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"
-        ):
+        with pytest.raises(ConfigurationError, match="bayesian-scbf:simultaneous=P"):
             posterior_guarantee(problem, conditions)
 
 
-@pytest.mark.slow
-def test_an_unbounded_set_has_none(cubic, posterior):
+def test_an_unbounded_set_has_none(cubic, posterior, monkeypatch):
+    hurry(monkeypatch)
     problem = problem_of("safe_envs/CubicSDE-v0")
     # Its noise varies with the state: no intervals of sigma are known.
     varying = identify(problem, starts=200, repetitions=20, diffusion_degree=2)
-    with pytest.raises(ConfigurationError, match="intervals of sigma are known for constant noise"):
+    with pytest.raises(ConfigurationError, match="constant noise"):
         posterior_guarantee(problem, [BayesianSCBF(varying, simultaneous=0.9)])
     # The same set with the noise of the disk, which is constant.
     parabola = replace(cubic, barriers=problem.barriers)
     endless = replace(
         parabola, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in cubic.states)
     )
-    with pytest.raises(ConfigurationError, match="beyond the states that are searched"):
+    with pytest.raises(ConfigurationError, match="beyond"):
         posterior_guarantee(endless, [BayesianSCBF(posterior, simultaneous=0.9)])
     # To leave a workspace ends an episode, so that h counts inside of it only: 1 - x_1 - x_2^2 is
     # largest at x_1 = -2.
@@ -177,12 +161,11 @@ def test_an_unbounded_set_has_none(cubic, posterior):
     ).supremum == pytest.approx(3.0, rel=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("identifications", [3, pytest.param(12, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize("identifications", [1, pytest.param(12, marks=pytest.mark.oracle)])
 def test_the_bound_is_below_what_happens(cubic, monkeypatch, identifications):
     """From one start, with identifications that know little; a shorter search finds less of the
     shortfall, and promises more."""
-    monkeypatch.setattr("safe_envs.proofs.safe_set._ROUNDS", (30, 10))
+    hurry(monkeypatch)
     envs, horizon, promised = 100, 0.5, []
     for seed in range(identifications):
         condition = BayesianSCBF(
@@ -220,7 +203,7 @@ def unstable(**options):
     )
 
 
-@pytest.mark.parametrize("identifications", [2, pytest.param(8, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize("identifications", [1, pytest.param(8, marks=pytest.mark.oracle)])
 def test_long_steps_bias_what_is_identified_and_are_allowed_for(identifications):
     """Data of .05 s that are integrated finely: the posterior is surer of the wrong rates than its
     probability says."""
@@ -245,7 +228,7 @@ def test_long_steps_bias_what_is_identified_and_are_allowed_for(identifications)
         found = posterior_guarantee(problem, [condition])
         covered += bool((robust <= truth).all())
         allowed += bool((robust - found.bias <= truth).all())
-        assert "steps of 0.05 s in the data may shift the rate of h by up to" in found.remark
+        assert "steps of 0.05 s in the data may shift the rate of h" in found.remark
     assert covered == 0
     assert allowed == identifications
     # dt/2 times h' L F + 1/2 h'' 2 J S, with F = 3 x + u, J = 3, L F = 3 F and h = 1 - x^2: largest
