@@ -8,6 +8,8 @@ import random
 from dataclasses import replace
 from fractions import Fraction
 
+import hypothesis
+import hypothesis.strategies as st
 import pytest
 import sympy as sp
 
@@ -17,8 +19,10 @@ from safe_envs.filters.certificates.checker import check
 from safe_envs.filters.certificates.files import checksum, load_certificate, save_certificate
 from safe_envs.filters.certificates.matching import difference, env_difference, plant_of
 from safe_envs.registry import make_problem
-from safe_envs.systems import CUSTOM_ID, ENV_IDS
+from safe_envs.systems import CUSTOM_ID
+from tests.conftest import EVERY_ENV
 from tests.filters.certificates.examples import TRUE, brownian, disk, in_line, with_plant, x
+from tests.filters.certificates.held_examples import scalar_certificate, with_numbers
 
 
 def saved(certificate, tmp_path):
@@ -37,12 +41,13 @@ def rewritten(path, change):
     return path
 
 
-@pytest.mark.parametrize("name", TRUE)
+@pytest.mark.parametrize("name", [*TRUE, "held input"])
 def test_a_file_states_what_was_written(name, tmp_path):
-    assert load_certificate(saved(TRUE[name], tmp_path)) == TRUE[name]
+    certificate = TRUE[name] if name in TRUE else scalar_certificate()
+    assert load_certificate(saved(certificate, tmp_path)) == certificate
 
 
-@pytest.mark.parametrize("env_id", [e for e in ENV_IDS if e != CUSTOM_ID])
+@pytest.mark.parametrize("env_id", [p for p in EVERY_ENV if p.values[0] != CUSTOM_ID])
 def test_the_system_of_each_env_is_written_exactly(env_id, tmp_path):
     plant = plant_of(make_problem(env_id))
     assert not any(e.atoms(sp.Float) for e in (*plant.drift, *plant.barriers))
@@ -60,8 +65,9 @@ def test_the_system_of_each_env_is_written_exactly(env_id, tmp_path):
     assert not difference(read.plant, plant_of(make_problem(env_id)))
 
 
-def test_each_changed_digit_is_found(tmp_path):
-    path = saved(disk(), tmp_path)
+@pytest.mark.parametrize("made", [disk, scalar_certificate])
+def test_each_changed_digit_is_found(made, tmp_path):
+    path = saved(made(), tmp_path)
     text = path.read_text()
     digits = [i for i, letter in enumerate(text) if letter.isdigit()]
     for i in digits:
@@ -91,23 +97,6 @@ def test_with_a_new_checksum_the_checker_finds_what_is_false(tmp_path):
     # What is true is checked, for it is another certificate.
     path = rewritten(saved(brownian(), tmp_path), lambda content: content.update(m="1.1"))
     assert check(load_certificate(path)).word == "checked"
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        ("0", "0"),
-        ("-1/4", "-0.25"),
-        ("1/3", "1/3"),
-        ("1/1000", "0.001"),
-        ("-12.5", "-12.5"),
-        ("2/7", "2/7"),
-        ("1200", "1200"),
-    ],
-)
-def test_numbers_are_exact(value, text):
-    assert number_text(Fraction(value)) == text
-    assert Fraction(text) == Fraction(value)
 
 
 @pytest.mark.parametrize(
@@ -156,10 +145,24 @@ def test_numbers_are_exact(value, text):
         ("env", {"id": 3, "options": {}}, "id = 3"),
         ("env", {"id": "", "options": {"a": "b" * 30_000}}, "characters of options"),
         ("psi", [], "psi"),
+        ("psi.center", ["0"], "a list of 2 numbers"),
+        ("psi.scale", ["1", "0"], "above 0"),
+        ("psi.coefficients", [], "coefficients"),
+        ("psi.coefficients", [[[0, 0], "1"], [[0, 0], "1"]], "no other"),
+        ("psi.coefficients", [[[0, 21], "1"]], "exponents"),
+        ("psi.coefficients", [[[0, True], "1"]], "exponents"),
+        ("psi.coefficients", [[[0, -1], "1"]], "exponents"),
+        ("psi.coefficients", [[[0], "1"]], "exponents"),
+        ("psi.coefficients", [[[0, 0], "nan"]], "a number"),
+        ("psi.coefficients", ["x"], "exponents"),
     ],
 )
 def test_malformed_parts_are_errors(key, value, message, tmp_path):
-    path = rewritten(saved(disk(), tmp_path), lambda content: content.update({key: value}))
+    def change(content):
+        part, _, name = key.rpartition(".")
+        (content[part] if part else content).update({name: value})
+
+    path = rewritten(saved(disk(), tmp_path), change)
     with pytest.raises(ConfigurationError, match=message) as error:
         load_certificate(path)
     assert "psi.json" in str(error.value)
@@ -167,32 +170,38 @@ def test_malformed_parts_are_errors(key, value, message, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("key", "value"),
     [
-        ("center", ["0"], "a list of 2 numbers"),
-        ("scale", ["1", "0"], "above 0"),
-        ("coefficients", [], "coefficients"),
-        ("coefficients", [[[0, 0], "1"], [[0, 0], "1"]], "which no other"),
-        ("coefficients", [[[0, 21], "1"]], "exponents"),
-        ("coefficients", [[[0, True], "1"]], "exponents"),
-        ("coefficients", [[[0, -1], "1"]], "exponents"),
-        ("coefficients", [[[0], "1"]], "exponents"),
-        ("coefficients", [[[0, 0], "nan"]], "a number"),
-        ("coefficients", ["x"], "a list of exponents"),
+        ("control", "continuous"),
+        ("control", None),
+        ("steps", 0),
+        ("steps", True),
+        ("steps", 10**12),
+        ("period", "0"),
+        ("sag", "-1"),
+        ("tail", 0.5),
+        ("m", "-1"),
+        ("inputs", [{"name": name, "low": "-1", "high": "1"} for name in ("v", "w")]),
     ],
 )
-def test_malformed_parts_of_psi_are_errors(key, value, message, tmp_path):
-    path = rewritten(saved(disk(), tmp_path), lambda content: content["psi"].update({key: value}))
-    with pytest.raises(ConfigurationError, match=message):
+def test_malformed_parts_of_held_input_are_errors(key, value, tmp_path):
+    path = rewritten(saved(scalar_certificate(), tmp_path), lambda c: c.update({key: value}))
+    with pytest.raises(ConfigurationError, match=r"psi\.json"):
         load_certificate(path)
 
 
-def test_a_large_polynomial_is_refused_before_it_takes_memory(tmp_path):
-    states = [{"name": f"x_{i}", "low": "0", "high": "1"} for i in range(12)]
-    large = {"states": states, "drift": ["0"] * 12, "barriers": ["1"], "policy": []}
-    large |= {"input_matrix": [["0"]] * 12, "diffusion": [["0"]] * 12}
-    large["psi"] = {"center": ["0"] * 12, "scale": ["1"] * 12, "coefficients": [[[20] * 12, "1"]]}
-    path = rewritten(saved(disk(), tmp_path), lambda content: content.update(large))
+@pytest.mark.parametrize(
+    ("made", "n", "degree"),
+    [(disk, 12, 20), (scalar_certificate, 4, 3)],
+    ids=["continuous time", "held input"],
+)
+def test_a_large_polynomial_is_refused_before_it_takes_memory(made, n, degree, tmp_path):
+    states = [{"name": f"x_{i}", "low": "0", "high": "1"} for i in range(n)]
+    large = {"states": states, "drift": ["0"] * n, "barriers": ["1"], "policy": []}
+    large |= {"input_matrix": [["0"]] * n, "diffusion": [["0"]] * n}
+    coefficients = [[[degree] * n, "1"]]
+    large["psi"] = {"center": ["0"] * n, "scale": ["1"] * n, "coefficients": coefficients}
+    path = rewritten(saved(made(), tmp_path), lambda content: content.update(large))
     with pytest.raises(ConfigurationError, match="lower degree"):
         load_certificate(path)
 
@@ -268,17 +277,21 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path):
     assert not path.exists()
 
 
+@hypothesis.given(st.fractions(-(10**6), 10**6, max_denominator=10**9))
+def test_numbers_are_written_exactly(value):
+    assert Fraction(number_text(value)) == value
+
+
 def test_texts_are_read_as_exact_numbers():
     a, b = sp.symbols("a b", real=True)
-    names = {"a": a, "b": b}
     for text, exact in (
         ("0.1*a + 1e-3", a / 10 + sp.Rational(1, 1000)),
-        ("-a**2/3 - b - (a - b)", -(a**2) / 3 - 2 * 0 * b - b - a + b),
+        ("-a**2/3 - b - (a - b)", -(a**2) / 3 - a),
         ("sqrt(a**2 + 3)*Max(a, b, 0)", sp.sqrt(a**2 + 3) * sp.Max(a, b, 0)),
         ("a - b - 2 + 3", a - b + 1),
         ("pi*.5", sp.pi / 2),
     ):
-        assert read_expression(text, names, "here") == exact
+        assert read_expression(text, {"a": a, "b": b}, "here") == exact
 
 
 def test_the_env_of_a_file_is_compared():
@@ -294,6 +307,11 @@ def test_the_env_of_a_file_is_compared():
         assert env_difference(replace(disk(), env_id=env_id)).word == "not compared"
     outside = replace(disk(), options={"system": "evil.py:run"})
     assert env_difference(outside).word == "not compared"
+    assert env_difference(scalar_certificate()).word == "same"
+    for options, told in (({"dt": 0.02}, "control period"), ({"substeps": 2}, "substeps")):
+        found = env_difference(with_numbers(options={"horizon": 0.5, **options}))
+        assert found.word == "differs"
+        assert told in found.text
 
 
 def test_angles_have_one_turn_and_other_unbounded_states_an_error():
