@@ -1,20 +1,33 @@
-"""Files of learned models and data: kept exactly, refused where they are not what was written."""
+"""Files of learned models and data: what was saved, or an error of ours, whoever wrote them."""
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import math
+import os
 import pickle
+import tempfile
+import zipfile
 from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
+import hypothesis
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.files import MOST_BYTES
 from safe_envs.filters.learning import load_learned
 from safe_envs.filters.learning.data import LearnedFileError, Signature, load, save
-from safe_envs.registry import make_problem
+from safe_envs.wrappers import SafetyFilter, parse_conditions
+from tests.conftest import problem_of
+from tests.test_bounded_reading import damaged_by
 
-DISK = make_problem("safe_envs/CubicSDEDisk-v0")
+DISK = problem_of("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)
 ARRAYS = {"weights": np.linspace(0.0, 1.0, 40).reshape(8, 5), "count": np.array(3)}
 DETAILS = {"degree": 3, "names": ["f", "g"], "scale": 0.1}
@@ -50,18 +63,10 @@ def test_what_is_saved_is_loaded(path):
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(content.arrays[name], array)
     content.signature.require(DISK, "barriers", "model", "dt")
-
-
-def test_the_order_in_memory_does_not_matter(path):
-    before = load(path).sha256
-    save(
-        path,
-        "regression",
-        SIGNATURE,
-        DETAILS,
-        {name: np.asfortranarray(array) for name, array in ARRAYS.items()},
-    )
-    assert load(path).sha256 == before
+    # The order in memory does not matter, and numbers of NumPy are numbers.
+    turned = {name: np.asfortranarray(array) for name, array in ARRAYS.items()}
+    save(path, "regression", SIGNATURE, {**DETAILS, "degree": np.int64(3)}, turned)
+    assert load(path).sha256 == content.sha256
 
 
 def test_the_checksum_is_of_everything(path):
@@ -84,85 +89,47 @@ def test_the_checksum_is_of_everything(path):
     assert len(known) == 7
 
 
-@pytest.mark.parametrize("left", [0.0, 0.1, 0.5, 0.9, 0.999])
-def test_a_truncated_file_is_refused(path, left):
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(left * len(whole))])
-    with pytest.raises(LearnedFileError, match="it is truncated or altered"):
-        load(path)
+def rewritten(path, **changes):
+    """Write the arrays of a file again, with others in their place, or without them."""
+    arrays = {**archived(path), **changes}
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
 
 
-def test_an_altered_byte_is_refused(path):
-    whole = path.read_bytes()
-    place = whole.index(ARRAYS["weights"].tobytes()) + 100
-    path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-    with pytest.raises(LearnedFileError, match="no file of `safe-envs identify`"):
-        load(path)
-
-
-def test_altered_arrays_under_the_old_header_are_refused(path):
-    arrays = archived(path)
-    weights = arrays["weights"].copy()
-    weights[3, 2] += 1e-12
-    for changed in (
-        {**arrays, "weights": weights},
-        {**arrays, "more": np.zeros(1)},
-        {k: v for k, v in arrays.items() if k != "count"},
-    ):
-        np.savez(path, **changed)
-        with pytest.raises(LearnedFileError, match="was altered"):
-            load(path)
+NPY = b"\x93NUMPY\x01\0" + np.lib.format.magic(1, 0)
+WEIGHTS = ARRAYS["weights"] + 1e-12 * (np.arange(40).reshape(8, 5) == 17)
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("change", "told"),
     [
-        {"kind": "network"},
-        {"details": {}},
-        {"sha256": "0" * 64},
-        {"signature": {**asdict(SIGNATURE), "system": "Scalar"}},
+        *(
+            (lambda p, left=left: p.write_bytes(p.read_bytes()[: int(left * 1700)]), "truncated")
+            for left in (0.0, 0.1, 0.5, 0.9)
+        ),
+        (lambda p: rewritten(p, weights=WEIGHTS), "was altered"),
+        (lambda p: rewritten(p, more=np.zeros(1)), "was altered"),
+        (lambda p: rewritten(p, count=None), "was altered"),
+        (lambda p: with_header(p, kind="network"), "was altered"),
+        (lambda p: with_header(p, details={}), "was altered"),
+        (lambda p: with_header(p, sha256="0" * 64), "was altered"),
+        (lambda p: with_header(p, signature={**asdict(SIGNATURE), "system": "S"}), "was altered"),
+        (lambda p: with_header(p, signature={}), "no file"),
+        (lambda p: with_header(p, signature={**asdict(SIGNATURE), "color": "red"}), "no file"),
+        (lambda p: with_header(p, signature=None), "no file"),
+        (lambda p: with_header(p, format=99), "format 99"),
+        (lambda p: p.unlink(), "does not exist"),
+        (lambda p: (p.unlink(), p.mkdir()), "is a folder"),
+        (lambda p: (p.unlink(), os.mkfifo(p)), "a pipe or a device"),
+        (lambda p: (p.unlink(), p.symlink_to("/dev/zero")), "a pipe or a device"),
+        (lambda p: p.write_bytes(b"weights: 1, 2, 3\n"), "no file"),
+        (lambda p: p.write_bytes(pickle.dumps({"weights": [1.0]})), "no file"),
+        (lambda p: p.write_bytes(NPY), "no file"),
+        (lambda p: np.savez(p, weights=np.zeros(3)), "no file"),
     ],
 )
-def test_an_altered_header_is_refused(path, changes):
-    with_header(path, **changes)
-    with pytest.raises(LearnedFileError, match="was altered"):
-        load(path)
-
-
-@pytest.mark.parametrize("signature", [{}, {**asdict(SIGNATURE), "color": "red"}, [1, 2], None])
-def test_a_header_without_a_signature_is_refused(path, signature):
-    with_header(path, signature=signature)
-    with pytest.raises(LearnedFileError, match="no file of `safe-envs identify`"):
-        load(path)
-
-
-def test_a_later_format_is_refused(path):
-    with_header(path, format=99)
-    with pytest.raises(LearnedFileError, match="has the format 99; this version reads 2"):
-        load(path)
-
-
-def test_a_missing_file_is_an_error(tmp_path):
-    with pytest.raises(LearnedFileError, match="does not exist"):
-        load(tmp_path / "none.npz")
-    with pytest.raises(LearnedFileError, match="is a folder; name a file in it"):
-        load(tmp_path)
-    with pytest.raises(LearnedFileError, match="path of a learned model is empty"):
-        load_learned("", DISK)
-
-
-def test_what_is_no_npz_is_refused(tmp_path):
-    path = tmp_path / "model.npz"
-    for content in (b"", b"weights: 1, 2, 3\n", pickle.dumps({"weights": [1.0]})):
-        path.write_bytes(content)
-        with pytest.raises(LearnedFileError, match="no file of `safe-envs identify`"):
-            load(path)
-    with path.open("wb") as stream:
-        np.save(stream, np.zeros(3))
-    with pytest.raises(LearnedFileError, match="no file of `safe-envs identify`"):
-        load(path)
-    np.savez(path, weights=np.zeros(3))
-    with pytest.raises(LearnedFileError, match="no file of `safe-envs identify`"):
+def test_what_was_altered_or_is_no_file_of_ours_is_refused(path, change, told):
+    change(path)
+    with pytest.raises(LearnedFileError, match=told):
         load(path)
 
 
@@ -193,55 +160,54 @@ def test_nothing_is_unpickled(path, name):
     Trap.sprung = False
 
 
-def test_objects_are_not_saved(path):
+@pytest.mark.parametrize(
+    ("details", "arrays", "error"),
+    [
+        ({}, {"weights": np.array([Trap()], dtype=object)}, ValueError),
+        ({"degree": object()}, ARRAYS, TypeError),
+        ({}, {"weights": np.broadcast_to(0.0, MOST_BYTES // 8 + 1)}, ConfigurationError),
+    ],
+)
+def test_what_could_not_be_loaded_is_not_saved(path, details, arrays, error):
     whole = path.read_bytes()
-    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
-        save(path, "regression", SIGNATURE, {}, {"weights": np.array([Trap()], dtype=object)})
+    with pytest.raises(error):
+        save(path, "regression", SIGNATURE, details, arrays)
     assert path.read_bytes() == whole
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_folder_that_does_not_exist_is_an_error(tmp_path):
     with pytest.raises(ConfigurationError, match="does not exist"):
-        save(tmp_path / "none" / "model.npz", "regression", SIGNATURE, {}, ARRAYS)
+        save(path.parent / "none" / "model.npz", "regression", SIGNATURE, {}, ARRAYS)
 
 
-def test_another_system_is_refused():
-    with pytest.raises(
-        LearnedFileError, match="its system: CubicSDEDisk, that of Scalar: Scalar; learn again"
-    ):
-        SIGNATURE.require(make_problem("safe_envs/Scalar-v0"))
+@pytest.mark.parametrize(
+    ("env_id", "options", "named"),
+    [
+        ("Scalar-v0", {}, "system"),
+        ("CubicSDEDisk-v0", {"dt": 0.02}, "dt"),
+        ("CubicSDEDisk-v0", {"noise": 0.5}, "model"),
+        ("CubicSDEDisk-v0", {"barrier": {"radius": 0.5}}, "barriers"),
+    ],
+)
+def test_what_has_to_fit_is_named(env_id, options, named):
+    problem, parts = problem_of(f"safe_envs/{env_id}", **options), {"dt", "model", "barriers"}
+    with pytest.raises(LearnedFileError, match=f"its {named}"):
+        SIGNATURE.require(problem, named)
+    if named in parts:
+        SIGNATURE.require(problem, *(parts - {named}))
     with pytest.raises(LearnedFileError, match="its state units"):
         replace(SIGNATURE, state_units=("m", "m")).require(DISK)
-
-
-def test_what_else_has_to_fit():
-    slower = make_problem("safe_envs/CubicSDEDisk-v0", dt=0.02)
-    SIGNATURE.require(slower, "barriers", "model")
-    with pytest.raises(LearnedFileError, match=r"its dt: 0\.01, that of CubicSDEDisk: 0\.02"):
-        SIGNATURE.require(slower, "dt")
-    noisier = make_problem("safe_envs/CubicSDEDisk-v0", noise=0.5)
-    SIGNATURE.require(noisier, "barriers", "dt")
-    with pytest.raises(LearnedFileError, match="its model"):
-        SIGNATURE.require(noisier, "model")
-    smaller = make_problem("safe_envs/CubicSDEDisk-v0", barrier={"radius": 0.5})
-    SIGNATURE.require(smaller, "model", "dt")
-    with pytest.raises(LearnedFileError, match="its barriers"):
-        SIGNATURE.require(smaller, "barriers")
 
 
 def test_data_are_no_model(tmp_path):
     save(tmp_path / "data.npz", "transitions", SIGNATURE, DETAILS, ARRAYS)
     for method in (None, "bayesian"):
-        with pytest.raises(
-            LearnedFileError,
-            match=r"data\.npz holds transitions \(data\), no model; `safe-envs identify --data",
-        ):
+        with pytest.raises(LearnedFileError, match=r"data\.npz holds transitions"):
             load_learned(tmp_path / "data.npz", DISK, method)
+    with pytest.raises(LearnedFileError, match="empty"):
+        load_learned("", DISK)
 
 
 def test_the_plant_is_kept_and_compared_but_not_required(tmp_path):
-    other = make_problem("safe_envs/CubicSDEDisk-v0", plant={"a": 0.8})
+    other = problem_of("safe_envs/CubicSDEDisk-v0", plant={"a": 0.8})
     signature = Signature.of(other)
     signature.require(DISK, "model", "barriers", "dt")
     save(tmp_path / "model.npz", "regression", signature, DETAILS, ARRAYS)
@@ -251,8 +217,225 @@ def test_the_plant_is_kept_and_compared_but_not_required(tmp_path):
     assert kept.differences(other) == replace(kept, plant=()).differences(DISK) == ()
 
 
-def test_numbers_of_numpy_are_kept_as_such(path):
-    save(path, "regression", SIGNATURE, {"degree": np.int64(3), "scale": np.float64(0.1)}, ARRAYS)
-    assert load(path).details == {"degree": 3, "scale": 0.1}
-    with pytest.raises(TypeError, match="no JSON"):
-        save(path, "regression", SIGNATURE, {"degree": object()}, ARRAYS)
+# Written to do harm.
+
+
+json_values = st.sampled_from(
+    [
+        None,
+        True,
+        0,
+        1,
+        -1,
+        2,
+        3.5,
+        1e300,
+        1e-300,
+        10**400,
+        10**9,
+        "",
+        "x",
+        [],
+        [1],
+        {},
+        {"a": 1},
+        [[1, 2]],
+    ]
+)
+numbers = st.sampled_from([0.0, -1.0, 5.0, 1e50, -1e99, 1e300, 1e-300, math.nan, math.inf])
+
+
+def archive_of(arrays: dict[str, Any]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def loaded(content: bytes) -> Any:
+    """What is loaded of a file with a content; None where it is refused."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.npz"
+        path.write_bytes(content)
+        try:
+            return load(path)
+        except LearnedFileError:
+            return None
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> bytes:
+    path = tmp_path_factory.mktemp("learned") / "model.npz"
+    save(path, "regression", SIGNATURE, DETAILS, ARRAYS)
+    return path.read_bytes()
+
+
+@hypothesis.settings(max_examples=50)
+@hypothesis.given(st.data())
+def test_a_damaged_file_is_the_same_or_refused(whole, data):
+    content = loaded(damaged_by(data, whole))
+    if content is not None:
+        found = (content.kind, content.signature, content.details)
+        assert found == ("regression", SIGNATURE, DETAILS)
+        assert all(np.array_equal(content.arrays[name], array) for name, array in ARRAYS.items())
+
+
+@pytest.mark.parametrize("part", ["header", "weights"])
+def test_a_bomb_is_not_unpacked(tmp_path, whole, part):
+    arrays = dict(np.load(io.BytesIO(whole)))
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.save(content, np.zeros(10**7, dtype=np.uint8) if name == part else array)
+            archive.writestr(f"{name}.npy", content.getvalue())
+    assert len(stream.getvalue()) < 20_000
+    (tmp_path / "bomb.npz").write_bytes(stream.getvalue())
+    with pytest.raises(LearnedFileError, match=r"truncated or altered \(ValueError\)"):
+        load(tmp_path / "bomb.npz")
+
+
+@pytest.mark.parametrize(
+    "shape", ["(10000000000,)", "(1000000000000000000,)", "(-1,)", "(3,)", f"({'1,' * 200})"]
+)
+def test_an_array_is_as_large_as_its_header_says(whole, shape):
+    content = io.BytesIO()
+    header = (
+        f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(500).encode()
+        + b"\n"
+    )
+    content.write(b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + bytes(32))
+    stream = io.BytesIO(whole)
+    with zipfile.ZipFile(stream, "a") as archive:
+        archive.writestr("more.npy", content.getvalue())
+    assert loaded(stream.getvalue()) is None
+
+
+def places(document: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Of all that a JSON document holds."""
+    inner = (
+        document.items()
+        if isinstance(document, dict)
+        else enumerate(document)
+        if isinstance(document, list)
+        else ()
+    )
+    return [place, *(found for key, value in inner for found in places(value, (*place, key)))]
+
+
+def changed(data: st.DataObject, document: Any) -> Any:
+    """The document with another value in one place, or without it."""
+    place, value = data.draw(st.sampled_from(places(document))), data.draw(json_values)
+    if not place:
+        return value
+    inner = document
+    for key in place[:-1]:
+        inner = inner[key]
+    if data.draw(st.booleans()):
+        inner[place[-1]] = value
+    else:
+        del inner[place[-1]]
+    return document
+
+
+def altered(data: st.DataObject, arrays: dict[str, np.ndarray]) -> None:
+    """Another number in an array, another shape, or another kind of numbers."""
+    name = data.draw(st.sampled_from(sorted(arrays)))
+    array = arrays[name].astype(float)
+    way = data.draw(st.sampled_from(["entry", "entry", "all", "axis", "empty", "kind", "none"]))
+    if way == "entry" and array.size:
+        array.flat[data.draw(st.integers(0, array.size - 1))] = data.draw(numbers)
+    elif way == "all":
+        array[...] = data.draw(numbers)
+    elif way == "none":
+        del arrays[name]
+        return
+    arrays[name] = {"axis": array[None], "empty": array[:0], "kind": array > 0}.get(way, array)
+
+
+def write(path: Path, model, document: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Write a file with any content under the right checksum."""
+    parts = [model.method, document["signature"], document["details"]]
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(
+            f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode() + arrays[name].tobytes()
+        )
+    header = {
+        "format": 2,
+        "kind": model.method,
+        **document,
+        "versions": {},
+        "sha256": digest.hexdigest(),
+    }
+    path.write_bytes(
+        archive_of({**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+    )
+
+
+def document_of(model) -> dict[str, Any]:
+    return json.loads(
+        json.dumps({"details": model._saved(), "signature": asdict(model.signature)}, default=float)
+    )
+
+
+LEARNED = pytest.mark.parametrize(
+    ("what", "env", "filter_name"),
+    [
+        ("residual", "disk", "learned-hocbf"),
+        ("network", "top", "ddscbf"),
+        ("diffusion", "gap", "ddscbf"),
+        ("posterior", "cubic", "bayesian-scbf"),
+    ],
+)
+
+
+@LEARNED
+def test_each_model_is_saved_as_it_is_and_loaded_again(request, tmp_path, what, env, filter_name):
+    model, problem = (request.getfixturevalue(name) for name in (what, env))
+    model.save(tmp_path / "saved.npz")
+    write(tmp_path / "written.npz", model, document_of(model), model.arrays())
+    for name in ("saved", "written"):
+        again = load_learned(tmp_path / f"{name}.npz", problem)
+        assert again.sha256 == model.sha256
+        assert again.record == model.record
+        for part, array in model.arrays().items():
+            np.testing.assert_array_equal(again.arrays()[part], array)
+    with pytest.raises(LearnedFileError, match="another problem"):
+        load_learned(tmp_path / "saved.npz", problem_of("safe_envs/Scalar-v0"))
+
+
+@hypothesis.settings(
+    max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+)
+@hypothesis.given(data=st.data())
+@LEARNED
+def test_wrong_content_is_refused_or_gives_actions(request, tmp_path, what, env, filter_name, data):
+    model, problem = request.getfixturevalue(what), request.getfixturevalue(env)
+    document, arrays = document_of(model), dict(model.arrays())
+    if data.draw(st.booleans()):
+        document = changed(data, document)
+    else:
+        altered(data, arrays)
+    hypothesis.assume(isinstance(document, dict) and {"details", "signature"} <= set(document))
+    write(tmp_path / "model.npz", model, document, arrays)
+    message, action = "", np.zeros(1)
+    try:
+        found = load_learned(tmp_path / "model.npz", problem)
+        conditions = parse_conditions(filter_name, problem, {found.method: found})
+        action = (
+            SafetyFilter.for_problem(problem, conditions)
+            .filter(np.full(problem.plant.n, 0.1), np.zeros(problem.plant.m))
+            .action
+        )
+    except SafeEnvsError as error:
+        message = str(error)
+    assert len(message) < 2000
+    assert np.isfinite(action).all()
+
+
+@pytest.mark.parametrize("degrees", [[3], [0], [10**9], ["2"], [2, 2], None])
+def test_degrees_are_those_of_the_barriers(tmp_path, disk, residual, degrees):
+    details = {**residual._saved(), "degrees": degrees}
+    save(tmp_path / "model.npz", residual.method, residual.signature, details, residual.arrays())
+    with pytest.raises(LearnedFileError, match="the degrees"):
+        load_learned(tmp_path / "model.npz", disk)
