@@ -1,9 +1,10 @@
-"""The estimates against their sampling laws; tolerances are five standard deviations of the
-statistic that is compared."""
+"""Estimates of the noise's part of a rate against their sampling laws, and the checks of a drift.
+
+Tolerances are five standard deviations of the statistic that is compared.
+"""
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +17,11 @@ from safe_envs.filters.learning.collection import collect
 from safe_envs.filters.learning.drift_checks import (
     drift_score,
     drift_warnings,
-    in_bulk,
     ito_part,
     mean_rates,
     rates,
     region_warnings,
 )
-from safe_envs.filters.learning.models.network import Network
 from tests.conftest import problem_of
 
 K = 200
@@ -121,26 +120,12 @@ def test_printed_averages_the_successors_alone(pendulum, data):
     np.testing.assert_allclose(estimated(pendulum, still, "printed").values, bias, atol=1e-12)
 
 
-def test_a_single_successor_gives_no_standard_error(pendulum):
+def test_what_there_is_no_estimate_of(pendulum, data):
     found = estimated(pendulum, collect(pendulum, 50, seed=0), "martingale")
     assert found.deviations is None
     assert found.values.shape == (100,)
-
-
-def test_parts_do_not_matter(pendulum, data):
-    some = replace(
-        data, x=data.x[300:], u=data.u[300:], successors=data.successors[300:], dt=data.dt[300:]
-    )
-    whole, part = (estimated(pendulum, d, "martingale").values for d in (data, some))
-    np.testing.assert_array_equal(whole[300:], part)
-
-
-def test_functions_that_are_constant_have_no_ito_part(data):
-    found = ito_part(data, np.zeros_like(data.x), lambda x: 2.0, lambda x: (0.0, 0.0))
-    assert (found.values == 0).all()
-
-
-def test_unknown_estimators_are_refused(pendulum, data):
+    constant = ito_part(data, np.zeros_like(data.x), lambda x: 2.0, lambda x: (0.0, 0.0))
+    assert (constant.values == 0).all()
     with pytest.raises(ConfigurationError, match="printed, centred, martingale"):
         estimated(pendulum, data, "median")
 
@@ -151,24 +136,6 @@ def test_a_wrong_drift_is_told(pendulum, data):
     assert not warned(right, data)
     (warning,) = warned(wrong, data)
     assert "standard errors away" in warning
-
-
-def test_bulk_evaluation_of_a_network_is_the_network():
-    rng = np.random.default_rng(0)
-    sizes = (2, 100, 30, 1)
-    weights = tuple(rng.normal(size=(b, a)) / np.sqrt(a) for a, b in itertools.pairwise(sizes))
-    biases = tuple(rng.normal(size=len(w)) for w in weights)
-    network = Network(
-        weights,
-        biases,
-        "tanh",
-        np.array([3.0, -1.0]),
-        np.array([2.0, 0.5]),
-        np.array([10.0]),
-        np.array([50.0]),
-    )
-    x = [3 + 2 * rng.normal(size=10_001), -1 + 0.5 * rng.normal(size=10_001)]
-    np.testing.assert_allclose(in_bulk(network, x), network.arrays(x)[0], atol=1e-5 * 50)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])

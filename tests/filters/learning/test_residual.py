@@ -1,3 +1,5 @@
+"""Residuals of derivatives: their labels, what is learned of them, and how well it is known."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -8,16 +10,15 @@ import pytest
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import lie_derivative_f, lie_derivative_g
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters.learning import load_learned
 from safe_envs.filters.learning.collection import collect_paths, draw_states, plant_step
-from safe_envs.filters.learning.data import LearnedFileError, load
+from safe_envs.filters.learning.data import LearnedFileError, load, save
 from safe_envs.filters.learning.models.base import Record
 from safe_envs.filters.learning.models.residual import ResidualModel
 from safe_envs.filters.learning.residual import learn_residual, residual_labels
 from safe_envs.problem.problem import Barrier
 from safe_envs.problem.starts import SamplingDomain
 from tests.conftest import problem_of
-
-pytestmark = pytest.mark.slow
 
 _DT = 1e-3
 _SMALL = {"states": 300, "hidden": (20,), "epochs": 20}
@@ -44,10 +45,12 @@ def exact_residuals(problem, barrier, degree, x):
 
 @pytest.fixture(scope="module")
 def learned(disk):
-    return learn_residual(disk, states=2000, epochs=200)
+    return learn_residual(disk, states=2000, epochs=120)
 
 
-@pytest.mark.parametrize("name", ["DubinsDisk", "DubinsObstacle", "QuadrotorAltitude", "Quadrotor"])
+@pytest.mark.parametrize(
+    "name", ["DubinsDisk", "QuadrotorAltitude", pytest.param("Quadrotor", marks=pytest.mark.oracle)]
+)
 def test_the_labels_are_the_exact_residuals(name):
     problem = problem_of(f"safe_envs/{name}-v0")
     x = draw_states(problem, 300, np.random.default_rng(1))
@@ -121,7 +124,6 @@ def test_the_printed_central_difference_gives_half_of_the_gain(disk):
     assert np.polyfit(gain, model_gain + labels[:, 2], 1)[0] == pytest.approx(1.0, abs=1e-6)
 
 
-@pytest.mark.slow
 def test_the_residuals_are_learned(disk, learned):
     x = draw_states(disk, 1000, np.random.default_rng(77))
     compared = learned.compare(disk, x)
@@ -144,15 +146,9 @@ def test_the_quantiles_cover_fresh_states(disk, learned):
 
 def test_the_record_says_how_it_was_learned(learned):
     record = learned.record
-    assert record.transitions == 2000 * 2 * 4
-    assert record.observed == pytest.approx(16.0)
-    assert 0 < record.seconds < 60
-    assert record.settings == {"states": 2000, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 200}
-    assert set(record.errors) == {
-        f"h {name} {kind}"
-        for name in ("Delta_1", "Delta_2", "Sigma_omega")
-        for kind in ("rms", "q95")
-    }
+    assert (record.transitions, record.observed) == (2000 * 2 * 4, pytest.approx(16.0))
+    settings = {"states": 2000, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 120}
+    assert record.settings == settings
     assert record.errors["h Sigma_omega q95"] == learned.parts[0].eps(0.95)[2]
 
 
@@ -169,20 +165,6 @@ def test_floats_and_arrays_agree_and_the_symbols_are_its_own(disk, learned):
     assert all(s.is_real for s in part.symbols)
 
 
-def test_a_saved_model_is_the_same_again(tmp_path, disk, learned):
-    path = tmp_path / "residual.npz"
-    learned.save(path)
-    again = ResidualModel.from_content(load(path), disk)
-    assert again.sha256 == learned.sha256
-    assert again.record == learned.record
-    x = draw_states(disk, 100, np.random.default_rng(5))
-    for (_, mine), (_, other) in zip(
-        learned.compare(disk, x).values(), again.compare(disk, x).values(), strict=True
-    ):
-        assert np.array_equal(mine, other)
-    assert np.array_equal(learned.parts[0].eps(0.5), again.parts[0].eps(0.5))
-
-
 def test_a_model_of_something_else_is_refused(tmp_path, disk, learned):
     path = tmp_path / "residual.npz"
     learned.save(path)
@@ -190,7 +172,6 @@ def test_a_model_of_something_else_is_refused(tmp_path, disk, learned):
     others = (
         disk.configured(model={"v": 0.6}),
         problem_of("safe_envs/DubinsDisk-v0", barrier={"radius": 2.0}),
-        problem_of("safe_envs/QuadrotorAltitude-v0"),
         replace(disk, sampling=replace(disk.sampling_domain, coordinates=disk.plant.states)),
     )
     for other in others:
@@ -198,6 +179,17 @@ def test_a_model_of_something_else_is_refused(tmp_path, disk, learned):
             ResidualModel.from_content(content, other)
     # The plant may be another one: what was learned is asked for its error there.
     ResidualModel.from_content(content, disk.configured(plant={"v": 0.9}))
+    details = content.details
+    for degrees in ([3], [0], [10**9], ["2"], [2, 2], None):
+        save(
+            path,
+            "learned-hocbf",
+            learned.signature,
+            details | {"degrees": degrees},
+            learned.arrays(),
+        )
+        with pytest.raises(LearnedFileError, match="the degrees"):
+            load_learned(path, disk)
     with pytest.raises(LearnedFileError, match="incomplete"):
         ResidualModel.from_content(replace(content, arrays={}), disk)
     with pytest.raises(LearnedFileError, match="incomplete"):
@@ -221,7 +213,7 @@ def test_a_step_of_ones_own_takes_the_place_of_the_plant(disk):
     np.testing.assert_allclose(found, exact_residuals(faster, disk.barriers[0], 2, x), atol=1e-5)
 
 
-def test_progress_is_told_to_the_end_over_all_barriers(disk):
+def test_each_barrier_has_its_residuals(disk):
     twice = replace(
         disk,
         barriers=(disk.barriers[0], Barrier(2 * disk.barriers[0].expression, "twice")),
@@ -237,50 +229,43 @@ def test_progress_is_told_to_the_end_over_all_barriers(disk):
     assert np.array_equal(again.parts[1].heldout, model.parts[1].heldout)
 
 
-def test_a_noisy_plant_is_refused(disk):
-    noisy = disk.configured(noise=0.1)
-    with pytest.raises(ConfigurationError, match="noise=0, or use ddscbf or bayesian-scbf"):
-        learn_residual(noisy, **_SMALL)
-    with pytest.raises(ConfigurationError, match="noise of the plant"):
-        learn_residual(noisy, **_SMALL, step=plant_step(noisy, _DT))
-
-
-def test_inputs_that_tell_nothing_apart_are_refused(disk):
-    quadrotor = problem_of("safe_envs/Quadrotor-v0")
-    four = quadrotor.sampling_domain.inputs[:4]
-    for problem, inputs in ((disk, ((1.0,),)), (disk, ((1.0,), (1.0,))), (quadrotor, four)):
-        poor = replace(
-            problem,
-            sampling=SamplingDomain(
-                problem.sampling_domain.region, inputs, problem.sampling_domain.coordinates
-            ),
-        )
-        with pytest.raises(ConfigurationError, match="apart"):
-            learn_residual(poor, **_SMALL)
-
-
-def test_a_plant_of_smaller_relative_degree_is_refused(disk):
-    drifting = replace(disk, plant=replace(disk.plant, input_matrix=[0.1, 0, 1]))
-    with pytest.raises(ConfigurationError, match="derivative 1 of barrier h"):
-        learn_residual(drifting, **_SMALL)
+QUADROTOR = problem_of("safe_envs/Quadrotor-v0")
+ONE = ((1.0,),)
 
 
 @pytest.mark.parametrize(
-    "setting",
+    ("changes", "setting", "told"),
     [
-        {"states": 5},
-        {"epochs": 0},
-        {"label_dt": 0.0},
-        {"label_dt": np.nan},
-        {"label_dt": 1e-300},
-        {"label_dt": 6.0},
-        {"hidden": 100},
-        {"seed": -1},
+        ({}, {"states": 5}, "states = 5"),
+        ({}, {"epochs": 0}, "epochs = 0"),
+        ({}, {"label_dt": 0.0}, "label_dt"),
+        ({}, {"label_dt": np.nan}, "label_dt"),
+        ({}, {"label_dt": 1e-300}, "label_dt"),
+        ({}, {"label_dt": 6.0}, "label_dt"),
+        ({}, {"hidden": 100}, "hidden"),
+        ({}, {"seed": -1}, "seed"),
+        ({"noise": 0.1}, {}, "noise=0"),
+        ({"inputs": ONE}, {}, "apart"),
+        ({"inputs": ONE * 2}, {}, "apart"),
+        ({"problem": QUADROTOR, "inputs": QUADROTOR.sampling_domain.inputs[:4]}, {}, "apart"),
+        ({"input_matrix": [0.1, 0, 1]}, {}, "derivative 1 of barrier h"),
     ],
 )
-def test_bad_settings_are_refused(disk, setting):
-    with pytest.raises(ConfigurationError):
-        learn_residual(disk, **{**_SMALL, **setting})
+def test_what_cannot_be_learned_is_refused(disk, changes, setting, told):
+    problem = changes.get("problem", disk)
+    if "noise" in changes:
+        problem = problem.configured(noise=changes["noise"])
+        with pytest.raises(ConfigurationError, match="noise of the plant"):
+            learn_residual(problem, **_SMALL, step=plant_step(problem, _DT))
+    if "inputs" in changes:
+        domain = problem.sampling_domain
+        domain = SamplingDomain(domain.region, changes["inputs"], domain.coordinates)
+        problem = replace(problem, sampling=domain)
+    if "input_matrix" in changes:
+        plant = replace(problem.plant, input_matrix=changes["input_matrix"])
+        problem = replace(problem, plant=plant)
+    with pytest.raises(ConfigurationError, match=told):
+        learn_residual(problem, **{**_SMALL, **setting})
 
 
 def test_the_level_is_that_of_split_conformal_prediction(learned):
@@ -288,12 +273,7 @@ def test_the_level_is_that_of_split_conformal_prediction(learned):
     np.testing.assert_array_equal(part.eps(0.95), [19.0, 38.0, 57.0])
     np.testing.assert_array_equal(part.eps(0.9), [18.0, 36.0, 54.0])
     np.testing.assert_array_equal(part.eps(0.01), part.eps(0.0))
-    with pytest.raises(
-        ConfigurationError,
-        match=(
-            r"0\.99 is more than 19 .* about 534 more states, of which 80 .* a level up to 0\.95$"
-        ),
-    ):
+    with pytest.raises(ConfigurationError, match=r"0\.99 is more than 19 .* 534 more .* 0\.95$"):
         part.eps(0.99)
     with pytest.raises(ConfigurationError, match=r"up to 0\.95: no number of states"):
         part.eps(1.0)
@@ -313,11 +293,3 @@ def test_the_quantile_covers_a_fresh_error_as_often_as_it_says(learned):
 def test_a_plant_of_somebody_else_is_not_known(disk, learned):
     assert learned.signature.differences(disk.configured(plant={"v": 0.5})) != ()
     assert learn_residual(disk, **_SMALL, step=plant_step(disk, _DT)).signature.plant == ()
-
-
-def test_settings_of_numpy_are_kept(tmp_path, disk):
-    model = learn_residual(
-        disk, states=np.int64(60), hidden=(np.int64(4),), epochs=np.int64(2), seed=np.int64(1)
-    )
-    model.save(tmp_path / "model.npz")
-    assert ResidualModel.from_content(load(tmp_path / "model.npz"), disk).sha256 == model.sha256
