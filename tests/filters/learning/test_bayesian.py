@@ -24,8 +24,6 @@ from safe_envs.systems.acc_gap import acc_gap
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.dubins import dubins_disk
 
-pytestmark = pytest.mark.slow
-
 CUBIC = cubic_sde_disk()
 PLACES = np.array([[0.0, 0.0], [0.5, -0.3], [-0.6, 0.6]])
 FLAT = Prior(1e4, 1.0, 1.0)
@@ -77,7 +75,6 @@ def test_the_paired_form_of_the_thesis_is_the_same_posterior():
     assert abs(found.covariance[:, :count, count:]).max() < 1e-10
 
 
-@pytest.mark.slow
 def test_credible_intervals_cover_and_those_of_the_print_do_not():
     covered, printed, level = [], [], norm.ppf(0.95)
     phi = np.hstack((Features.of(CUBIC, 3).matrix(PLACES), np.zeros((3, 10))))
@@ -146,14 +143,8 @@ def test_a_log_without_repetitions():
     assert (abs(estimate - PLACES[:, 0] ** 3) < 4 * doubt).all()
 
 
-def test_too_short_a_log():
-    x = draw_states(CUBIC, 8, np.random.default_rng(0))
-    with pytest.raises(ConfigurationError, match="nothing of the noise"):
-        identify(
-            CUBIC,
-            data=Transitions.from_log(CUBIC, x, np.linspace(-1, 1, 8)[:, None], x + 0.01, 0.01),
-            degree=2,
-        )
+EIGHT = draw_states(CUBIC, 8, np.random.default_rng(0))
+SHORT = Transitions.from_log(CUBIC, EIGHT, np.linspace(-1, 1, 8)[:, None], EIGHT + 0.01, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +186,6 @@ def test_the_truth_is_within_what_is_known(cubic: Posterior):
     assert pairs["covariance[x_1, x_1]"][0] == pytest.approx(0.04)
 
 
-@pytest.mark.slow
 def test_variances_of_the_drift_are_those_of_draws(gap: Posterior):
     x = draw_states(acc_gap(), 3, np.random.default_rng(0))
     variance = gap.drift_variance(x)
@@ -273,23 +263,16 @@ def test_noise_that_drives_two_states_together():
     )
 
 
-def test_saved_and_loaded(cubic: Posterior, tmp_path: Path):
-    cubic.save(tmp_path / "file")
-    content = load(tmp_path / "file")
-    again = Posterior.from_content(content, CUBIC)
-    assert content.kind == "bayesian"
-    assert again.sha256 == cubic.sha256
-    assert again.record == cubic.record
-    assert again.system == cubic.system
-    for name, array in cubic.arrays().items():
-        assert np.array_equal(array, again.arrays()[name]), name
-    with pytest.raises(LearnedFileError, match="another problem"):
-        Posterior.from_content(content, acc_gap())
-
-
-def test_data_of_another_problem_are_refused():
-    with pytest.raises(LearnedFileError, match="another problem"):
-        identify(CUBIC, data=collect(dubins_disk(), 5, 2))
+@pytest.mark.parametrize(
+    ("arguments", "error", "told"),
+    [
+        ({"data": collect(dubins_disk(), 5, 2)}, LearnedFileError, "another problem"),
+        ({"data": SHORT, "degree": 2}, ConfigurationError, "nothing of the noise"),
+    ],
+)
+def test_what_cannot_be_identified_is_refused(arguments, error, told):
+    with pytest.raises(error, match=told):
+        identify(CUBIC, **arguments)
 
 
 def test_the_degree_fits_the_data(cubic: Posterior):
@@ -299,15 +282,13 @@ def test_the_degree_fits_the_data(cubic: Posterior):
     assert identify(obstacles, starts=100, steps=1, repetitions=2).record.settings["degree"] == 1
 
 
-def test_the_record_and_the_progress():
+def test_the_same_seed_identifies_the_same():
     parts: list[float] = []
-    found = identify(
-        CUBIC, starts=20, steps=2, repetitions=3, seed=4, prior=1e4, progress=parts.append
-    )
+    settings = {"starts": 20, "steps": 2, "repetitions": 3, "seed": 4, "prior": 1e4}
+    found = identify(CUBIC, **settings, progress=parts.append)
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
     assert (found.record.transitions, found.record.seed) == (240, 4)
     assert found.record.observed == pytest.approx(2.4)
     assert found.signature == Signature.of(CUBIC)
-    same = identify(CUBIC, starts=20, steps=2, repetitions=3, seed=4, prior=1e4)
-    assert np.array_equal(found.mean, same.mean)
+    assert np.array_equal(found.mean, identify(CUBIC, **settings).mean)

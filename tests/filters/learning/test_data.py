@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -13,6 +14,7 @@ import sympy as sp
 
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.filters.learning import collection as module
+from safe_envs.filters.learning.checks import Purpose, random_stream
 from safe_envs.filters.learning.collection import (
     collect,
     collect_paths,
@@ -510,3 +512,33 @@ def test_what_data_are_of_is_checked(call, error, told):
     logged().require(DISK)
     with pytest.raises(error, match=told):
         call()
+
+
+# Their randomness.
+
+_SEED = 7
+
+
+def first_draws(rng):
+    return tuple(rng.integers(2**63, size=4).tolist())
+
+
+def test_no_two_uses_of_a_seed_share_their_randomness():
+    """Among them those that NumPy makes the same: a seed, the same with a 0 behind it, and the
+    children of either."""
+    found = {"plain": np.random.default_rng(_SEED)}
+    found |= {
+        f"child {i}": np.random.default_rng(child)
+        for i, child in enumerate(np.random.SeedSequence(_SEED).spawn(3))
+    }
+    found |= {f"small {i}": np.random.default_rng([_SEED, i]) for i in range(1, 10)}
+    for purpose in Purpose:
+        found[purpose.name] = random_stream(_SEED, purpose)
+        found |= {
+            f"{purpose.name} {i}": child
+            for i, child in enumerate(random_stream(_SEED, purpose).spawn(2))
+        }
+    draws = {name: first_draws(rng) for name, rng in found.items()}
+    for one, other in itertools.combinations(draws, 2):
+        assert draws[one] != draws[other], (one, other)
+    assert first_draws(random_stream(np.int64(_SEED), Purpose.DATA)) == draws["DATA"]
