@@ -528,8 +528,8 @@ def unknown(node: ast.AST) -> NoReturn:
     raise NotCompilableError(f"{ast.unparse(node)[:80]!r} has no form in C")
 
 
-class Operators:
-    """Translates the expressions of one function, but for calls.
+class Expressions:
+    """Translates the expressions of one function.
 
     Args:
         program: that the function belongs to.
@@ -730,6 +730,10 @@ class Operators:
         return Text(code, kind, CHOICE)
 
     def _Subscript(self, node: ast.Subscript) -> Text:  # noqa: N802
+        floats = node.value
+        if isinstance(floats, ast.Name) and self.kinds.get(floats.id) == FLOATS:
+            code = f"{self.text(floats).code}.at[{self.text(node.slice).code}]"
+            return Text(f"({self._program.precision.type}){code}", REAL, UNARY)
         constant = self._program.data_entry(node)
         if constant is not None:
             return Text(constant, REAL, UNARY if constant.startswith("-") else 16)
@@ -766,17 +770,6 @@ class Operators:
         name = self._fresh()
         self.before.append(f"const {self._program.precision.type} {name}[] = {{{inner}}};")
         return Text(f"(numbers){{{name}, {len(node.elts)}}}", NUMBERS)
-
-
-class Expressions(Operators):
-    """Translates the expressions of one function."""
-
-    def _Subscript(self, node: ast.Subscript) -> Text:  # noqa: N802
-        whole = node.value
-        if not (isinstance(whole, ast.Name) and self.kinds.get(whole.id) == FLOATS):
-            return super()._Subscript(node)
-        code = f"{self.text(whole).code}.at[{self.text(node.slice).code}]"
-        return Text(f"({self._program.precision.type}){code}", REAL, UNARY)
 
     def _Call(self, node: ast.Call) -> Text:  # noqa: N802
         if not isinstance(node.func, ast.Name) or node.keywords:

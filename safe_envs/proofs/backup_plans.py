@@ -64,6 +64,9 @@ def closed_part(
 
 _FLAVOURS: tuple[Flavour, ...] = ("floats", "arrays")
 
+_CHUNK = 2048
+"""States that are simulated at once: more of them no longer fit into a processor's cache."""
+
 
 @dataclass(frozen=True)
 class PlannedLaw:
@@ -80,8 +83,23 @@ class PlannedLaw:
     terminal: sp.Expr
 
 
-class PlannedSystem:
-    """What the plans of backup laws consist of.
+class PlanVerdict(NamedTuple):
+    """Whether plans stay safe until they enter a terminal set; arrays (M,) or of one plan.
+
+    Attributes:
+        allowed: whether one of the laws does.
+        height: smallest barrier on the plan that does; with none, on that of the first law up to
+            where it fails.
+        failed: the barrier that the first law violates first, -1 where it merely takes too long.
+    """
+
+    allowed: Any
+    height: Any
+    failed: Any
+
+
+class Plans:
+    """Simulates the plans of backup laws, of one state in floats and of batches.
 
     A period is one of the env with every random number 0: classical Runge-Kutta for a system
     without noise, whose plans are thereby those of the env; and Euler for one with noise. Inputs
@@ -221,29 +239,6 @@ class PlannedSystem:
         shape = x[0].shape
         step = self.steps["arrays"].step
         return tuple([filled(c, shape) for c in step(x, u, self.still_arrays)])
-
-
-_CHUNK = 2048
-"""States that are simulated at once: more of them no longer fit into a processor's cache."""
-
-
-class PlanVerdict(NamedTuple):
-    """Whether plans stay safe until they enter a terminal set; arrays (M,) or of one plan.
-
-    Attributes:
-        allowed: whether one of the laws does.
-        height: smallest barrier on the plan that does; with none, on that of the first law up to
-            where it fails.
-        failed: the barrier that the first law violates first, -1 where it merely takes too long.
-    """
-
-    allowed: Any
-    height: Any
-    failed: Any
-
-
-class Plans(PlannedSystem):
-    """Simulates the plans of backup laws, of one state in floats and of batches."""
 
     def kept_after_one(self, x: Sequence[float], u: Sequence[float], floor: float) -> PlanVerdict:
         """Return whether some law keeps the state that an input leads to; see `kept_after`.
