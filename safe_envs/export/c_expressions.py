@@ -466,10 +466,6 @@ class CContext(ABC):
         """Return a number of the program; in formulas rounding is that of the precision."""
         return self.precision.tolerance(value) if value == ROUNDING else value
 
-    def is_library(self, name: str) -> bool:
-        """Return whether a function is taken from <math.h>."""
-        return name in MATH
-
     def helper(self, name: str) -> str:
         """Return the name of a function that C lacks, which is defined then."""
         if name not in self._helpers:
@@ -778,7 +774,7 @@ class Expressions:
         method: Callable[[Sequence[ast.expr]], Text] | None = getattr(self, f"_call_{name}", None)
         if method:
             return method(arguments)
-        if name in self._program.definitions.functions and not self._program.is_library(name):
+        if name in self._program.definitions.functions and name not in MATH:
             return self._call_function(name, arguments)
         function = self._program.precision.function(require_known(name))
         return Text(f"{function}({', '.join(self.real(each) for each in arguments)})", REAL)

@@ -292,7 +292,7 @@ class Plans:
         size = len(x[0])
         if size > _CHUNK:
             parts = [slice(i, i + _CHUNK) for i in range(0, size, _CHUNK)]
-            found = [self.kept_after(_at(x, part), _at(u, part), floor) for part in parts]
+            found = [self.kept_after(at_rows(x, part), at_rows(u, part), floor) for part in parts]
             return PlanVerdict(*[np.concatenate(each) for each in zip(*found, strict=True)])
         reached = self.advanced(x, u)
         first, *others = self.compiled["arrays"]
@@ -301,7 +301,7 @@ class Plans:
             rows = np.flatnonzero(~kept)
             if not rows.size:
                 break
-            found = self._followed(reading, _at(reached, rows), floor)
+            found = self._followed(reading, at_rows(reached, rows), floor)
             now = rows[found.allowed]
             kept[now], lowest[now] = True, found.height[found.allowed]
         failed[kept] = -1
@@ -336,7 +336,7 @@ class Plans:
             u = self.clipped_arrays(values, x)
             if over.size:
                 on = np.flatnonzero(open_)
-                rows, low, x, u = rows[on], low[on], _at(x, on), _at(u, on)
+                rows, low, x, u = rows[on], low[on], at_rows(x, on), at_rows(u, on)
             x = self.advanced(x, u)
         return PlanVerdict(kept, lowest, failed)
 
@@ -367,11 +367,12 @@ class Plans:
             u = self.clipped_arrays(values, x)
             if over.size:
                 on = np.flatnonzero(~there)
-                rows, low, x, u = rows[on], low[:, on], _at(x, on), _at(u, on)
+                rows, low, x, u = rows[on], low[:, on], at_rows(x, on), at_rows(u, on)
         return entered, np.where(np.isnan(lows), -np.inf, lows)
 
 
-def _at(components: Components, rows: Any) -> Components:
+def at_rows(components: Components, rows: Any) -> Components:
+    """Return rows of a batch."""
     return tuple([c[rows] for c in components])
 
 

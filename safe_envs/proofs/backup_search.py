@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components
-from safe_envs.proofs.backup_plans import Plans
+from safe_envs.proofs.backup_plans import Plans, at_rows
 
 DIFFERENCE = 1e-3
 """Of inputs, in parts of the width of their bounds."""
@@ -135,7 +135,7 @@ class Search:
                     nearest, found, law = away, reached, j
         if found is None or len(wanted) == 1:
             return found
-        at, point, end = [_as_batch(each) for each in (x, found[0], wanted)]
+        at, point, end = [tuple(np.array([c]) for c in each) for each in (x, found[0], wanted)]
         with np.errstate(all="ignore"):
             point, height = self._on(at, point, end, np.array([found[1]]), np.array([law]))
         return [c.item() for c in point], height.item()
@@ -180,7 +180,7 @@ class Search:
         share, lowest, width = np.zeros(laws * size), np.empty(laws * size), 1.0
         rows = np.arange(laws * size)
         for parts in _STAGES:
-            segments = [_at(each, rows) for each in (at, begin, end)]
+            segments = [at_rows(each, rows) for each in (at, begin, end)]
             kept, low, part = self._tried(segments, share[rows], width, parts)
             now = rows[kept]
             share[now] += width * part[kept]
@@ -193,7 +193,7 @@ class Search:
         away[rows] = sum((a - b)[rows] ** 2 for a, b in zip(points, end, strict=True))
         law = away.reshape(laws, size).argmin(axis=0)
         chosen = law * size + np.arange(size)
-        point, height, found = _at(points, chosen), lowest[chosen], away[chosen] < np.inf
+        point, height, found = at_rows(points, chosen), lowest[chosen], away[chosen] < np.inf
         if len(point) > 1:
             point, height = self._on(x, point, wanted, height, np.where(found, law, -1))
         return point, height, found
@@ -206,24 +206,13 @@ class Search:
         height: np.ndarray,
         law: np.ndarray,
     ) -> tuple[Components, np.ndarray]:
-        """Go on from allowed inputs as `slope_search` says.
-
-        Args:
-            x: p components (R,) of the states.
-            point: m components (R,) of the inputs.
-            wanted: m components (R,) of the proposed ones.
-            height: the smallest barriers on the plans of the inputs, (R,).
-            law: by which an input was found, -1 where it is not allowed, (R,).
-
-        Returns:
-            m components of inputs, and the smallest barriers on their plans.
-        """
+        """Go on from allowed inputs as `slope_search` says."""
         table, height = np.array(point), height.copy()
         for j in range(len(self._plans.laws)):
             rows = np.flatnonzero(law == j)
             if not rows.size:
                 continue
-            at, begin, end = [_at(each, rows) for each in (x, point, wanted)]
+            at, begin, end = [at_rows(each, rows) for each in (x, point, wanted)]
             aim = aims(self._plans, j, at, (begin, end), self._floor)
             kept, low, part = self._tried((at, begin, aim), np.zeros(rows.size), 1.0, _ON)
             nearer = self._between(begin, aim, part)
@@ -245,18 +234,7 @@ class Search:
         width: float,
         parts: Sequence[float],
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Try points of segments.
-
-        Args:
-            segments: components (R,) of the states, and of where the segments begin and end.
-            share: of the segments from which on points are tried, shape (R,).
-            width: up to how much more.
-            parts: of the width, the largest first.
-
-        Returns:
-            Whether one of the points is allowed, the smallest barrier on the plan of the first that
-            is, and its part.
-        """
+        """Try points of segments."""
         size, count = len(share), len(parts)
         at, begin, end = [_repeated(each, count) for each in segments]
         shares = np.concatenate([share + width * part for part in parts])
@@ -289,11 +267,3 @@ class Search:
 
 def _repeated(components: Components, count: int) -> Components:
     return tuple([np.tile(c, count) for c in components])
-
-
-def _at(components: Components, rows: np.ndarray) -> Components:
-    return tuple([c[rows] for c in components])
-
-
-def _as_batch(components: Sequence[float]) -> Components:
-    return tuple([np.array([c]) for c in components])
