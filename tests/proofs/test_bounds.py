@@ -102,28 +102,18 @@ def test_union_bound_of_two_barriers_holds_for_independent_motions(time):
 
 def test_special_cases_reduce_to_each_other():
     h, c, time = np.array([0.1, 0.5, 1.7]), 2.0, 0.8
-    np.testing.assert_array_equal(
-        guarantees.proposition_4_2_5(h, c, 0.0, time), guarantees.proposition_4_2_8(h, c)
-    )
-    np.testing.assert_array_equal(
-        guarantees.shortfall_repaired(h, c, 0.0, time), guarantees.proposition_4_2_8(h, c)
-    )
-    np.testing.assert_array_equal(
-        guarantees.union_bound(h[:, None], [c], time, (0.7,)),
-        guarantees.proposition_4_2_5(h, c, 0.7, time),
-    )
-    np.testing.assert_array_equal(
-        guarantees.theorem_4_2_10_printed(h[:, None], [c]), guarantees.proposition_4_2_8(h, c)
-    )
-    np.testing.assert_allclose(
-        guarantees.proposition_4_2_5(h, c, 0.7, time), h / c * math.exp(-0.7 * time)
-    )
-    np.testing.assert_allclose(
-        guarantees.proposition_4_2_5_printed(h, c, time), h / c * math.exp(-c * time)
-    )
-    np.testing.assert_allclose(
-        guarantees.shortfall_repaired(h, c, 0.1, time), (h - 0.1 * time).clip(0) / c
-    )
+    best = guarantees.proposition_4_2_8(h, c)
+    slower = guarantees.proposition_4_2_5(h, c, 0.7, time)
+    for found, expected in (
+        (guarantees.proposition_4_2_5(h, c, 0.0, time), best),
+        (guarantees.shortfall_repaired(h, c, 0.0, time), best),
+        (guarantees.theorem_4_2_10_printed(h[:, None], [c]), best),
+        (guarantees.union_bound(h[:, None], [c], time, (0.7,)), slower),
+        (slower, h / c * math.exp(-0.7 * time)),
+        (guarantees.proposition_4_2_5_printed(h, c, time), h / c * math.exp(-c * time)),
+        (guarantees.shortfall_repaired(h, c, 0.1, time), (h - 0.1 * time).clip(0) / c),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-15)
 
 
 def test_stage_bound_is_the_formula_and_continuous_in_the_rate():
@@ -133,12 +123,9 @@ def test_stage_bound_is_the_formula_and_continuous_in_the_rate():
         assert guarantees.stage_bound(b, c, time, a, m) == pytest.approx(
             max(formula, 0.0), rel=1e-9
         )
-    assert guarantees.stage_bound(b, c, time, 1e-13, m) == pytest.approx(
-        float(guarantees.stage_bound(b, c, time, 0.0, m)), rel=1e-9
-    )
-
-
-def test_for_ever_only_without_rate_and_shortfall():
+    at_0 = float(guarantees.stage_bound(b, c, time, 0.0, m))
+    assert guarantees.stage_bound(b, c, time, 1e-13, m) == pytest.approx(at_0, rel=1e-9)
+    # For ever only without a rate and a shortfall.
     assert guarantees.stage_bound(1.0, 2.0) == 0.5
     assert guarantees.stage_bound(1.0, 2.0, rate=0.1) == 0.0
     assert guarantees.stage_bound(1.0, 2.0, shortfall=0.1) == 0.0

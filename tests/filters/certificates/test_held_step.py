@@ -96,25 +96,6 @@ def test_expectations_are_those_of_quadrature(noise: str) -> None:
         assert summed == pytest.approx(change, abs=1e-11)
 
 
-def test_second_order_term_of_a_known_case() -> None:
-    """For psi = x^2 and dx = u dt + s dW it is x^2 + 2 x u dt + u^2 dt^2 + s^2 dt."""
-    s = sp.Rational(1, 3)
-    line = Plant(
-        (X,),
-        ((-sp.oo, sp.oo),),
-        (U,),
-        ((sp.Integer(-1), sp.Integer(1)),),
-        (sp.Integer(0),),
-        ((sp.Integer(1),),),
-        ((s,),),
-        (1 - X,),
-    )
-    psi = Polynomial((X,), (Fraction(0),), (Fraction(1),), {(2,): Fraction(1)})
-    dt = sp.Rational(DT)
-    found = HeldStep(line, psi, DT).expectation([U])
-    assert sp.expand(found - (X + dt * U) ** 2 - s**2 * dt) == 0
-
-
 def test_constraint_is_the_chord_between_the_bounds() -> None:
     step = HeldStep(plant("of the state"), polynomial(3), DT)
     a, b = step.constraint(Fraction(1, 100))
@@ -125,18 +106,22 @@ def test_constraint_is_the_chord_between_the_bounds() -> None:
         assert evaluated(a * bound + b, {}, here) == pytest.approx(exact, abs=1e-11)
 
 
-def test_what_has_no_held_step_is_refused() -> None:
-    problem = make_problem("safe_envs/Scalar-v0")
-    assert held_period(problem) == Fraction(1, 100)
-    with pytest.raises(ConfigurationError, match="substeps = 2"):
-        held_period(problem.configured(substeps=2))
-    with pytest.raises(ConfigurationError, match="no noise"):
-        held_period(problem.configured(noise=0.0))
-    two = HeldStep(plant("constant", (U, V)), polynomial(2), DT)
-    with pytest.raises(ConfigurationError, match="2 inputs"):
-        two.constraint(Fraction(0))
-    with pytest.raises(ConfigurationError, match="2 inputs"):
-        two.gain_by_input(lambda p, k: sp.Dummy())
-    other = Polynomial((V,), (Fraction(0),), (Fraction(1),), {})
-    with pytest.raises(ConfigurationError, match="polynomial of v"):
-        HeldStep(plant("constant"), other, DT)
+SCALAR = make_problem("safe_envs/Scalar-v0")
+TWO = HeldStep(plant("constant", (U, V)), polynomial(2), DT)
+OTHER = Polynomial((V,), (Fraction(0),), (Fraction(1),), {})
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: held_period(SCALAR.configured(substeps=2)), "substeps = 2"),
+        (lambda: held_period(SCALAR.configured(noise=0.0)), "no noise"),
+        (lambda: TWO.constraint(Fraction(0)), "2 inputs"),
+        (lambda: TWO.gain_by_input(lambda p, k: sp.Dummy()), "2 inputs"),
+        (lambda: HeldStep(plant("constant"), OTHER, DT), "polynomial of v"),
+    ],
+)
+def test_what_has_no_held_step_is_refused(call, told) -> None:
+    assert held_period(SCALAR) == Fraction(1, 100)
+    with pytest.raises(ConfigurationError, match=told):
+        call()

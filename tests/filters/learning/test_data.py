@@ -264,58 +264,40 @@ def test_paths_that_are_not_allowed(arguments, error, message):
         )
 
 
-class TestEnvStep:
-    """Gymnasium's pendulum, as an env of somebody else."""
+@pytest.fixture
+def pendulum():
+    """Gymnasium's pendulum, as an env of somebody else, with its state set and read."""
+    env = gym.make("Pendulum-v1")
+    yield env, lambda e, x: setattr(e.unwrapped, "state", x), lambda e: e.unwrapped.state
+    env.close()
 
-    @pytest.fixture
-    def pendulum(self):
-        env = gym.make("Pendulum-v1")
-        yield env
-        env.close()
 
-    @staticmethod
-    def set_state(env, x):
-        env.unwrapped.state = x
+def test_an_env_of_somebody_else_moves_as_it_does(pendulum):
+    step = env_step(*pendulum)
+    x, u = np.array([[0.1, 0.0], [2.0, -1.0], [-1.0, 0.5]]), np.array([[0.0], [1.0], [-2.0]])
+    before = x.copy()
+    speed = x[:, 1] + (15.0 * np.sin(x[:, 0]) + 3.0 * u[:, 0]) * 0.05
+    expected = np.stack([x[:, 0] + speed * 0.05, speed], axis=1)
+    np.testing.assert_allclose(step(x, u, np.random.default_rng(0)), expected, atol=1e-12)
+    np.testing.assert_array_equal(x, before)
 
-    @staticmethod
-    def get_state(env):
-        return env.unwrapped.state
 
-    def test_it_is_the_env_that_moves(self, pendulum):
-        step = env_step(pendulum, self.set_state, self.get_state)
-        x, u = np.array([[0.1, 0.0], [2.0, -1.0], [-1.0, 0.5]]), np.array([[0.0], [1.0], [-2.0]])
-        before = x.copy()
-        speed = x[:, 1] + (15.0 * np.sin(x[:, 0]) + 3.0 * u[:, 0]) * 0.05
-        expected = np.stack([x[:, 0] + speed * 0.05, speed], axis=1)
-        np.testing.assert_allclose(step(x, u, np.random.default_rng(0)), expected, atol=1e-12)
-        np.testing.assert_array_equal(x, before)
+def test_an_env_of_somebody_else_feeds_the_collector(pendulum):
+    step = env_step(*pendulum, to_action=lambda u: (u / 10.0).astype(np.float32))
+    settings = {"inputs": [(-1.0,), (1.0,)], "step": step, "dt": 0.05, "seed": 3}
+    one, same = (collect(make_problem("Pendulum-v0"), 10, **settings) for _ in range(2))
+    np.testing.assert_array_equal(one.successors, same.successors)
+    expected = one.x[:, 1] + (15.0 * np.sin(one.x[:, 0]) + 0.3 * one.u[:, 0]) * 0.05
+    np.testing.assert_allclose(one.successors[:, 0, 1], expected, atol=1e-7)
 
-    def test_it_feeds_the_collector(self, pendulum):
-        problem = make_problem("safe_envs/Pendulum-v0")
-        step = env_step(
-            pendulum,
-            self.set_state,
-            self.get_state,
-            to_action=lambda u: (u / 10.0).astype(np.float32),
-        )
-        one, same = (
-            collect(problem, 10, inputs=[(-1.0,), (1.0,)], step=step, dt=0.05, seed=3)
-            for _ in range(2)
-        )
-        np.testing.assert_array_equal(one.successors, same.successors)
-        expected = one.x[:, 1] + (15.0 * np.sin(one.x[:, 0]) + 0.3 * one.u[:, 0]) * 0.05
-        np.testing.assert_allclose(one.successors[:, 0, 1], expected, atol=1e-7)
 
-    def test_noise_of_the_env_is_of_the_generator(self, pendulum):
-        def get_noisy(env):
-            return env.unwrapped.state + env.unwrapped.np_random.normal(size=2)
-
-        step = env_step(pendulum, self.set_state, get_noisy)
-        x, u = np.zeros((3, 2)), np.zeros((3, 1))
-        rng = np.random.default_rng(0)
-        one, going_on = step(x, u, rng), step(x, u, rng)
-        assert not np.isin(one, going_on).any()
-        np.testing.assert_array_equal(step(x, u, np.random.default_rng(0)), one)
+def test_noise_of_an_env_is_of_the_generator(pendulum):
+    env, set_state, _ = pendulum
+    step = env_step(env, set_state, lambda e: e.unwrapped.np_random.normal(size=2))
+    x, u, rng = np.zeros((3, 2)), np.zeros((3, 1)), np.random.default_rng(0)
+    one, going_on = step(x, u, rng), step(x, u, rng)
+    assert not np.isin(one, going_on).any()
+    np.testing.assert_array_equal(step(x, u, np.random.default_rng(0)), one)
 
 
 def test_states_that_do_not_fit_into_memory_are_not_drawn():
