@@ -19,6 +19,8 @@ from safe_envs.wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVec
 from tests.conftest import problem_of
 from tests.proofs.verified import hurry
 
+pytestmark = pytest.mark.slow
+
 START = (0.0, 0.6)
 
 

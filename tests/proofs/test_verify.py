@@ -29,6 +29,8 @@ from tests.proofs.verified import (
     y,
 )
 
+pytestmark = pytest.mark.slow
+
 STATUSES = {"proved", "estimated", "withheld", "hypothesis fails", "no bound", "not established"}
 
 

@@ -24,6 +24,8 @@ from safe_envs.systems.acc_gap import acc_gap
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.dubins import dubins_disk
 
+pytestmark = pytest.mark.slow
+
 CUBIC = cubic_sde_disk()
 PLACES = np.array([[0.0, 0.0], [0.5, -0.3], [-0.6, 0.6]])
 FLAT = Prior(1e4, 1.0, 1.0)

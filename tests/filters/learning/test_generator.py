@@ -18,6 +18,8 @@ from safe_envs.problem.problem import Barrier
 from safe_envs.systems.pendulum import pendulum
 from tests.conftest import problem_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def first_order(top):

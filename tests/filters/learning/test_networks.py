@@ -22,6 +22,8 @@ from safe_envs.filters.learning.models.residual import LearnedResidual
 from safe_envs.filters.learning.residual import AdamSettings, train
 from tests.conftest import problem_of
 
+pytestmark = pytest.mark.slow
+
 _ACTIVATIONS = ("relu", "tanh")
 
 

@@ -20,6 +20,8 @@ from safe_envs.problem.problem import Barrier
 from safe_envs.problem.starts import SamplingDomain
 from tests.conftest import problem_of
 
+pytestmark = pytest.mark.slow
+
 _DT = 1e-3
 _SMALL = {"states": 300, "hidden": (20,), "epochs": 20}
 
