@@ -186,7 +186,7 @@ def test_numbers_of_random_certificates_hold(policy):
 @pytest.mark.oracle
 @pytest.mark.parametrize("policy", [False, True], ids=["best input", "policy"])
 def test_numbers_of_many_random_certificates_hold(policy):
-    assert sum(_compared(seed, policy) for seed in range(100)) >= 40
+    assert sum(_compared(seed, policy) for seed in range(60)) >= 30
 
 
 def test_psi_is_not_above_zero_where_an_angle_jumps():
