@@ -1,7 +1,7 @@
 """Terminal sets of backup laws, and the proof that they are kept.
 
 The shape of a set comes from a Lyapunov equation, its size from the proof: the largest level that
-`safe_envs.proofs.backup_sets` proves, within the extent that the law gives.
+is proved within the extent that the law gives.
 
 **Shape.** With the Jacobian A of a block's control period at the equilibrium, and the extents w, P
 = LL' = sum_k (A/r)'^k Q (A/r)^k with Q = diag(1/w^2). As (A/r)' P (A/r) = P - Q <= P, A contracts
