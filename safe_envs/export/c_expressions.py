@@ -466,10 +466,6 @@ class CContext(ABC):
         """Return a number of the program; in formulas rounding is that of the precision."""
         return self.precision.tolerance(value) if value == ROUNDING else value
 
-    def is_library(self, name: str) -> bool:
-        """Return whether a function is taken from <math.h>."""
-        return name in MATH
-
     def helper(self, name: str) -> str:
         """Return the name of a function that C lacks, which is defined then."""
         if name not in self._helpers:
@@ -528,8 +524,8 @@ def unknown(node: ast.AST) -> NoReturn:
     raise NotCompilableError(f"{ast.unparse(node)[:80]!r} has no form in C")
 
 
-class Operators:
-    """Translates the expressions of one function, but for calls.
+class Expressions:
+    """Translates the expressions of one function.
 
     Args:
         program: that the function belongs to.
@@ -730,6 +726,10 @@ class Operators:
         return Text(code, kind, CHOICE)
 
     def _Subscript(self, node: ast.Subscript) -> Text:  # noqa: N802
+        floats = node.value
+        if isinstance(floats, ast.Name) and self.kinds.get(floats.id) == FLOATS:
+            code = f"{self.text(floats).code}.at[{self.text(node.slice).code}]"
+            return Text(f"({self._program.precision.type}){code}", REAL, UNARY)
         constant = self._program.data_entry(node)
         if constant is not None:
             return Text(constant, REAL, UNARY if constant.startswith("-") else 16)
@@ -767,17 +767,6 @@ class Operators:
         self.before.append(f"const {self._program.precision.type} {name}[] = {{{inner}}};")
         return Text(f"(numbers){{{name}, {len(node.elts)}}}", NUMBERS)
 
-
-class Expressions(Operators):
-    """Translates the expressions of one function."""
-
-    def _Subscript(self, node: ast.Subscript) -> Text:  # noqa: N802
-        whole = node.value
-        if not (isinstance(whole, ast.Name) and self.kinds.get(whole.id) == FLOATS):
-            return super()._Subscript(node)
-        code = f"{self.text(whole).code}.at[{self.text(node.slice).code}]"
-        return Text(f"({self._program.precision.type}){code}", REAL, UNARY)
-
     def _Call(self, node: ast.Call) -> Text:  # noqa: N802
         if not isinstance(node.func, ast.Name) or node.keywords:
             return unknown(node)
@@ -785,7 +774,7 @@ class Expressions(Operators):
         method: Callable[[Sequence[ast.expr]], Text] | None = getattr(self, f"_call_{name}", None)
         if method:
             return method(arguments)
-        if name in self._program.definitions.functions and not self._program.is_library(name):
+        if name in self._program.definitions.functions and name not in MATH:
             return self._call_function(name, arguments)
         function = self._program.precision.function(require_known(name))
         return Text(f"{function}({', '.join(self.real(each) for each in arguments)})", REAL)

@@ -1,4 +1,4 @@
-"""The header of an exported filter."""
+"""The texts of an exported filter: header, decision, build file and README."""
 
 from __future__ import annotations
 

@@ -156,8 +156,12 @@ def _chooses_tuple(value: ast.expr) -> bool:
 INDENT = "    "
 
 
-class Assignments:
-    """Translates the assignments and the returned values of one function.
+_ZERO = {REAL: "0", WHOLE: "0", TRUTH: "false"}
+_IN_PLACE = {ast.Add: "+=", ast.Sub: "-=", ast.Mult: "*=", ast.Div: "/="}
+
+
+class FunctionTranslator:
+    """Translates one function, for parameters of given kinds.
 
     Args:
         program: that it belongs to.
@@ -334,20 +338,6 @@ class Assignments:
         )
         self._program.need_record(record)
         return record
-
-
-_ZERO = {REAL: "0", WHOLE: "0", TRUTH: "false"}
-_IN_PLACE = {ast.Add: "+=", ast.Sub: "-=", ast.Mult: "*=", ast.Div: "/="}
-
-
-class FunctionTranslator(Assignments):
-    """Translates one function, for parameters of given kinds.
-
-    Args:
-        program: that it belongs to.
-        node: the function.
-        kinds: of its parameters.
-    """
 
     def translated(self) -> CFunction:
         """Return the function in C.
@@ -572,11 +562,6 @@ class CProgram(CContext):
         inner = ",\n    ".join(lines)
         doc = "/* Numbers that functions read by their place: weights and biases of networks. */"
         return f"{doc}\nstatic const {self.precision.type} constants[] = {{\n    {inner},\n}};\n"
-
-    @property
-    def data_size(self) -> int:
-        """Number of constants."""
-        return len(self._data)
 
     def function(self, name: str, kinds: Sequence[Result]) -> CFunction:
         """Return a function for arguments of given kinds, translated once.

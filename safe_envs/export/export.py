@@ -1,4 +1,4 @@
-"""The files of an exported filter."""
+"""The export of a filter: its options, and the files that it writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of an exported promise filter."""
+"""The export of a promise filter: the texts of its files, and cases for its self-test."""
 
 from __future__ import annotations
 

@@ -187,10 +187,6 @@ class SafeSetAnalysis:
         """Return the largest |sigma' grad h|^2 where h is a part of its size in C.
 
         The states are on the straight lines from points of C to points beyond.
-
-        Args:
-            i: index of the barrier.
-            part: of the largest h in C.
         """
         formulas, rng = self.formulas, self.rng(3)
 

@@ -1,7 +1,7 @@
 """Terminal sets of backup laws, and the proof that they are kept.
 
 The shape of a set comes from a Lyapunov equation, its size from the proof: the largest level that
-`safe_envs.proofs.backup_sets` proves, within the extent that the law gives.
+is proved within the extent that the law gives.
 
 **Shape.** With the Jacobian A of a block's control period at the equilibrium, and the extents w, P
 = LL' = sum_k (A/r)'^k Q (A/r)^k with Q = diag(1/w^2). As (A/r)' P (A/r) = P - Q <= P, A contracts
@@ -660,20 +660,11 @@ def with_terminal_sets(
             tuple(system.numeric(e) for e in law.law),
             system.numeric(law.terminal)
             if law.terminal is not None
-            else terminal_expression(derived_sets(problem, system, law, margin)),
+            else sp.Min(*(_of_block(*kept) for kept in derived_sets(problem, system, law, margin))),
         )
         for law in stated.laws
     )
     return replace(stated, laws=laws)
-
-
-def terminal_expression(sets: Sequence[BlockSet]) -> Any:
-    """Return an expression that is >= 0 in the product of sets, the least 1 - |L'(y - e)|^2/c.
-
-    Args:
-        sets: of blocks of states.
-    """
-    return sp.Min(*(_of_block(symbols, e) for symbols, e in sets))
 
 
 def derived_sets(
@@ -789,11 +780,7 @@ def _product(
 def _largest(
     block: Block, conditions: Conditions, disturbed: Disturbance, widths: np.ndarray, name: str
 ) -> Ellipsoid | None:
-    """Return the set of the largest volume that is proved; None without any.
-
-    Raises:
-        ConfigurationError: the law does not stabilise its equilibrium.
-    """
+    """Return the set of the largest volume that is proved; None without any."""
     point = Interval(block.rest[None, :], block.rest[None, :])
     a = block.period(point, disturbed).slope.center[0]
     if not np.isfinite(a).all():
@@ -819,13 +806,7 @@ def _largest(
 
 
 def _shapes(a: np.ndarray, radius: float, widths: np.ndarray) -> list[np.ndarray]:
-    """Return forms P in whose norms a map contracts.
-
-    Args:
-        a: A, shape (n, n).
-        radius: its spectral radius.
-        widths: w, shape (n,).
-    """
+    """Return forms P in whose norms a map contracts."""
     from scipy.linalg import solve_discrete_lyapunov
 
     shapes = []

@@ -1,4 +1,4 @@
-"""Barrier certificates of problems: synthesis, then the judge."""
+"""Barrier certificates of problems: linear programs find psi, and the judge proves its numbers."""
 
 from __future__ import annotations
 

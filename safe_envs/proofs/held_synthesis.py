@@ -1,7 +1,7 @@
 """Barriers for the env's own steps with held input: linear programs, then the proof.
 
-The theorem is in `held_bound`. With one input in its bounds and q(u) = E psi(F(x, u, xi)), psi is
-asked for
+The theorem is in `safe_envs.proofs.held`. With one input in its bounds and q(u) = E psi(F(x, u,
+xi)), psi is asked for
 
 - q(u) >= psi - m at the better end of the bounds, so that the constraint can be met,
 - q at samples of u between the ends not below its chord, so that each input under it may be used,

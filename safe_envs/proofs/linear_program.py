@@ -1,4 +1,4 @@
-"""The linear program whose solution is a barrier."""
+"""Linear programs whose solution is a barrier: its basis, the safe set, samples and inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guarantee over a posterior: for every system that the data leave possible."""
+"""The bound of any filter, and that over a posterior: for every system that data leave possible."""
 
 from __future__ import annotations
 

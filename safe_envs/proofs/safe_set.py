@@ -1,4 +1,4 @@
-"""Points of a safe set: the states to look at, the starts, and draws from the set.
+"""A safe set: its formulas, its points, and searches for suprema, shortfalls, kinks and poles.
 
 SciPy's differential evolution in place of `search`, with the same populations and numbers of
 rounds, was measured for 11 registered problems: slower for every one, 2 to 11 times, never with a

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.scripts import cli
-from tests.wrappers.verification.verified import hurry
+from tests.proofs.verified import hurry
 
 
 @pytest.fixture

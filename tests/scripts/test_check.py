@@ -11,7 +11,7 @@ import pytest
 
 from safe_envs.filters.certificates.files import save_certificate
 from tests.scripts.conftest import strictly
-from tests.wrappers.certificates.examples import FALSE, TRUE, brownian, disk
+from tests.filters.certificates.examples import FALSE, TRUE, brownian, disk
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from safe_envs.proofs.judge import Supremum
 from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
-from tests.wrappers.verification.verified import verify_once
+from tests.proofs.verified import verify_once
 
 pytestmark = pytest.mark.slow
 

@@ -337,14 +337,7 @@ def _diffusion(
 def _regressed(
     phi: np.ndarray, targets: np.ndarray, count: np.ndarray, prior: np.ndarray
 ) -> Gaussian:
-    """Return the weights of variances per s; their own noise follows from what the fit leaves.
-
-    Args:
-        phi: features, shape (G, M).
-        targets: mean squares, shape (G, n).
-        count: degrees of freedom of each row, shape (G,).
-        prior: variance of each weight, shape (n,).
-    """
+    """Return the weights of variances per s; their own noise follows from what the fit leaves."""
     weight = np.sqrt(count)[:, None]
     solution, _, rank, _ = np.linalg.lstsq(phi * weight, targets * weight, rcond=None)
     left = ((targets - phi @ solution) ** 2 * count[:, None]).sum(axis=0) / max(len(phi) - rank, 1)

@@ -1,4 +1,4 @@
-"""One-step data of a system, and their collection."""
+"""One-step data of a system, which system they are of, and files of data and models."""
 
 from __future__ import annotations
 

@@ -159,11 +159,7 @@ def train(
 
 
 def _widths(hidden: Any) -> tuple[int, ...]:
-    """Return the widths of hidden layers as Python's numbers.
-
-    Raises:
-        ConfigurationError: they are no whole numbers from 1.
-    """
+    """Return the widths of hidden layers as Python's numbers."""
     try:
         widths = tuple(hidden)
     except TypeError as error:

@@ -13,7 +13,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.proofs.guarantees import Bound
 from safe_envs.wrappers import parse_conditions
 from tests.conftest import problem_of
-from tests.wrappers.verification.verified import verify_once
+from tests.proofs.verified import verify_once
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from safe_envs.agents.evaluation.bounds import (
 from safe_envs.agents.evaluation.episodes import VisitedStates
 from safe_envs.wrappers import SZCBF, Certified
 from tests.conftest import problem_of
-from tests.wrappers.certificates.held_examples import SCALAR, scalar_certificate, with_numbers
+from tests.filters.certificates.held_examples import SCALAR, scalar_certificate, with_numbers
 
 PROBLEM = problem_of(SCALAR, horizon=0.5)
 

@@ -15,8 +15,8 @@ from safe_envs.scripts.reports.sweep import print_cells, print_evaluations
 from safe_envs.text import text_width
 from tests.agents.evaluation.made_up import LONG_NAME, LONG_WORD, nasty_evaluation
 from tests.scripts.reports.test_sweep_cells import CELL
-from tests.wrappers.certificates.examples import disk
-from tests.wrappers.verification.verified import hurry
+from tests.filters.certificates.examples import disk
+from tests.proofs.verified import hurry
 
 SCALAR = ("Scalar-v0", "--horizon", 0.2)
 OWN = "a_folder_with_a_long_name/a_file_with_a_long_name.py:AConditionWithALongName"

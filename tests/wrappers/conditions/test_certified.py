@@ -35,7 +35,7 @@ from safe_envs.wrappers import (
     spec_of,
 )
 from tests.conftest import problem_of
-from tests.wrappers.certificates.handmade import (
+from tests.filters.certificates.handmade import (
     certificate_of,
     polynomial_of,
     random_polynomial,

@@ -1,1 +1,1 @@
-"""Features, networks and files of learned models."""
+"""What is learned: networks, features, distributions, and the models made of them."""
