@@ -239,8 +239,8 @@ class CompiledQP:
         Args:
             x: components of the state, followed by those of `FilterQP.runtime`.
         """
-        at = self._with_terms([np.array([c]) for c in x])
         with np.errstate(all="ignore"):
+            at = self._with_terms([np.array([c]) for c in x])
             a, b, _, inside, forms, known = self._split(self._values(*at))
             found = []
             for i in range(self._count):

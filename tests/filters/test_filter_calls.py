@@ -16,15 +16,11 @@ from safe_envs import (
     NumericalError,
     SafeEnvsError,
 )
-from safe_envs.engine.program import Program
-from safe_envs.engine.slots import Data
-from safe_envs.filters.conditions.base import AffineConstraint
-from safe_envs.filters.decision_source import filter_source
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, HOCBF, RCBF, SCBF, SRCBF, SafetyFilter
 from tests.conftest import problem_of
-from tests.wrappers.filter_qp.decision_kernels import decided
-from tests.wrappers.filter_qp.test_filter_source import Corrected, Measured
+from tests.oracles.filter_cases import Corrected, Doubtful, Measured
+from tests.oracles.programs import decision_of
 
 x, y, u, w, p, q = sp.symbols("x y u w p q", real=True)
 gain, wind = sp.Symbol("gain", positive=True), sp.Symbol("wind", real=True)
@@ -107,26 +103,15 @@ def test_decisions_are_those_of_a_system_where_what_is_given_stands(conditions, 
 
 @pytest.mark.parametrize("m", [1, 2])
 def test_bounds_at_a_call_are_those_of_an_uncertain_constraint(m):
-    class Doubtful(CBF):
-        """A CBF with a constant uncertainty."""
-
-        def derived(self, model, barrier):
-            found = super().derived(model, barrier)
-            form = (0.1, 0.0, 0.2) if m == 1 else (0.1, 0.0, 0.0, 0.2, 0.1, 0.2)
-            return AffineConstraint(
-                found.coefficient,
-                found.offset,
-                found.chain,
-                uncertainty=tuple(map(sp.sympify, form)),
-            )
-
+    form = (0.1, 0.0, 0.2) if m == 1 else (0.1, 0.0, 0.0, 0.2, 0.1, 0.2)
+    condition = Doubtful(1.0, form=form)
     system = ControlAffineSDE((x, y), (u, w)[:m], [0, 0], np.eye(2, m, dtype=int).tolist(), [0, 0])
     h = [1 - x, x + 3] if m == 1 else [1 - x - y**2, x + y + 3]
-    given = SafetyFilter(system, h, Doubtful(1.0), (-9, 9))
+    given = SafetyFilter(system, h, condition, (-9, 9))
     limits = BOUNDS[:, :m]
     batch = given.filter(STATES, PROPOSALS[:, :m], bounds=limits)
     for i in range(0, 30, 3):
-        made = SafetyFilter(system, h, Doubtful(1.0), limits[i])
+        made = SafetyFilter(system, h, condition, limits[i])
         expected = made.filter(STATES[i], PROPOSALS[i, :m])
         one = given.filter(STATES[i], PROPOSALS[i, :m], bounds=limits[i])
         np.testing.assert_allclose(one.action, expected.action, atol=1e-12)
@@ -261,10 +246,9 @@ def test_constraints_without_a_value_are_told_with_what_was_given():
 
 def test_the_time_is_not_looked_at_where_nothing_depends_on_it():
     still = SafetyFilter(chased(), 1 - x, "cbf", (-2, 2))
-    assert still.qp.symbols == (x, y, p, q)
-    still.filter([0.0, 0.0], [0.0, 0.0], parameters=POINT, t=12.0)
-    timed = SafetyFilter(chased(), BARRIERS[0], "cbf", (-2, 2), adjustable=("gain",))
-    assert timed.qp.symbols == (x, y, p, q, gain, TIME)
+    for t in ({}, {"t": 12.0}):
+        found = still.filter([0.0, 0.0], [1.0, 0.0], parameters=POINT, **t)
+        assert found.action.tolist() == [0.5, 0.0]
 
 
 LEARNED = Measured(ControlAffineSDE((x, y), (u,), [0, 0], [[1], [0]], [0, 0]), [1.5 + x**2, y])
@@ -280,20 +264,11 @@ def test_a_program_takes_what_is_given_after_the_state(conditions):
     moving = SafetyFilter(
         chased(), list(BARRIERS[:count]), conditions, (-2, 2), dt=0.1, adjustable=("gain",)
     )
-    data = Data()
-    source = filter_source(moving.qp, data)
-    decide = Program("filter", [decided], source).plain()["decided"]
+    decide = decision_of(moving)
     for i in range(10):
-        state = (*STATES[i], MOVING["p"][i], MOVING[q][i], MOVING["gain"][i])
-        state = tuple(map(float, (*state, *([NOW[i]] if TIME in moving.qp.runtime else []))))
-        proposal = tuple(PROPOSALS[i].tolist())
-        expected = moving.decide_floats(state, proposal)
-        action, _, acts, feasible, *_ = decide(
-            state, proposal, data.array(), np.full(source.work, np.nan)
-        )
-        np.testing.assert_allclose(action, expected.action, atol=1e-12)
-        batch = moving.decide_arrays(
-            tuple(np.array([c]) for c in state), tuple(np.array([c]) for c in proposal)
-        )
-        np.testing.assert_allclose(np.ravel(batch.action), expected.action, atol=1e-12)
-        assert (acts, feasible) == (any(expected.active), expected.feasible)
+        values = {key: array[i] for key, array in MOVING.items()}
+        expected = moving.filter(STATES[i], PROPOSALS[i], parameters=values, t=NOW[i])
+        state = [*STATES[i], *values.values(), *([NOW[i]] if TIME in moving.qp.runtime else [])]
+        found = decide(state, PROPOSALS[i])
+        np.testing.assert_allclose(found.action, expected.action, atol=1e-12)
+        assert (found.active, found.feasible) == (expected.active.any(), expected.feasible)

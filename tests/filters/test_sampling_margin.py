@@ -13,9 +13,8 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.filters.solver import INWARDS
 from safe_envs.wrappers import SafetyFilter
-from tests.wrappers.filter_qp.test_filter_source import Decided
+from tests.oracles.programs import decision_of
 
 x, v, y, w, u, a = sp.symbols("x v y w u a", real=True)
 CART = ControlAffineSDE.from_rate((x, v), (u,), [v, u])
@@ -56,9 +55,9 @@ def test_a_harmless_input_stays_harmless():
     state, nominal = np.array([0.5, 0.05]), np.array([3.0])
     root = (-0.21 + (0.21**2 + 4 * 0.2 * 0.692) ** 0.5) / 0.4
     one, batch = safety_filter.filter(state, nominal), safety_filter.filter([state], [nominal])
-    kernel = Decided(safety_filter)(state.tolist(), nominal.tolist())
-    for action in (one.action[0], batch.action[0, 0], kernel[0][0]):
-        assert action == pytest.approx(root, rel=10 * INWARDS)
+    program = decision_of(safety_filter)(state, nominal)
+    for action in (one.action[0], batch.action[0, 0], program.action[0]):
+        assert action == pytest.approx(root, rel=1e-8)
     assert one.feasible
     assert one.active.all()
     at = [state[0] + DT * state[1] + DT**2 * root / 2, state[1] + DT * root]
@@ -67,7 +66,7 @@ def test_a_harmless_input_stays_harmless():
         assert safety_filter.filter(state, [harmless]).action == [harmless]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, 3])
 def test_one_input_is_the_nearest_at_which_all_constraints_hold(seed):
     rng = np.random.default_rng(seed)
     barriers = list(random_barriers(rng, (x, v), 1 + seed % 2))
@@ -89,7 +88,7 @@ def test_one_input_is_the_nearest_at_which_all_constraints_hold(seed):
     assert (abs(found.action) <= 6.0).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, 1])
 def test_several_inputs_end_at_one_that_has_been_checked(seed):
     rng = np.random.default_rng(seed)
     barriers = [2 - x**2 - v**2 - y**2 - w**2, *random_barriers(rng, (x, v, y, w), seed)]
@@ -110,11 +109,11 @@ def test_several_inputs_end_at_one_that_has_been_checked(seed):
     least = (np.minimum(values, 0.0) ** 2).sum(axis=0).min(axis=1)[lost]
     ours = (np.minimum(np.squeeze(reached, (2, 3)), 0.0) ** 2).sum(axis=1)[lost]
     assert (ours < 2.5 * least + 1e-3).all()
-    decide = Decided(safety_filter)
+    decide = decision_of(safety_filter)
     for i in range(40):
         single = safety_filter.filter(states[i], nominal[i])
         np.testing.assert_allclose(single.action, found.action[i], atol=1e-6)
-        np.testing.assert_allclose(decide(states[i], nominal[i])[0], found.action[i], atol=1e-6)
+        np.testing.assert_allclose(decide(states[i], nominal[i]).action, found.action[i], atol=1e-6)
 
 
 def test_where_no_input_holds_the_filter_says_so():
@@ -127,9 +126,10 @@ def test_where_no_input_holds_the_filter_says_so():
     assert found.slack == pytest.approx([-worst], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("policy", "alpha", "half"), [("zero", 5, 10.0), ("nominal", 1, 30.0)])
 def test_a_cart_pole_at_15_hz_is_no_less_safe_with_the_margin(policy, alpha, half, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "examples"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
     monkeypatch.delitem(sys.modules, "cart_pole", raising=False)
     import cart_pole as example
 
