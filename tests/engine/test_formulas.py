@@ -14,7 +14,7 @@ from safe_envs.engine.formulas import Source, formula_max, formula_min, formulas
 from safe_envs.engine.program import Program
 from safe_envs.engine.slots import Data
 from safe_envs.errors import SystemDefinitionError
-from tests.compiled import kernels
+from tests.engine import kernels
 
 x, y, t = sp.symbols("x y t", real=True)
 POINTS = [(0.3, 1.7, 0.5), (0.9, 1.1, 2.0), (0.2, 2.9, -1.0)]
@@ -50,22 +50,18 @@ EXPRESSIONS = [
 ]
 
 
-def check(functions_of) -> None:
+@pytest.mark.parametrize(
+    "functions_of",
+    [Program.plain, pytest.param(Program.compiled, marks=pytest.mark.oracle)],
+    ids=["plain", "compiled"],
+)
+def test_programs_compute_formulas(functions_of: Callable) -> None:
     for expression in EXPRESSIONS:
         data = Data()
         functions = functions_of(program([expression], data))
         expected = compile_function((x, y, t), [expression], "floats")
         for point in POINTS:
             assert read(functions, data, point) == pytest.approx(expected(*point)[0], rel=1e-14)
-
-
-def test_plain_programs_compute_formulas() -> None:
-    check(Program.plain)
-
-
-@pytest.mark.oracle
-def test_compiled_programs_compute_formulas() -> None:
-    check(Program.compiled)
 
 
 def test_numbers_are_data_and_not_text() -> None:
@@ -85,41 +81,22 @@ def test_what_has_no_number_is_refused_as_elsewhere() -> None:
             formulas("f", {"values": (x, y)}, [expression], Data())
 
 
-def test_a_function_returns_floats_and_reads_what_it_needs() -> None:
-    source = formulas("f", {"values": (x, y), "time": t}, [1, 2 * y], Data())
-    assert "values[0]" not in source.text
-    assert "time\n" not in source.text
-    names: dict = dict(vars(math))
-    exec(source.text, names)
-    assert names["f"]((math.nan, 3.0), math.nan, np.array([1.0])) == (1.0, 6.0)
-
-
-@pytest.mark.parametrize(
-    "expression",
-    [sp.Max(t, x - y), sp.Min(t, x - y), sp.sign(x - y)],
-    ids=str,
-)
-def test_nan_remains_nan(expression: sp.Expr) -> None:
-    data = Data()
-    functions = program([expression], data).plain()
-    with np.errstate(invalid="ignore"):
-        assert math.isnan(read(functions, data, (math.inf, math.inf, 1.0)))
-    assert read(functions, data, (1.0, 2.0, 1.0)) == float(expression.subs({x: 1, y: 2, t: 1}))
-
-
-@pytest.mark.parametrize(("kernel", "plain"), [(formula_max, max), (formula_min, min)])
-def test_nan_remains_nan_in_either_place(kernel: Callable, plain: Callable) -> None:
-    assert math.isnan(kernel(math.nan, 1.0))
-    assert math.isnan(kernel(1.0, math.nan))
-    assert kernel(2.0, 1.0) == kernel(1.0, 2.0) == plain(1.0, 2.0)
+def test_nan_remains_nan() -> None:
+    for expression in (sp.Max(t, x - y), sp.Min(t, x - y), sp.sign(x - y)):
+        data = Data()
+        functions = program([expression], data).plain()
+        with np.errstate(invalid="ignore"):
+            assert math.isnan(read(functions, data, (math.inf, math.inf, 1.0)))
+        at = {x: 1, y: 2, t: 1}
+        assert read(functions, data, (1.0, 2.0, 1.0)) == float(expression.subs(at))
+    for kernel, plain in ((formula_max, max), (formula_min, min)):
+        assert math.isnan(kernel(math.nan, 1.0))
+        assert math.isnan(kernel(1.0, math.nan))
+        assert kernel(2.0, 1.0) == kernel(1.0, 2.0) == plain(1.0, 2.0)
 
 
 @pytest.mark.parametrize("value", [1e30, -1e19, 2.5, -2.5, 0.0, -7.0, math.inf])
 def test_whole_numbers_have_no_largest_one(value: float) -> None:
     data = Data()
     functions = program([sp.floor(x)], data).plain()
-    text = program([sp.floor(x) + sp.ceiling(y)], Data()).text
     assert read(functions, data, (value, 0.0, 0.0)) == np.floor(value)
-    # Compiled code would make a whole number of 64 bits of it.
-    assert "formula_floor(" in text
-    assert "formula_ceiling(" in text

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE, RelativeDegreeError
-from safe_envs.wrappers import CBF, HOCBF, RCBF, SCBF, SRCBF, SafetyFilter
-from tests.conftest import problem_of
+from safe_envs import Barrier, ControlAffineSDE
+from safe_envs.wrappers import CBF, RCBF, SCBF, SRCBF, SafetyFilter
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 
@@ -109,13 +108,3 @@ def test_beside_another_barrier():
     np.testing.assert_allclose(outside.action, [-3.0], atol=1e-6)
     assert not outside.feasible
     assert outside.cause == 0
-
-
-def test_relative_degree_1_is_asked_for():
-    problem = problem_of("safe_envs/StochasticDubins-v0")
-    for condition in (RCBF(), SRCBF()):
-        with pytest.raises(
-            RelativeDegreeError, match=r"is for relative degree 1\. Use hocbf, scbf or szcbf"
-        ):
-            condition.constraint(problem.model, problem.barriers[0])
-    assert HOCBF((1.0, 1.0)).constraint(problem.model, problem.barriers[0]).demand is None

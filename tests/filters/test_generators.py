@@ -19,8 +19,6 @@ from safe_envs.dynamics.lie import relative_degree
 from safe_envs.wrappers import parse_conditions
 from tests.conftest import problem_of
 
-pytestmark = pytest.mark.slow
-
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 _STEP = 2e-3
@@ -96,8 +94,16 @@ IDS_OF_DEGREE_1 = [
 ]
 # Twelve states take long: one condition without noise and one with it cover the two that have them.
 TWELVE = {"safe_envs/Quadrotor-v0": ("szcbf",), "safe_envs/QuadrotorLimits-v0": ("ecbf",)}
-CASES = [(i, text) for i in safe_envs.ENV_IDS for text in TWELVE.get(i, OF_ANY_DEGREE)]
-CASES += [(i, text) for i in IDS_OF_DEGREE_1 for text in OF_DEGREE_1]
+# Of degree 1, of degree 2, and ACC.
+OFTEN = {"safe_envs/Scalar-v0", "safe_envs/StochasticDubins-v0", "safe_envs/ACC-v0"}
+CASES = [
+    pytest.param(i, text, marks=[] if i in OFTEN else pytest.mark.oracle)
+    for i in safe_envs.ENV_IDS
+    for text in (
+        *TWELVE.get(i, OF_ANY_DEGREE),
+        *(OF_DEGREE_1 if i in IDS_OF_DEGREE_1 else ()),
+    )
+]
 
 
 @pytest.mark.parametrize(("env_id", "text"), CASES)

@@ -1,5 +1,5 @@
-"""Texts of filters by whoever wants to do harm: each is read, or refused with a message, in no time
-and without running anything."""
+"""Filters as text: what they say is read and written, and those of whoever wants to do harm are
+read, or refused with a message, in no time and without running anything."""
 
 from __future__ import annotations
 
@@ -12,10 +12,20 @@ import sympy as sp
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.class_k import S
-from safe_envs.wrappers import ClassK, parse_conditions, spec_of
+from safe_envs.wrappers import (
+    CBF,
+    CONDITIONS,
+    ECBF,
+    HOCBF,
+    SCBF,
+    SRCBF,
+    SZCBF,
+    ClassK,
+    parse_condition,
+    parse_conditions,
+    spec_of,
+)
 from tests.conftest import problem_of
-
-pytestmark = pytest.mark.slow
 
 SCALAR = problem_of("safe_envs/Scalar-v0")
 
@@ -73,7 +83,7 @@ def alpha_of(text: str) -> ClassK | None:
     return alpha
 
 
-@hypothesis.settings(max_examples=60)
+@hypothesis.settings(max_examples=40)
 @hypothesis.given(expressions)
 def test_arithmetic_is_a_class_k_function_or_refused(text):
     alpha = alpha_of(text)
@@ -82,6 +92,7 @@ def test_arithmetic_is_a_class_k_function_or_refused(text):
         assert alpha.expression.free_symbols == {S}
 
 
+@hypothesis.settings(max_examples=50)
 @hypothesis.given(st.text() | st.text(alphabet="s0123456789.+-*/^()[]{}_eEjx,'\"\\ ", max_size=30))
 def test_any_text_is_a_class_k_function_or_refused(text):
     alpha_of(text)
@@ -165,6 +176,7 @@ pieces = st.sampled_from(
 )
 
 
+@hypothesis.settings(max_examples=50)
 @hypothesis.given(st.lists(pieces | st.text(max_size=3), max_size=12).map("".join))
 def test_any_text_is_a_filter_or_refused(text):
     began, message, conditions = time.process_time(), "", None
@@ -198,3 +210,99 @@ def test_long_texts_and_odd_numbers_are_refused_in_short(text, message):
         parse_conditions(text, SCALAR)
     assert len(str(raised.value)) < 1000
     assert time.process_time() - began < _SECONDS
+
+
+def test_texts_are_never_run(tmp_path):
+    target = tmp_path / "owned"
+    for text in (
+        "ecbf:poles={}",
+        "ecbf:k={}",
+        "cbf:alpha={}",
+        "hocbf:p={}",
+        "rcbf:gamma={}",
+        "rcbf:form={}",
+        "scbf:sampling_margin={}",
+    ):
+        with pytest.raises(ConfigurationError):
+            parse_condition(text.format(f"__import__('pathlib').Path('{target}').touch()"), (1.0,))
+    for wrong in (("-1",), (f"__import__('pathlib').Path('{target}').touch()",)):
+        with pytest.raises(ConfigurationError, match="poles"):
+            ECBF(poles=wrong)
+    assert not target.exists()
+
+
+def test_several_barriers_take_one_text_or_one_each():
+    problem = problem_of("safe_envs/QuadrotorLimits-v0")
+    same = parse_conditions("scbf", problem)
+    assert same == (SCBF(),) * 3
+    assert spec_of(same) == "scbf"
+    each = parse_conditions("hocbf:p=1,2+ecbf:poles=-1,-2+hocbf:p=s+s**3,2", problem)
+    assert [c.name for c in each] == ["hocbf", "ecbf", "hocbf"]
+    assert parse_conditions(spec_of(each), problem) == each
+    by_gains = parse_conditions("hocbf", problem)
+    assert [c.p for c in by_gains] == [problem.gains_of(i) for i in range(3)]
+    with pytest.raises(
+        ConfigurationError,
+        match="2 conditions",
+    ):
+        parse_conditions("hocbf+scbf", problem)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "cbf:alpha=0.3",
+        "cbf:alpha=2*s**3",
+        "ecbf:k=2.0,3.0",
+        "hocbf:p=2.0,8.0",
+        "hocbf:p=2.0,tanh(s)",
+        "rcbf:gamma=0.5:form=log",
+        "srcbf:gamma=0.1:form=inverse",
+        "szcbf:alphas=1.0,0.5",
+        "scbf",
+        "scbf:sampling_margin=first-order",
+        "cbf:alpha=1.0:sampling_margin=0.25",
+    ],
+)
+def test_text_round_trips(text):
+    condition = parse_condition(text, (1.0,))
+    assert spec_of(condition) == text
+    assert parse_condition(spec_of(condition), ()) == condition
+
+
+def test_parameters_default_to_the_gains():
+    assert parse_condition("hocbf", (2.0, 8.0)) == HOCBF((2.0, 8.0))
+    assert parse_condition("cbf", (5.0,)) == CBF(5.0)
+    assert parse_condition("ecbf", (2.0, 8.0)) == ECBF((16.0, 10.0))
+    assert parse_condition("szcbf", (2.0, 8.0)) == SZCBF((2.0, 8.0))
+    assert parse_condition("srcbf", (5.0,)) == SRCBF(1.0)  # gamma is no rate
+    assert set(CONDITIONS) == {"cbf", "ecbf", "hocbf", "rcbf", "srcbf", "scbf", "szcbf"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scfb", "scfb"),
+        ("hocbf:q=1", "'q'"),
+        ("hocbf:p=1,x", "'x'"),
+        ("hocbf:p=", "expression of s"),
+        ("hocbf:p=1,-2", "positive"),
+        ("hocbf:p=nan", "positive"),
+        ("cbf:alpha=1,2", "alpha"),
+        ("scbf:alpha=1", "alpha"),
+        ("hocbf:p=2,8:p=3,3", "'p'"),
+        ("szcbf:alphas=s", "alphas = s"),
+        ("srcbf:gamma=0", "gamma = 0.0"),
+        ("rcbf:form=exp", "exp"),
+        (
+            "cbf:sampling_margin=second-order",
+            "second-order",
+        ),
+        ("cbf:sampling_margin=-1", "sampling_margin = -1.0"),
+        ("ecbf:poles=-1+1j,-1-1j", "poles"),
+        ("scbf+scbf", "scbf"),
+    ],
+)
+def test_text_that_makes_no_condition_is_explained(text, message):
+    with pytest.raises(ConfigurationError, match=message):
+        parse_conditions(text, problem_of("safe_envs/StochasticDubins-v0"))
