@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from fractions import Fraction
 
 import gymnasium as gym
 import numpy as np
@@ -35,16 +34,15 @@ from safe_envs.wrappers import (
     spec_of,
 )
 from tests.conftest import problem_of
+from tests.oracles.filter_cases import check
 from tests.wrappers.certificates.handmade import (
     certificate_of,
     polynomial_of,
     random_polynomial,
 )
-from tests.wrappers.filter_qp.test_filter_source import check
 
 DISK = problem_of("safe_envs/CubicSDEDisk-v0")
 PENDULUM = problem_of("safe_envs/Pendulum-v0")
-LIMITS = problem_of("safe_envs/QuadrotorLimits-v0")
 x_1, x_2 = DISK.plant.states
 H = 1 - x_1**2 - x_2**2
 INNER = sp.Rational(1, 4) - x_1**2 - x_2**2  # positive in a smaller disk only
@@ -174,18 +172,20 @@ def test_a_shortfall_and_a_margin_move_the_constraint_by_themselves():
 )
 def test_without_a_constraint_the_action_raises_psi_fastest_and_is_flagged(state, u):
     safety_filter = filter_of(DISK, INNER)
-    found = safety_filter.decide_floats(state, [3.0])
-    several = safety_filter.decide_arrays(
-        tuple(np.array([c, 0.1]) for c in state), (np.array([3.0, 0.0]),)
-    )
-    assert (found.feasible, several.feasible.tolist()) == (False, [False, True])
-    assert found.action[0] == several.action[0][0] == u
-    assert found.active[0]
     # What is missing of the inequality, at the nearest state of the workspace.
     first, second = np.clip(state, -2.0, 2.0)
     rate = -2 * first * (-0.6 * first - second) - 2 * second * (first**3 + second * u) - 0.08
-    assert found.margin[0] == several.margin[0][0] == pytest.approx(rate)
-    assert found.slack[0] == several.slack[0][0] == pytest.approx(max(0.0, -rate))
+    several = safety_filter.decide_arrays(
+        tuple(np.array([c, 0.1]) for c in state), (np.array([3.0, 0.0]),)
+    )
+    for found in (safety_filter.decide_floats(state, [3.0]), several):
+        first_of = [np.ravel(part)[0] for part in (found.action, found.margin, found.slack)]
+        assert first_of[0] == u
+        assert first_of[1] == pytest.approx(rate)
+        assert first_of[2] == pytest.approx(max(0.0, -rate))
+        assert not np.ravel(found.feasible)[0]
+        assert np.ravel(found.active)[0]
+    assert several.feasible.tolist() == [False, True]
 
 
 def test_where_psi_is_positive_outside_c_there_is_none_either():
@@ -237,32 +237,20 @@ def test_an_angle_counts_by_its_turn():
 
 
 def test_several_barriers_get_the_same_constraint():
-    names = [s.name for s in LIMITS.plant.states]
-    z, rate = (LIMITS.plant.states[names.index(name)] for name in ("z", "zdot"))
-    middle = (LIMITS.states[names.index("z")].high + LIMITS.states[names.index("z")].low) / 2
-    psi = 4 - (z - sp.Rational(repr(middle))) ** 2 - rate**2
-    certificate = certificate_of(LIMITS, psi, rate=3)
-    safety_filter = SafetyFilter.for_problem(LIMITS, Certified(certificate))
-    first, *others = safety_filter.constraints
-    assert len(others) == 2
-    for other in others:
-        assert (other.coefficient, other.offset) == (first.coefficient, first.offset)
-    alone = SafetyFilter(
-        LIMITS.model, [(LIMITS.barriers[0], Certified(certificate))], bounds=LIMITS.box
-    )
-    rng = np.random.default_rng(0)
-    x = np.zeros((20, LIMITS.plant.n))
-    x[:, names.index("z")] = middle + rng.uniform(-1.2, 1.2, 20)
-    x[:, names.index("zdot")] = rng.uniform(-2.0, 2.0, 20)
-    low, high = np.array(LIMITS.box).T
-    u = rng.uniform(low, high, (20, len(low)))
+    both = replace(DISK, barriers=(DISK.barriers[0], Barrier(2 - x_1, "wall")), gains=((1.0,),) * 2)
+    condition = Certified(certificate_of(both, INNER))
+    safety_filter = SafetyFilter.for_problem(both, condition)
+    first, second = safety_filter.constraints
+    assert (second.coefficient, second.offset) == (first.coefficient, first.offset)
+    alone = SafetyFilter(both.model, [(both.barriers[0], condition)], bounds=both.box)
+    x, u = states_of(DISK, 40, reach=0.3), np.random.default_rng(1).uniform(-15.0, 15.0, (40, 1))
     found, expected = safety_filter.filter(x, u), alone.filter(x, u)
     np.testing.assert_array_equal(found.feasible, expected.feasible)
-    np.testing.assert_allclose(found.action, expected.action, atol=1e-6 * high.max())
+    np.testing.assert_allclose(found.action, expected.action, atol=1e-9)
     assert expected.active.any()
+    assert expected.feasible.any()
     # Other conditions may join it.
-    both = [Certified(certificate)] * 2
-    assert SafetyFilter.for_problem(LIMITS, [*both, parse_condition("hocbf", (3.0, 12.0))])
+    assert SafetyFilter.for_problem(both, [condition, parse_condition("hocbf", (3.0, 2.0))])
 
 
 # all that a filter goes through
@@ -276,19 +264,16 @@ def test_programs_decide_as_the_filter_does():
 
 
 @pytest.mark.slow
-def test_evaluations_by_both_engines(psi_file):
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("compiled", marks=pytest.mark.oracle)])
+def test_an_evaluation_keeps_the_bound_of_its_certificate(psi_file, engine):
     name = f"certified:file={psi_file}"
-    rows = [
-        evaluate("safe_envs/CubicSDEDisk-v0", "random", [name], episodes=100, engine=engine).rows[0]
-        for engine in ("numpy", "compiled")
-    ]
-    assert rows[0].filter == rows[1].filter == name
-    assert rows[0].safe == rows[1].safe
-    assert rows[0].infeasible_rate == pytest.approx(rows[1].infeasible_rate, abs=1e-4)
-    assert rows[0].intervention_rate > 0
+    found = evaluate("safe_envs/CubicSDEDisk-v0", "random", [name], episodes=100, engine=engine)
+    (row,) = found.rows
+    assert row.filter == name
+    assert row.intervention_rate > 0
     # A certificate that the judge proves has its bound, and the filter keeps it.
-    assert rows[0].continuous_word == "proved"
-    assert 0.0 < rows[0].continuous_bound <= rows[0].ci_high
+    assert row.continuous_word == "proved"
+    assert 0.0 < row.continuous_bound <= row.ci_high
 
 
 def test_wrappers_take_its_text(psi_file):
@@ -421,24 +406,24 @@ def test_its_text_makes_it_again(psi_file, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "fragment"),
     [
         ("certified:file=", "cannot be read"),
         ("certified:file=nowhere.json", "nowhere.json"),
-        ("certified:p=2", "no parameter 'p'"),
-        ("certified:certificate=psi.json", "no parameter 'certificate'"),
+        ("certified:p=2", "'p'"),
+        ("certified:certificate=psi.json", "'certificate'"),
         ("certified:sha256=0123", "save it"),
-        ("certified:file={file}:file={file}", "names 'file' twice"),
-        ("certified:file={file}:sampling_margin=first-order", "no sampling margin of first order"),
+        ("certified:file={file}:file={file}", "'file' twice"),
+        ("certified:file={file}:sampling_margin=first-order", "first order"),
         ("certified:file={file}:sampling_margin=-1", "sampling_margin"),
-        ("certified:file={file}+certified:file={file}", "has 2 conditions"),
-        ("certifed", "did you mean 'certified'"),
+        ("certified:file={file}+certified:file={file}", "2 conditions"),
+        ("certifed", "'certified'"),
     ],
 )
-def test_malformed_texts_are_refused(text, message, psi_file, folder):
+def test_malformed_texts_are_refused(text, fragment, psi_file, folder):
     with pytest.raises(ConfigurationError) as error:
         parse_conditions(text.format(file=psi_file), DISK)
-    assert message in str(error.value)
+    assert fragment in str(error.value)
 
 
 def test_without_a_problem_there_is_no_certificate(psi_file):
@@ -448,13 +433,3 @@ def test_without_a_problem_there_is_no_certificate(psi_file):
     with pytest.raises(ConfigurationError, match="give a BarrierCertificate"):
         Certified("psi.json")  # pyright: ignore[reportArgumentType]
     assert issubclass(Certified, Condition)
-
-
-def test_a_polynomial_of_degree_16_in_two_states_stays_quick():
-    # Nested forms: expanded, the constraint would take some 1e5 operations.
-    psi = random_polynomial(DISK, 16)
-    (constraint,) = filter_of(DISK, psi).constraints
-    operations = sp.count_ops([*constraint.coefficient, constraint.offset, *constraint.domain])
-    assert operations < 5000
-    assert psi.degree == 16
-    assert isinstance(psi.coefficients[(0, 0)], Fraction)

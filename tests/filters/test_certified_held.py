@@ -13,8 +13,8 @@ from safe_envs.filters.certificates.files import save_certificate
 from safe_envs.filters.certificates.held_step import HeldStep
 from safe_envs.wrappers import Certified, SafetyFilter, parse_conditions, spec_of
 from tests.conftest import problem_of
+from tests.oracles.filter_cases import check
 from tests.wrappers.certificates.held_examples import SCALAR, scalar_certificate
-from tests.wrappers.filter_qp.test_filter_source import check
 
 
 @pytest.fixture(scope="module")

@@ -65,7 +65,6 @@ def share_below(problem, x, u, **design):
     return below / TIMES
 
 
-@pytest.mark.slow
 def test_the_numbers_are_those_of_the_symbols():
     posterior = identify(DISK, starts=100, repetitions=30, degree=3)
     for condition in (
@@ -83,15 +82,13 @@ def test_the_numbers_are_those_of_the_symbols():
             )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gain", [0.0, 0.04])
+@pytest.mark.parametrize("gain", [0.0, pytest.param(0.04, marks=pytest.mark.oracle)])
 def test_an_effect_that_the_data_do_not_show_is_kept_in_mind(gain):
     # The most probable system takes it for 0, which a large input makes much of.
     problem = changed(input_matrix=sp.Matrix([gain, 1]))
     assert share_below(problem, (0.8, 0.2), 10.0, starts=100, repetitions=30) >= LEAST
 
 
-@pytest.mark.slow
 def test_correlated_noise_makes_the_row_less_sure():
     root = np.linalg.cholesky(0.04 * np.array([[1.0, 0.95], [0.95, 1.0]]))
     problem = changed(diffusion=sp.Matrix(root))
