@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import subprocess
-import sys
 from fractions import Fraction
 
 import hypothesis
@@ -253,29 +251,3 @@ def test_proxqp_is_of_the_same_opinion(k, m):
     expected, found = by_batch(qps), by_batch(qps, "proxqp")
     assert_equal(qps, found, expected, 1e-11)
     assert (found.active == expected.active).all()
-
-
-_LATE = """
-import sys
-import numpy as np
-from safe_envs.engine.qp import dispatch
-for k, m in ((1, 2), (3, 1), (3, 2), (3, 4)):
-    for solver in dispatch.SOLVERS:
-        rng = np.random.default_rng(0)
-        dispatch.prepare(k, m, solver)
-        known = set(sys.modules)
-        for shift in (0.0, 5.0):
-            a, b, v = rng.normal(size=(k, m)), rng.normal(size=k) - shift, rng.normal(size=m)
-            ends = [-1.0] * m, [1.0] * m, [1.0] * m, [1.0] * k
-            dispatch.project_floats(a.tolist(), b.tolist(), v.tolist(), *ends, solver)
-            many = [np.full(20, c) for c in v]
-            dispatch.project_arrays(a.tolist(), b.tolist(), many, *ends, solver)
-        late = set(sys.modules) - known
-        assert not late, (k, m, solver, late)
-"""
-
-
-@pytest.mark.slow
-def test_nothing_is_imported_once_a_size_is_prepared():
-    run = subprocess.run([sys.executable, "-c", _LATE], capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr

@@ -279,17 +279,3 @@ def test_szcbf_has_the_corrected_chain():
     offset = -2 * v**2 + a_1 * a_h + a_2 * h_1  # A h_1 + alpha_2 h_1, where the print has alpha_2 h
     assert float(problem.model.numeric(found.chain[1]).subs(at)) == pytest.approx(h_1, rel=1e-12)
     assert float(problem.model.numeric(found.offset).subs(at)) == pytest.approx(offset, rel=1e-12)
-
-
-@pytest.mark.parametrize(("corrected", "stays"), [(True, True), (False, False)])
-def test_the_printed_szcbf_leaves_the_set_without_any_noise(corrected, stays):
-    # x' = y, y' = u, h = 1 - x. The printed h_2 = A h_1 + alpha_2 h gives x'' + a_1 x' + a_2 x <=
-    # a_2: an oscillator.
-    a_1, a_2, dt = 1.0, 4.0, 1e-3
-    x, y, highest = 0.0, 0.5, 0.0
-    for _ in range(10_000):
-        h, h_1 = 1 - x, -y + a_1 * (1 - x)
-        u = -a_1 * y + a_2 * (h_1 if corrected else h)
-        x, y = x + dt * y + 0.5 * dt**2 * u, y + dt * u
-        highest = max(highest, x)
-    assert (highest <= 1.0) is stays

