@@ -151,22 +151,19 @@ DISK, NOISY = "safe_envs/DubinsDisk-v0", "safe_envs/StochasticDubins-v0"
 LEFT = sp.Piecewise((0, X < 0.9), (0.5, True))
 
 
+def of_drift(step, text) -> SafetyFilter:
+    system = ControlAffineSDE((X,), (sp.Symbol("u", real=True),), [step], [1])
+    return SafetyFilter(system, 1 - X, text, (-1, 1), dt=0.1, region=[(-2, 2)])
+
+
 @pytest.mark.parametrize(
     ("make", "error", "fragment"),
     [
         (lambda: constraint(CBF(1.0), DISK), RelativeDegreeError, "degree 2"),
         (lambda: constraint(HOCBF((1.0, 1.0)), "safe_envs/ACC-v0"), RelativeDegreeError, "2 given"),
-        (
-            lambda: constraint(ECBF((1.0,)), "safe_envs/DubinsDisk-v0"),
-            RelativeDegreeError,
-            "1 given",
-        ),
-        (lambda: constraint(RCBF(), "safe_envs/StochasticDubins-v0"), RelativeDegreeError, "hocbf"),
-        (
-            lambda: constraint(SRCBF(), "safe_envs/StochasticDubins-v0"),
-            RelativeDegreeError,
-            "hocbf",
-        ),
+        (lambda: constraint(ECBF((1.0,)), DISK), RelativeDegreeError, "1 given"),
+        (lambda: constraint(RCBF(), NOISY), RelativeDegreeError, "hocbf"),
+        (lambda: constraint(SRCBF(), NOISY), RelativeDegreeError, "hocbf"),
         *[
             (lambda wrong=wrong: ECBF(**wrong), ConfigurationError, "real negative")
             for wrong in (
@@ -183,14 +180,7 @@ LEFT = sp.Piecewise((0, X < 0.9), (0.5, True))
         (lambda: ECBF((1.0, 2.0), poles=(-1.0, -1.5)), ConfigurationError, "poles"),
         *[
             (
-                lambda step=step, text=text: SafetyFilter(
-                    ControlAffineSDE((X,), (sp.Symbol("u", real=True),), [step], [1]),
-                    1 - X,
-                    text,
-                    (-1, 1),
-                    dt=0.1,
-                    region=[(-2, 2)],
-                ),
+                lambda step=step, text=text: of_drift(step, text),
                 SystemDefinitionError,
                 "drift of x",
             )
@@ -206,8 +196,7 @@ def test_what_makes_no_constraint_is_refused(make, error, fragment):
 
 def test_a_drift_that_only_the_constraint_has_may_jump():
     for step in (STEP, LEFT):
-        system = ControlAffineSDE((X,), (sp.Symbol("u", real=True),), [step], [1])
-        assert SafetyFilter(system, 1 - X, "cbf", (-1, 1)).filter([0.0], [0.5]).feasible
+        assert of_drift(step, "cbf").filter([0.0], [0.5]).feasible
 
 
 def test_ecbf_takes_real_poles_that_rounding_splits():
