@@ -29,7 +29,7 @@ def solved(kind: str) -> list[tuple[QPs, dict[str, Answers]]]:
     for k, m in SIZES:
         for shift in (0.0, 1.8):
             rng = np.random.default_rng([KINDS.index(kind), m, k, int(shift)])
-            qps = random_qps(rng, 6, k, m, kind, shift)
+            qps = random_qps(rng, 4, k, m, kind, shift)
             found.append((qps, {name: way(qps) for name, way in WAYS.items()}))
     return found
 
@@ -203,10 +203,13 @@ def qps_of_any_scale(draw):
     a, b, v = np.split(np.array(entries), [k * m, k * m + k])
     half = np.array([draw(st.sampled_from([1.0, 1e-6, 1e6, 1e100])) for _ in range(m)])
     weights = [draw(st.sampled_from([1.0, 1e-8, 1e8])), *[1.0] * (m - 1)]
-    return QPs.one(a * min(scale, 1.0), b * scale, v, -half, half, weights)
+    with np.errstate(over="ignore"):
+        b = b * scale
+    hypothesis.assume(np.isfinite(b).all())
+    return QPs.one(a * min(scale, 1.0), b, v, -half, half, weights)
 
 
-@hypothesis.settings(max_examples=80)
+@hypothesis.settings(max_examples=50)
 @hypothesis.given(qps_of_any_scale())
 def test_numbers_of_any_size_are_decided_alike_and_never_called_feasible_where_they_are_not(qps):
     u, margin, _, feasible = WAYS["floats"](qps)

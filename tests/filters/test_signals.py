@@ -21,7 +21,7 @@ x, y, u, w, p, q, clock = sp.symbols("x y u w p q clock", real=True)
 mass = sp.Symbol("mass", positive=True)
 MEASURED = (x, y, p, q, TIME)
 FIRST = {"sampling_margin": "first-order"}
-SEEDS = [0, 1, *[pytest.param(seed, marks=pytest.mark.oracle) for seed in range(2, 5)]]
+SEEDS = [1, *[pytest.param(seed, marks=pytest.mark.oracle) for seed in (0, 2, 3)]]
 ONE: Any = {TIME: clock, mass: sp.Symbol("mass", real=True)}
 
 
