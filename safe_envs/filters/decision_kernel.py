@@ -136,7 +136,7 @@ def take_nearest_function(  # noqa: PLR0913
 ) -> None:
     """Write the constraint of a maximum: that of a function whose is nearest to the proposed input.
 
-    See `CompiledQP.nearest`.
+    See `FilterQPSolver.nearest`.
 
     Args:
         i: number of the constraint.

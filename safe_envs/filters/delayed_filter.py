@@ -22,9 +22,9 @@ from safe_envs.errors import (
     require_whole,
     shown,
 )
+from safe_envs.filters.arguments import RuntimeArguments, doubles, require_finite
 from safe_envs.filters.measurement_filter import components_of
 from safe_envs.filters.qp import FilterDecision, FilterQP
-from safe_envs.filters.runtime import RuntimeArguments, doubles, require_finite
 from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.problem.actuators import require_delay, resting_input
 from safe_envs.problem.signals import TIME

@@ -11,11 +11,11 @@ import numpy as np
 
 from safe_envs.envs.sensor import Sample
 from safe_envs.errors import ConfigurationError, InvalidInputError, real_array, shown
+from safe_envs.filters.arguments import doubles
 from safe_envs.filters.conditions.estimates import belief_symbols
 from safe_envs.filters.estimation.estimator import Estimator, require_fixed, unpacked
 from safe_envs.filters.estimation.tracker import BeliefTracker
 from safe_envs.filters.qp import FilterDecision
-from safe_envs.filters.runtime import doubles
 
 
 def components_of(values: np.ndarray) -> Sequence[Any]:
@@ -203,46 +203,3 @@ def certain_states(estimator: Any) -> tuple[int, ...]:
             " with its text"
         )
     return estimator.certain
-
-
-class FiltersMeasurements:
-    """The part of a `SafetyFilter` that is given measurements."""
-
-    belief_places: list[int]
-    _measured: MeasurementFilter | None = None
-
-    @property
-    def measured(self) -> MeasurementFilter:
-        """The filter of measurements, which remembers its belief.
-
-        Raises:
-            ConfigurationError: There is no estimator.
-        """
-        if self._measured is None:
-            raise ConfigurationError(
-                "the filter has no estimator; make it with estimator=..., or give filter() states"
-            )
-        return self._measured
-
-    @property
-    def of_measurements(self) -> str:
-        """What of the filter goes with measurements, for errors; "" of a filter of states."""
-        if self._measured is not None:
-            return f"the estimator {self._measured.estimator.text}"
-        return "conditions with belief" if self.belief_places else ""
-
-    def filter_measurement(self, y: Any, u_nominal: Any, **given: Any) -> FilterDecision:
-        """Decide at the estimate of the state; see `MeasurementFilter.filter`.
-
-        Args:
-            y: what was measured just now, shape (k,) or (..., k).
-            u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
-            **given: bounds, parameters and t as of `SafetyFilter.filter`.
-
-        Returns:
-            The decision; its barriers are those of the estimate, or of the belief.
-        """
-        return self.measured.filter(y, u_nominal, **given)
-
-    def _measure_by(self, estimator: Estimator | None) -> None:
-        self._measured = None if estimator is None else MeasurementFilter(self, estimator)

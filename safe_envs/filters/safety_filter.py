@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
 from typing import Any, Never
 
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import finite, stacked
-from safe_envs.dynamics.defined import NO_VALUE
+from safe_envs.dynamics.codegen import (
+    Components,
+    Flavour,
+    compile_function,
+    filled,
+    finite,
+    stacked,
+)
+from safe_envs.dynamics.defined import NO_VALUE, defined_arrays
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import InvalidInputError
+from safe_envs.engine.qp import dispatch
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.filters import arguments
-from safe_envs.filters.arguments import known_for_problem
+from safe_envs.filters.arguments import (
+    RuntimeArguments,
+    doubles,
+    known_for_problem,
+    require_finite,
+)
 from safe_envs.filters.conditions.base import Condition, parts_of
 from safe_envs.filters.conditions.estimates import (
     EstimateSettings,
@@ -25,15 +41,14 @@ from safe_envs.filters.conditions.estimates import (
 from safe_envs.filters.conditions.text import Conditions
 from safe_envs.filters.estimation.estimator import Estimator
 from safe_envs.filters.estimation.registry import make_estimator
-from safe_envs.filters.measurement_filter import FiltersMeasurements, certain_states
-from safe_envs.filters.qp import FilterDecision, FilterQP
-from safe_envs.filters.runtime import RuntimeArguments, doubles, require_finite
-from safe_envs.filters.solver import BarrierValues, ComponentFilter
+from safe_envs.filters.measurement_filter import MeasurementFilter, certain_states
+from safe_envs.filters.qp import FilterDecision, FilterQP, UndefinedConstraintError
+from safe_envs.filters.solver import Bounds, FilterQPSolver, PerBarrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
 
 
-class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
+class SafetyFilter:
     """Chooses the input nearest to a proposed one that every condition allows.
 
     It minimises 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier and to the
@@ -133,12 +148,12 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
             arguments.runtime_symbols(known, self.pairs, self.constraints, clf),
             owners if len(owners) > len(self.pairs) else (),
         )
-        super().__init__(qp, [barrier.name for barrier, _ in self.pairs])
+        self._solve_by(qp, [barrier.name for barrier, _ in self.pairs])
         fixed = [p.name for p in known.parameters]
         self._given = RuntimeArguments(qp, system.parameters, fixed, endless)
         self._state_shape, self._input_shape = (system.n,), (system.m,)
         self.belief_places = belief_places(qp.runtime, system.n)
-        self._measure_by(estimator)
+        self._measured = None if estimator is None else MeasurementFilter(self, estimator)
         self.warm_up()
 
     @classmethod
@@ -297,3 +312,194 @@ class SafetyFilter(FiltersMeasurements, BarrierValues, ComponentFilter):
             u.copy() if proposed is inputs else np.array(proposed),
             np.array(barrier),
         )
+
+    @property
+    def measured(self) -> MeasurementFilter:
+        """The filter of measurements, which remembers its belief.
+
+        Raises:
+            ConfigurationError: There is no estimator.
+        """
+        if self._measured is None:
+            raise ConfigurationError(
+                "the filter has no estimator; make it with estimator=..., or give filter() states"
+            )
+        return self._measured
+
+    @property
+    def of_measurements(self) -> str:
+        """What of the filter goes with measurements, for errors; "" of a filter of states."""
+        if self._measured is not None:
+            return f"the estimator {self._measured.estimator.text}"
+        return "conditions with belief" if self.belief_places else ""
+
+    def filter_measurement(self, y: Any, u_nominal: Any, **given: Any) -> FilterDecision:
+        """Decide at the estimate of the state; see `MeasurementFilter.filter`.
+
+        Args:
+            y: what was measured just now, shape (k,) or (..., k).
+            u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
+            **given: bounds, parameters and t as of `SafetyFilter.filter`.
+
+        Returns:
+            The decision; its barriers are those of the estimate, or of the belief.
+        """
+        return self.measured.filter(y, u_nominal, **given)
+
+    def _solve_by(self, qp: FilterQP, names: Sequence[str]) -> None:
+        """Solve a QP by the fastest of its solvers; the barriers' names are for messages."""
+        self.qp, self._names = qp, names
+        self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
+        goal = int(qp.clf is not None)
+        self._size = len(qp.constraints) + goal, qp.model.m + goal
+        single = len(qp.constraints) == 1 and qp.plain
+        self._solve_arrays = self._arrays.solve_single if single else self._arrays.solve
+        self._solve_floats = self._floats.solve_single if single else self._floats.solve
+        if qp.plain and not single and not any(c.uncertainty for c in qp.constraints):
+            self._solve_floats = self._floats.solve_plain
+        if qp.owners:
+            self._solve_floats = PerBarrier(self._solve_floats, qp, "floats")
+            self._solve_arrays = PerBarrier(self._solve_arrays, qp, "arrays")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        # Another process has not imported yet what decisions may need.
+        self.compile()
+
+    def compile(self) -> None:
+        """Import and compile all that any decision may need."""
+        dispatch.prepare(*self._size)
+        for solver in (self._floats, self._arrays):
+            solver.compile()
+
+    def decide_floats(
+        self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Decide for one state.
+
+        Args:
+            x: finite components of the state, followed by those of `FilterQP.runtime`.
+            u: m finite components of the proposed input.
+            bounds: m lower and m upper input bounds; by default those of the QP.
+
+        Returns:
+            The decision in components.
+
+        Raises:
+            NumericalError: The constraint has no finite value.
+        """
+        try:
+            found = self._solve_floats(x, u, bounds)
+        except UndefinedConstraintError as error:
+            raise self.undefined(error.what, x) from error
+        except NO_VALUE:
+            # Plain floats raise where arrays overflow or give no number; the batch decides then.
+            found = self._decide_one_of_batch(x, u, bounds)
+        return found
+
+    def _decide_one_of_batch(
+        self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None
+    ) -> FilterDecision:
+        one, of_one = [tuple(np.array([c]) for c in part) for part in (x, u)]
+        found = self.decide_arrays(one, of_one, bounds)
+        *parts, cause, proposed = [
+            [filled(c, (1,)).item() for c in (part if isinstance(part, Sequence) else (part,))]
+            for part in found[:-1]
+        ]
+        action, margin, active, (feasible,), slack = parts
+        return FilterDecision(action, margin, active, feasible, slack, cause[0], proposed)
+
+    def decide_arrays(
+        self, x: Components, u: Components, bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Decide for a batch; as `decide_floats`, with an array (B,) for each component.
+
+        Args:
+            x: components of the states, followed by those of `FilterQP.runtime`.
+            u: m components of the proposed inputs.
+            bounds: m lower and m upper input bounds, each a float or an array (B,); by default
+                those of the QP.
+
+        Returns:
+            The decisions in components.
+        """
+        # What overflows or has no value is found below, which says where.
+        with np.errstate(all="ignore"):
+            return self._decide(x, u, bounds)
+
+    def _decide(self, x: Components, u: Components, bounds: Bounds | None) -> FilterDecision:
+        try:
+            return self._solve_arrays(x, u, bounds)
+        except UndefinedConstraintError as error:
+            raise self.undefined(error.what, [float(c[error.index]) for c in x]) from error
+
+    def undefined(
+        self, what: str, x: Sequence[float], which: Sequence[int] | None = None
+    ) -> NumericalError:
+        """Return the error of something without a finite value.
+
+        Args:
+            what: the constraint, the goal or the barrier.
+            x: components of the state, followed by those of `FilterQP.runtime`.
+            which: of the barriers; None to find out.
+        """
+        at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.qp.symbols, x, strict=True))
+        if which is None and "goal" not in what:
+            owners = self.qp.owner_of_each
+            which = list(dict.fromkeys(owners[i] for i in self._arrays.undefined_at(x)))
+        names = f" on {', '.join([self._names[i] for i in which])}" if which else ""
+        return NumericalError(
+            f"{what}{names} has no finite value at {at}; check it and the model there"
+        )
+
+    def by_constraint(self) -> Any:
+        """Return the filter with an entry for each constraint in its decisions.
+
+        Of itself, decisions have one for each barrier, which may have several constraints.
+        """
+        if not self.qp.owners:
+            return self
+        found: Any = copy.copy(self)
+        found.pairs = self.parts
+        names = [barrier.name for barrier, _ in self.parts]
+        found._solve_by(replace(self.qp, owners=()), names)
+        for name in ("_barriers_floats", "_barriers_arrays"):
+            vars(found).pop(name, None)
+        return found.warm_up()
+
+    @cached_property
+    def _barriers_floats(self) -> Any:
+        return self._compile_barriers("floats")
+
+    @cached_property
+    def _barriers_arrays(self) -> Any:
+        return self._compile_barriers("arrays")
+
+    def _compile_barriers(self, flavour: Flavour) -> Any:
+        # A condition with a belief keeps the barrier of that.
+        kept = [
+            barrier.expression
+            if c.belief is None
+            else sp.Min(*[self.constraints[i].chain[0] for i in members])
+            for (barrier, c), members in zip(self.pairs, self.qp.members, strict=True)
+        ]
+        expressions = [self.qp.model.numeric(h) for h in kept]
+        return compile_function(self.qp.symbols, expressions, flavour)
+
+    def barriers_at(self, values: Sequence[Any]) -> Sequence[Any]:
+        """Return the barriers at a batch, as numbers or arrays (B,).
+
+        Args:
+            values: of the symbols of `qp`, arrays (B,).
+        """
+        return defined_arrays(self._barriers_arrays(*values))
+
+    def _defined(self, barrier: np.ndarray, x: Sequence[Any]) -> np.ndarray:
+        """Return barriers (B, k) at states, -inf where one has no value; raise on overflow."""
+        bad = ~np.isfinite(barrier)
+        partial = self.qp.partial_barriers
+        lost = [i for i in range(bad.shape[1]) if i not in partial and bad[:, i].any()]
+        if lost:
+            at = int(bad[:, lost[0]].argmax())
+            raise self.undefined("the barrier", [float(np.atleast_1d(c)[at]) for c in x], lost[:1])
+        return np.where(bad, -np.inf, barrier)

@@ -22,13 +22,11 @@ nearest.
 from __future__ import annotations
 
 import contextlib
-import copy
 import functools
 import itertools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from operator import mul, truediv
 from typing import Any, NamedTuple
@@ -41,16 +39,14 @@ from safe_envs.dynamics.codegen import (
     Flavour,
     compile_function,
     constants,
-    filled,
     finite,
 )
-from safe_envs.dynamics.defined import NO_VALUE, defined_arrays
 from safe_envs.engine.qp import dispatch, one_constraint, second_order
 from safe_envs.engine.qp.kernels.one_constraint import project_scalar
 from safe_envs.engine.qp.rounding import ROUNDING, tolerance, tolerances
 from safe_envs.engine.qp.second_order import majorant
-from safe_envs.errors import ConfigurationError, NumericalError
-from safe_envs.filters.conditions.base import AffineConstraint, Pairs
+from safe_envs.errors import ConfigurationError
+from safe_envs.filters.conditions.base import AffineConstraint
 from safe_envs.filters.qp import FilterDecision, FilterQP, UndefinedConstraintError
 
 
@@ -102,8 +98,8 @@ Bounds = tuple[Sequence[Any], Sequence[Any]]
 """m lower and m upper input bounds, floats or arrays (B,)."""
 
 
-class CompiledQP:
-    """A QP compiled for states given component by component, as floats or as arrays of a batch.
+class FilterQPSolver:
+    """Solves a QP for states given component by component, as floats or as arrays of a batch.
 
     The formulas are the same for both flavours; only the choice between two values and the solver
     differ.
@@ -239,8 +235,8 @@ class CompiledQP:
         Args:
             x: components of the state, followed by those of `FilterQP.runtime`.
         """
-        at = self._with_terms([np.array([c]) for c in x])
         with np.errstate(all="ignore"):
+            at = self._with_terms([np.array([c]) for c in x])
             a, b, _, inside, forms, known = self._split(self._values(*at))
             found = []
             for i in range(self._count):
@@ -351,6 +347,280 @@ class CompiledQP:
     def _compiled(self, expressions: Sequence[Any]) -> Any:
         numbers = [self._qp.model.numeric(e) for e in expressions]
         return compile_function(self._symbols, numbers, self._flavour)
+
+    def solve_single(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Solve a plain QP of one constraint; see `solve`."""
+        low, high = bounds or self.bounds
+        values = self._values(*self._with_terms(x))
+        if self._uncertain:
+            return self._solve_uncertain(values, u, low[0], high[0])
+        *a, b = values
+        p = self._qp
+        if self._flavour == "floats":
+            if self._m == 1:
+                v, margin, active, feasible = project_scalar(a[0], b, u[0], low[0], high[0])
+                action = [v]
+            else:
+                action, margin, active, feasible = one_constraint.project_floats(
+                    a, b, u, low, high, p.weights
+                )
+            self._require_finite((margin,))
+            return FilterDecision(
+                action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0, u
+            )
+        action, margin, active, feasible = one_constraint.project_arrays(
+            a, b, u, low, high, p.weights
+        )
+        self._require_finite((margin,))
+        met = np.count_nonzero(feasible) == len(feasible)
+        slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
+        return FilterDecision(action, (margin,), (active,), feasible, (slack,), 0, u)
+
+    def _solve_uncertain(
+        self, values: Components, u: Sequence[Any], low: Any, high: Any
+    ) -> FilterDecision:
+        a, b, *form = values
+        action, margin, active, feasible = self._project_uncertain(
+            (a,), (b,), (form,), u[0], low, high, self._qp.priorities
+        )
+        self._require_finite((margin[0], *form))
+        return FilterDecision(
+            (action,),
+            tuple(margin),
+            tuple(active),
+            feasible,
+            (self._choose(feasible, 0.0, -margin[0]),),
+            0,
+            u,
+        )
+
+    def solve_plain(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Solve a plain QP without uncertainty for one state; see `solve`, which this shortens."""
+        low, high = bounds or self.bounds
+        values, m, width = self._values(*self._with_terms(x)), self._m, self._m + 1
+        self._require_finite(values)
+        a, b = [values[i : i + m] for i in range(0, len(values), width)], values[m::width]
+        action, margin, active, feasible = self._project(
+            a, b, u, low, high, self.weights, self._qp.priorities
+        )
+        self._require_finite((*action, *margin))
+        slack = [0.0] * len(b) if feasible else [max(-g, 0.0) for g in margin]
+        cause = furthest_active(a, b, u, active, self.weights) if True in active else -1
+        return FilterDecision(action, margin, active, feasible, slack, cause, u)
+
+    def solve(
+        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
+    ) -> FilterDecision:
+        """Solve any QP.
+
+        Args:
+            x: components of the state, followed by those of `FilterQP.runtime`.
+            u: m components of the proposed input.
+            bounds: input bounds; by default those of the QP.
+
+        Returns:
+            The decision in components.
+
+        Raises:
+            UndefinedConstraintError: A constraint or the goal has no finite value.
+        """
+        bounds = bounds or self.bounds
+        x = self._with_terms(x)
+        a, b, goal, inside, forms, known = self._split(self._values(*x))
+        target = u
+        if goal:
+            target = [0.0 * uj for uj in u]
+            u = self._best(goal, target, bounds)
+        for i in self._maxima:
+            functions = self._functions[i](*x)
+            if i in known:
+                known[i] = known[i] & self._isfinite(sum(functions))
+                functions = [self._choose(known[i], entry, 0.0) for entry in functions]
+            *a[i], b[i] = self.nearest(functions, u, bounds)
+        self._require_finite([*b, *[aj for ai in a for aj in ai]])
+        counts = [inside.get(i, True) & known.get(i, True) for i in range(self._count)]
+        asked = [
+            (
+                self._choose(inside[i], b[i] - self._demand(i, x, counts[i]), 0.0)
+                if i in inside
+                else b[i]
+            )
+            for i in range(self._count)
+        ]
+        held = [
+            [self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i]
+            for i in range(self._count)
+        ]
+        aim = self._outwards(a, inside, target, bounds)
+        rows = self._on_the_safe_side(held, asked, forms, bounds)
+        exact = forms if self._exact else {}
+        action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
+        if self._sampled:
+            falls = {i: self._fall(i, x, counts[i]) for i in self._sampled}
+            period, owners = constraints_of_period(*rows, falls)
+            weights = [self._qp.priorities[i] for i in owners]
+            held = PeriodSearch(
+                PeriodConstraints(period, exact, weights, self._flavour, self._m),
+                owners,
+                self._project,
+                bounds,
+                self.weights,
+            )
+            action, margin, active, feasible = held.hold(action, active, margin)
+        for i, defined in inside.items():
+            margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
+            active[i] = self._choose(defined, active[i], True)
+            feasible = feasible & defined
+        # A demand or a loss without a value shows here, and so does what overflows on the way to
+        # the action.
+        self._require_finite([*action, *margin])
+        for i, has_value in known.items():
+            margin[i] = self._choose(has_value, margin[i], -math.inf)
+            active[i] = self._choose(has_value, active[i], True)
+            feasible = feasible & has_value
+        slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
+        return FilterDecision(
+            action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u
+        )
+
+    def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
+        """Return the input that is best for the goal, without constraints; raises as `solve`.
+
+        Args:
+            x: components of the state, followed by those of `FilterQP.runtime`.
+            nothing: m components of the input 0.
+        """
+        goal = self._split(self._values(*self._with_terms(x)))[2]
+        return self._best(goal, nothing, self.bounds)
+
+    def _best(self, goal: Sequence[Any], nothing: Sequence[Any], bounds: Bounds) -> Sequence[Any]:
+        self._require_finite(goal, "the goal")
+        return self._minimise((), (), nothing, bounds, goal)[0]
+
+    def _outwards(
+        self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any], bounds: Bounds
+    ) -> Sequence[Any]:
+        """Return the proposed input, or one far away where h of a reciprocal condition rises most.
+
+        The latter is for states outside its domain. The allowed point nearest to an input so far
+        off is where h rises most among those that the other constraints allow: these are not to
+        suffer from a condition that is undefined.
+        """
+        if all(
+            defined is True or (defined is not False and defined.all())
+            for defined in inside.values()
+        ):
+            return u
+        rise = [0.0] * self._m
+        for i, defined in inside.items():
+            rise = [
+                rj + self._choose(defined, 0.0, aj)
+                for rj, aj in zip(rise, self._over_largest(a[i]), strict=True)
+            ]
+        rise = self._over_largest(rise)
+        steepness = sum([rj * rj / wj for rj, wj in zip(rise, self.weights, strict=True)])
+        ends = list(zip(*bounds, strict=True))
+        span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
+        far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
+        corner = [
+            self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj))
+            for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)
+        ]
+        return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self.weights, strict=True)]
+
+    def _over_largest(self, entries: Sequence[Any]) -> list[Any]:
+        """Return entries over the largest of their sizes, whose inverse may overflow."""
+        size = functools.reduce(self._larger, [abs(entry) for entry in entries])
+        return [entry / self._choose(size > 0.0, size, 1.0) for entry in entries]
+
+    def _minimise(
+        self,
+        a: Sequence[Any],
+        b: Sequence[Any],
+        u: Sequence[Any],
+        bounds: Bounds,
+        goal: Sequence[Any],
+        forms: dict[int, Components] | None = None,
+    ) -> tuple[Any, Any, Any, Any]:
+        p, (low, high) = self._qp, bounds
+        if forms:
+            q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
+            action, margin, active, feasible = self._project_uncertain(
+                [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
+            )
+            return [action], list(margin), list(active), feasible
+        if not goal:
+            return self._project(a, b, u, low, high, self.weights, p.priorities)
+        # The goal's slack is d = unit e, since the square of d would overflow before d does. Twice
+        # the most that the input bounds can make d always meets the goal's constraint, also after
+        # rounding.
+        growth, along = goal[0], goal[1:]
+        most = growth + sum(
+            [self._larger(bj * lo, bj * hi) for bj, lo, hi in zip(along, low, high, strict=True)]
+        )
+        unit = self.goal_unit
+        rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
+        low = (*low, 0.0)
+        high = (*high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
+        w, priorities = (*self.weights, self.weights[0]), [*p.priorities[: len(a)], 1.0]
+        action, margin, active, _ = self._project(
+            rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
+        )
+        action, margin, active = action[: self._m], margin[: len(a)], active[: len(a)]
+        # The goal's constraint, which can always be met, has no say in that, nor has its rounding.
+        feasible: Any = True
+        for ai, bi, g in zip(a, b, margin, strict=True):
+            feasible = feasible & (g >= -self._tolerance(ai, bi, action))
+        return action, margin, active, feasible
+
+    def _on_the_safe_side(
+        self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components], bounds: Bounds
+    ) -> tuple[list[Any], list[Any]]:
+        """Return affine constraints that are met only where the uncertain ones are.
+
+        Those that are solved as they are stay as they are.
+        """
+        a, b = list(a), list(b)
+        for i, form in forms.items():
+            self._require_finite(form)
+            if self._exact:
+                continue
+            known = bounds is self.bounds and i in self.planes
+            slopes, constant = self.planes[i] if known else self._plane(form, bounds)
+            a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
+            b[i] = b[i] - constant
+        return a, b
+
+    def _cause(
+        self,
+        a: Sequence[Any],
+        b: Sequence[Any],
+        u: Sequence[Any],
+        active: Sequence[Any],
+        inside: dict[int, Any],
+    ) -> Any:
+        """Return the active constraint whose half-space is furthest from the proposed input.
+
+        A reciprocal one outside its domain is further than any, and one that says nothing of the
+        input nearer than any; of several such, the first counts.
+        """
+        cause, furthest = -1, -math.inf
+        for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
+            if acts is False or (acts is not True and not np.count_nonzero(acts)):
+                continue
+            distance = self._distance(ai, bi, u)
+            if i in inside:
+                distance = self._choose(inside[i], distance, math.inf)
+            size = functools.reduce(self._larger, [abs(aj) for aj in ai])
+            distance = self._choose(acts & (size > 0.0), distance, -math.inf)
+            first: Any = acts & (cause < 0)
+            cause = self._choose(first | (distance > furthest), i, cause)
+            furthest = self._larger(furthest, distance)
+        return cause
 
 
 def solved_as_cones(qp: FilterQP) -> bool:
@@ -765,284 +1035,6 @@ _FAR = 1e4
 """How many times further than the input bounds reach is far away."""
 
 
-class FilterQPSolver(CompiledQP):
-    """Solves a QP for states given component by component, as floats or as arrays of a batch."""
-
-    def solve_single(
-        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
-    ) -> FilterDecision:
-        """Solve a plain QP of one constraint; see `solve`."""
-        low, high = bounds or self.bounds
-        values = self._values(*self._with_terms(x))
-        if self._uncertain:
-            return self._solve_uncertain(values, u, low[0], high[0])
-        *a, b = values
-        p = self._qp
-        if self._flavour == "floats":
-            if self._m == 1:
-                v, margin, active, feasible = project_scalar(a[0], b, u[0], low[0], high[0])
-                action = [v]
-            else:
-                action, margin, active, feasible = one_constraint.project_floats(
-                    a, b, u, low, high, p.weights
-                )
-            self._require_finite((margin,))
-            return FilterDecision(
-                action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0, u
-            )
-        action, margin, active, feasible = one_constraint.project_arrays(
-            a, b, u, low, high, p.weights
-        )
-        self._require_finite((margin,))
-        met = np.count_nonzero(feasible) == len(feasible)
-        slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
-        return FilterDecision(action, (margin,), (active,), feasible, (slack,), 0, u)
-
-    def _solve_uncertain(
-        self, values: Components, u: Sequence[Any], low: Any, high: Any
-    ) -> FilterDecision:
-        a, b, *form = values
-        action, margin, active, feasible = self._project_uncertain(
-            (a,), (b,), (form,), u[0], low, high, self._qp.priorities
-        )
-        self._require_finite((margin[0], *form))
-        return FilterDecision(
-            (action,),
-            tuple(margin),
-            tuple(active),
-            feasible,
-            (self._choose(feasible, 0.0, -margin[0]),),
-            0,
-            u,
-        )
-
-    def solve_plain(
-        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
-    ) -> FilterDecision:
-        """Solve a plain QP without uncertainty for one state; see `solve`, which this shortens."""
-        low, high = bounds or self.bounds
-        values, m, width = self._values(*self._with_terms(x)), self._m, self._m + 1
-        self._require_finite(values)
-        a, b = [values[i : i + m] for i in range(0, len(values), width)], values[m::width]
-        action, margin, active, feasible = self._project(
-            a, b, u, low, high, self.weights, self._qp.priorities
-        )
-        self._require_finite((*action, *margin))
-        slack = [0.0] * len(b) if feasible else [max(-g, 0.0) for g in margin]
-        cause = furthest_active(a, b, u, active, self.weights) if True in active else -1
-        return FilterDecision(action, margin, active, feasible, slack, cause, u)
-
-    def solve(
-        self, x: Sequence[Any], u: Sequence[Any], bounds: Bounds | None = None
-    ) -> FilterDecision:
-        """Solve any QP.
-
-        Args:
-            x: components of the state, followed by those of `FilterQP.runtime`.
-            u: m components of the proposed input.
-            bounds: input bounds; by default those of the QP.
-
-        Returns:
-            The decision in components.
-
-        Raises:
-            UndefinedConstraintError: A constraint or the goal has no finite value.
-        """
-        bounds = bounds or self.bounds
-        x = self._with_terms(x)
-        a, b, goal, inside, forms, known = self._split(self._values(*x))
-        target = u
-        if goal:
-            target = [0.0 * uj for uj in u]
-            u = self._best(goal, target, bounds)
-        for i in self._maxima:
-            functions = self._functions[i](*x)
-            if i in known:
-                known[i] = known[i] & self._isfinite(sum(functions))
-                functions = [self._choose(known[i], entry, 0.0) for entry in functions]
-            *a[i], b[i] = self.nearest(functions, u, bounds)
-        self._require_finite([*b, *[aj for ai in a for aj in ai]])
-        counts = [inside.get(i, True) & known.get(i, True) for i in range(self._count)]
-        asked = [
-            (
-                self._choose(inside[i], b[i] - self._demand(i, x, counts[i]), 0.0)
-                if i in inside
-                else b[i]
-            )
-            for i in range(self._count)
-        ]
-        held = [
-            [self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i]
-            for i in range(self._count)
-        ]
-        aim = self._outwards(a, inside, target, bounds)
-        rows = self._on_the_safe_side(held, asked, forms, bounds)
-        exact = forms if self._exact else {}
-        action, margin, active, feasible = self._minimise(*rows, aim, bounds, goal, exact)
-        if self._sampled:
-            falls = {i: self._fall(i, x, counts[i]) for i in self._sampled}
-            period, owners = constraints_of_period(*rows, falls)
-            weights = [self._qp.priorities[i] for i in owners]
-            held = PeriodSearch(
-                PeriodConstraints(period, exact, weights, self._flavour, self._m),
-                owners,
-                self._project,
-                bounds,
-                self.weights,
-            )
-            action, margin, active, feasible = held.hold(action, active, margin)
-        for i, defined in inside.items():
-            margin[i] = self._choose(defined, margin[i], dot(a[i], action) + b[i])
-            active[i] = self._choose(defined, active[i], True)
-            feasible = feasible & defined
-        # A demand or a loss without a value shows here, and so does what overflows on the way to
-        # the action.
-        self._require_finite([*action, *margin])
-        for i, has_value in known.items():
-            margin[i] = self._choose(has_value, margin[i], -math.inf)
-            active[i] = self._choose(has_value, active[i], True)
-            feasible = feasible & has_value
-        slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
-        return FilterDecision(
-            action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u
-        )
-
-    def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
-        """Return the input that is best for the goal, without constraints; raises as `solve`.
-
-        Args:
-            x: components of the state, followed by those of `FilterQP.runtime`.
-            nothing: m components of the input 0.
-        """
-        goal = self._split(self._values(*self._with_terms(x)))[2]
-        return self._best(goal, nothing, self.bounds)
-
-    def _best(self, goal: Sequence[Any], nothing: Sequence[Any], bounds: Bounds) -> Sequence[Any]:
-        self._require_finite(goal, "the goal")
-        return self._minimise((), (), nothing, bounds, goal)[0]
-
-    def _outwards(
-        self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any], bounds: Bounds
-    ) -> Sequence[Any]:
-        """Return the proposed input, or one far away where h of a reciprocal condition rises most.
-
-        The latter is for states outside its domain. The allowed point nearest to an input so far
-        off is where h rises most among those that the other constraints allow: these are not to
-        suffer from a condition that is undefined.
-        """
-        if all(
-            defined is True or (defined is not False and defined.all())
-            for defined in inside.values()
-        ):
-            return u
-        rise = [0.0] * self._m
-        for i, defined in inside.items():
-            rise = [
-                rj + self._choose(defined, 0.0, aj)
-                for rj, aj in zip(rise, self._over_largest(a[i]), strict=True)
-            ]
-        rise = self._over_largest(rise)
-        steepness = sum([rj * rj / wj for rj, wj in zip(rise, self.weights, strict=True)])
-        ends = list(zip(*bounds, strict=True))
-        span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
-        far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
-        corner = [
-            self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj))
-            for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)
-        ]
-        return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self.weights, strict=True)]
-
-    def _over_largest(self, entries: Sequence[Any]) -> list[Any]:
-        """Return entries over the largest of their sizes, whose inverse may overflow."""
-        size = functools.reduce(self._larger, [abs(entry) for entry in entries])
-        return [entry / self._choose(size > 0.0, size, 1.0) for entry in entries]
-
-    def _minimise(
-        self,
-        a: Sequence[Any],
-        b: Sequence[Any],
-        u: Sequence[Any],
-        bounds: Bounds,
-        goal: Sequence[Any],
-        forms: dict[int, Components] | None = None,
-    ) -> tuple[Any, Any, Any, Any]:
-        p, (low, high) = self._qp, bounds
-        if forms:
-            q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
-            action, margin, active, feasible = self._project_uncertain(
-                [ai[0] for ai in a], b, q, u[0], low[0], high[0], p.priorities
-            )
-            return [action], list(margin), list(active), feasible
-        if not goal:
-            return self._project(a, b, u, low, high, self.weights, p.priorities)
-        # The goal's slack is d = unit e, since the square of d would overflow before d does. Twice
-        # the most that the input bounds can make d always meets the goal's constraint, also after
-        # rounding.
-        growth, along = goal[0], goal[1:]
-        most = growth + sum(
-            [self._larger(bj * lo, bj * hi) for bj, lo, hi in zip(along, low, high, strict=True)]
-        )
-        unit = self.goal_unit
-        rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
-        low = (*low, 0.0)
-        high = (*high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
-        w, priorities = (*self.weights, self.weights[0]), [*p.priorities[: len(a)], 1.0]
-        action, margin, active, _ = self._project(
-            rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
-        )
-        action, margin, active = action[: self._m], margin[: len(a)], active[: len(a)]
-        # The goal's constraint, which can always be met, has no say in that, nor has its rounding.
-        feasible: Any = True
-        for ai, bi, g in zip(a, b, margin, strict=True):
-            feasible = feasible & (g >= -self._tolerance(ai, bi, action))
-        return action, margin, active, feasible
-
-    def _on_the_safe_side(
-        self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components], bounds: Bounds
-    ) -> tuple[list[Any], list[Any]]:
-        """Return affine constraints that are met only where the uncertain ones are.
-
-        Those that are solved as they are stay as they are.
-        """
-        a, b = list(a), list(b)
-        for i, form in forms.items():
-            self._require_finite(form)
-            if self._exact:
-                continue
-            known = bounds is self.bounds and i in self.planes
-            slopes, constant = self.planes[i] if known else self._plane(form, bounds)
-            a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
-            b[i] = b[i] - constant
-        return a, b
-
-    def _cause(
-        self,
-        a: Sequence[Any],
-        b: Sequence[Any],
-        u: Sequence[Any],
-        active: Sequence[Any],
-        inside: dict[int, Any],
-    ) -> Any:
-        """Return the active constraint whose half-space is furthest from the proposed input.
-
-        A reciprocal one outside its domain is further than any, and one that says nothing of the
-        input nearer than any; of several such, the first counts.
-        """
-        cause, furthest = -1, -math.inf
-        for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
-            if acts is False or (acts is not True and not np.count_nonzero(acts)):
-                continue
-            distance = self._distance(ai, bi, u)
-            if i in inside:
-                distance = self._choose(inside[i], distance, math.inf)
-            size = functools.reduce(self._larger, [abs(aj) for aj in ai])
-            distance = self._choose(acts & (size > 0.0), distance, -math.inf)
-            first: Any = acts & (cause < 0)
-            cause = self._choose(first | (distance > furthest), i, cause)
-            furthest = self._larger(furthest, distance)
-        return cause
-
-
 class PerBarrier:
     """Solves a QP: of the constraints of a barrier, the one that is violated most counts.
 
@@ -1074,179 +1066,3 @@ class PerBarrier:
 
     def _reduced(self, of_two: Callable[..., Any], entries: Sequence[Any]) -> list[Any]:
         return [functools.reduce(of_two, [entries[i] for i in each]) for each in self._members]
-
-
-class ComponentFilter:
-    """Solves a QP by the fastest of its solvers.
-
-    Args:
-        qp: the QP.
-        names: of the barriers, for messages.
-    """
-
-    def __init__(self, qp: FilterQP, names: Sequence[str]) -> None:
-        self.qp, self._names = qp, names
-        self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
-        goal = int(qp.clf is not None)
-        self._size = len(qp.constraints) + goal, qp.model.m + goal
-        single = len(qp.constraints) == 1 and qp.plain
-        self._solve_arrays = self._arrays.solve_single if single else self._arrays.solve
-        self._solve_floats = self._floats.solve_single if single else self._floats.solve
-        if qp.plain and not single and not any(c.uncertainty for c in qp.constraints):
-            self._solve_floats = self._floats.solve_plain
-        if qp.owners:
-            self._solve_floats = PerBarrier(self._solve_floats, qp, "floats")
-            self._solve_arrays = PerBarrier(self._solve_arrays, qp, "arrays")
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        # Another process has not imported yet what decisions may need.
-        self.compile()
-
-    def compile(self) -> None:
-        """Import and compile all that any decision may need."""
-        dispatch.prepare(*self._size)
-        for solver in (self._floats, self._arrays):
-            solver.compile()
-
-    def decide_floats(
-        self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None = None
-    ) -> FilterDecision:
-        """Decide for one state.
-
-        Args:
-            x: finite components of the state, followed by those of `FilterQP.runtime`.
-            u: m finite components of the proposed input.
-            bounds: m lower and m upper input bounds; by default those of the QP.
-
-        Returns:
-            The decision in components.
-
-        Raises:
-            NumericalError: The constraint has no finite value.
-        """
-        try:
-            found = self._solve_floats(x, u, bounds)
-        except UndefinedConstraintError as error:
-            raise self.undefined(error.what, x) from error
-        except NO_VALUE:
-            # Plain floats raise where arrays overflow or give no number; the batch decides then.
-            found = self._decide_one_of_batch(x, u, bounds)
-        return found
-
-    def _decide_one_of_batch(
-        self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None
-    ) -> FilterDecision:
-        one, of_one = [tuple(np.array([c]) for c in part) for part in (x, u)]
-        found = self.decide_arrays(one, of_one, bounds)
-        *parts, cause, proposed = [
-            [filled(c, (1,)).item() for c in (part if isinstance(part, Sequence) else (part,))]
-            for part in found[:-1]
-        ]
-        action, margin, active, (feasible,), slack = parts
-        return FilterDecision(action, margin, active, feasible, slack, cause[0], proposed)
-
-    def decide_arrays(
-        self, x: Components, u: Components, bounds: Bounds | None = None
-    ) -> FilterDecision:
-        """Decide for a batch; as `decide_floats`, with an array (B,) for each component.
-
-        Args:
-            x: components of the states, followed by those of `FilterQP.runtime`.
-            u: m components of the proposed inputs.
-            bounds: m lower and m upper input bounds, each a float or an array (B,); by default
-                those of the QP.
-
-        Returns:
-            The decisions in components.
-        """
-        # What overflows or has no value is found below, which says where.
-        with np.errstate(all="ignore"):
-            return self._decide(x, u, bounds)
-
-    def _decide(self, x: Components, u: Components, bounds: Bounds | None) -> FilterDecision:
-        try:
-            return self._solve_arrays(x, u, bounds)
-        except UndefinedConstraintError as error:
-            raise self.undefined(error.what, [float(c[error.index]) for c in x]) from error
-
-    def undefined(
-        self, what: str, x: Sequence[float], which: Sequence[int] | None = None
-    ) -> NumericalError:
-        """Return the error of something without a finite value.
-
-        Args:
-            what: the constraint, the goal or the barrier.
-            x: components of the state, followed by those of `FilterQP.runtime`.
-            which: of the barriers; None to find out.
-        """
-        at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.qp.symbols, x, strict=True))
-        if which is None and "goal" not in what:
-            owners = self.qp.owner_of_each
-            which = list(dict.fromkeys(owners[i] for i in self._arrays.undefined_at(x)))
-        names = f" on {', '.join([self._names[i] for i in which])}" if which else ""
-        return NumericalError(
-            f"{what}{names} has no finite value at {at}; check it and the model there"
-        )
-
-
-class BarrierValues:
-    """The part of a `SafetyFilter` that evaluates its barriers."""
-
-    pairs: Pairs
-    parts: Pairs
-    constraints: tuple[AffineConstraint, ...]
-    qp: FilterQP
-    undefined: Callable[..., NumericalError]
-
-    def by_constraint(self) -> Any:
-        """Return the filter with an entry for each constraint in its decisions.
-
-        Of itself, decisions have one for each barrier, which may have several constraints.
-        """
-        if not self.qp.owners:
-            return self
-        found: Any = copy.copy(self)
-        found.pairs = self.parts
-        names = [barrier.name for barrier, _ in self.parts]
-        ComponentFilter.__init__(found, replace(self.qp, owners=()), names)
-        for name in ("_barriers_floats", "_barriers_arrays"):
-            vars(found).pop(name, None)
-        return found.warm_up()
-
-    @cached_property
-    def _barriers_floats(self) -> Any:
-        return self._compile_barriers("floats")
-
-    @cached_property
-    def _barriers_arrays(self) -> Any:
-        return self._compile_barriers("arrays")
-
-    def _compile_barriers(self, flavour: Flavour) -> Any:
-        # A condition with a belief keeps the barrier of that.
-        kept = [
-            barrier.expression
-            if c.belief is None
-            else sp.Min(*[self.constraints[i].chain[0] for i in members])
-            for (barrier, c), members in zip(self.pairs, self.qp.members, strict=True)
-        ]
-        expressions = [self.qp.model.numeric(h) for h in kept]
-        return compile_function(self.qp.symbols, expressions, flavour)
-
-    def barriers_at(self, values: Sequence[Any]) -> Sequence[Any]:
-        """Return the barriers at a batch, as numbers or arrays (B,).
-
-        Args:
-            values: of the symbols of `qp`, arrays (B,).
-        """
-        return defined_arrays(self._barriers_arrays(*values))
-
-    def _defined(self, barrier: np.ndarray, x: Sequence[Any]) -> np.ndarray:
-        """Return barriers (B, k) at states, -inf where one has no value; raise on overflow."""
-        bad = ~np.isfinite(barrier)
-        partial = self.qp.partial_barriers
-        lost = [i for i in range(bad.shape[1]) if i not in partial and bad[:, i].any()]
-        if lost:
-            at = int(bad[:, lost[0]].argmax())
-            raise self.undefined("the barrier", [float(np.atleast_1d(c)[at]) for c in x], lost[:1])
-        return np.where(bad, -np.inf, barrier)

@@ -58,10 +58,10 @@ from safe_envs.engine.formulas import Source
 from safe_envs.engine.slots import Data
 from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError, shown
 from safe_envs.filters import arguments
+from safe_envs.filters.arguments import doubles, require_finite
 from safe_envs.filters.conditions.names import BACKUP
 from safe_envs.filters.conditions.text import FilterSettings, settings_in
 from safe_envs.filters.qp import FilterDecision
-from safe_envs.filters.runtime import doubles, require_finite
 from safe_envs.problem.backup import Backup, backup_of
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.problem import Barrier, SafetyProblem

@@ -23,7 +23,7 @@ from safe_envs.problem.clf import CLF
 from safe_envs.problem.signals import TIME
 from safe_envs.wrappers import CBF, DelayedFilter, SafetyFilter, parse_conditions
 from tests.conftest import problem_of
-from tests.wrappers.filter_qp.test_filter_source import CASES, Corrected, case_of, integrators
+from tests.oracles.filter_cases import CASES, Corrected, case_of, integrators
 from tests.wrappers.learned import Terms
 
 COMPILER = c_compiler()

@@ -10,14 +10,12 @@ from safe_envs.lazy_attributes import lazy_attributes
 if TYPE_CHECKING:
     from safe_envs.filters.conditions.base import AffineConstraint, Condition
     from safe_envs.filters.conditions.bayesian import BayesianSCBF
-    from safe_envs.filters.conditions.cbf import CBF, ECBF, HOCBF
+    from safe_envs.filters.conditions.cbf import CBF, ECBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF
     from safe_envs.filters.conditions.certified import Certified
     from safe_envs.filters.conditions.class_k import ClassK, power
     from safe_envs.filters.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
     from safe_envs.filters.conditions.names import condition_names
-    from safe_envs.filters.conditions.reciprocal import RCBF, SRCBF
     from safe_envs.filters.conditions.registry import CONDITIONS, LEARNED
-    from safe_envs.filters.conditions.stochastic import SCBF, SZCBF
     from safe_envs.filters.conditions.text import (
         parse_condition,
         parse_conditions,
@@ -65,10 +63,10 @@ _MODULES = {
     "LEARNED": "safe_envs.filters.conditions.registry",
     "LearnedCondition": "safe_envs.filters.conditions.learned",
     "LearnedHOCBF": "safe_envs.filters.conditions.learned",
-    "RCBF": "safe_envs.filters.conditions.reciprocal",
-    "SCBF": "safe_envs.filters.conditions.stochastic",
-    "SRCBF": "safe_envs.filters.conditions.reciprocal",
-    "SZCBF": "safe_envs.filters.conditions.stochastic",
+    "RCBF": "safe_envs.filters.conditions.cbf",
+    "SCBF": "safe_envs.filters.conditions.cbf",
+    "SRCBF": "safe_envs.filters.conditions.cbf",
+    "SZCBF": "safe_envs.filters.conditions.cbf",
     "condition_names": "safe_envs.filters.conditions.names",
     "parse_condition": "safe_envs.filters.conditions.text",
     "parse_conditions": "safe_envs.filters.conditions.text",

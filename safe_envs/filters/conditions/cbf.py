@@ -1,4 +1,9 @@
-"""Conditions that ignore the noise: CBF, ECBF, HOCBF."""
+"""Conditions that need nothing but a model.
+
+CBF, ECBF, HOCBF and RCBF ignore the noise; SCBF, SZCBF and SRCBF have the Ito generator A in place
+of the Lie derivative. The barrier function B of the reciprocal ones, RCBF and SRCBF, is unbounded
+at the edge.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +16,16 @@ from typing import Any
 import sympy as sp
 from mpmath.libmp import NoConvergence  # pyright: ignore[reportMissingImports]
 
-from safe_envs.dynamics.lie import derivatives, lie_derivative_f, relative_degree
+from safe_envs.dynamics.lie import (
+    derivatives,
+    generator,
+    lie_derivative_f,
+    quadratic_variation_rate,
+    relative_degree,
+)
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened, shown
-from safe_envs.filters.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shortened, shown
+from safe_envs.filters.conditions.base import AffineConstraint, Condition, chain_of, resolved
 from safe_envs.filters.conditions.class_k import ClassK, Rate, entries_of, positive_rates, rates
 from safe_envs.filters.conditions.names import ONLY_DEGREE_1
 from safe_envs.problem.problem import Barrier
@@ -213,3 +224,152 @@ def _real_negative_roots(gains: Sequence[float]) -> tuple[float, ...]:
             f"k = {shown(gains)} has its poles at {shortened(listing)}: {_WHY}"
         )
     return tuple(float(sp.re(root)) for root in roots)
+
+
+@dataclass(frozen=True)
+class SCBF(Condition):
+    """A^r h >= 0, with the Ito generator A and the stochastic relative degree r.
+
+    Its bounds: `safe_envs.proofs.guarantees`.
+
+    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The thesis defines the relative degree by
+        A^j h = 0; it means that L_g A^(j-1) h = 0 below r.
+    """
+
+    name = "scbf"
+    stochastic = True
+
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint; see `chain_of` for what it raises."""
+        return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
+
+    def chain_rates(self, degree: int) -> tuple[float, ...]:
+        """Return zeros; see `Condition.chain_rates`."""
+        return (0.0,) * degree
+
+
+@dataclass(frozen=True)
+class SZCBF(Condition):
+    """h_0 = h, h_j = A h_(j-1) + alpha_j h_(j-1), and h_r(x, u) >= 0, with the Ito generator A.
+
+    Its bounds: `safe_envs.proofs.guarantees`.
+
+    Attributes:
+        alphas: rates alpha_1..alpha_r in 1/s, as many as the relative degree.
+
+    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, whose
+        h_2 = A h_1 + alpha_2 h lets even noise-free trajectories leave the set.
+    """
+
+    alphas: tuple[float, ...] = (1.0,)
+    name = "szcbf"
+    stochastic = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "alphas", positive_rates("alphas", self.alphas))
+
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint; see `chain_of` for what it raises."""
+        return AffineConstraint.after(model, *chain_of(model, barrier, self.alphas, generator))
+
+    @classmethod
+    def for_gains(cls, gains: Sequence[float]) -> SZCBF:
+        """Return the SZCBF with all rates."""
+        return cls(tuple(gains))
+
+    def chain_rates(self, degree: int) -> tuple[float, ...]:
+        """Return the rates; see `Condition.chain_rates`."""
+        return self.alphas
+
+
+_H = sp.Symbol("h", positive=True)
+_FORMS = {"inverse": 1 / _H, "log": -sp.log(_H / (1 + _H))}
+
+
+@dataclass(frozen=True)
+class _Reciprocal(Condition):
+    """A B <= gamma / B for B = beta(h), as a constraint on the rate of h.
+
+    With A B = beta' A h + beta''/2 |sigma' grad h|^2 and beta' < 0, dividing by beta' gives
+
+        A h >= (gamma/beta - beta''/2 |sigma' grad h|^2)/beta'
+
+    whose slack has the units of h per s. It is defined where h > 0 only, by more than the
+    rounding of h: beyond the edge the inequality would turn round, so that there the constraint is
+    A h alone.
+    """
+
+    gamma: float = 1.0
+    form: str = "inverse"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "gamma", positive_rates("gamma", (self.gamma,))[0])
+        if self.form not in _FORMS:
+            raise ConfigurationError(
+                f"form = {shown(self.form)}; {nearest(str(self.form), _FORMS)}"
+            )
+
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint.
+
+        Raises:
+            RelativeDegreeError: the relative degree is not 1.
+        """
+        h = barrier.expression
+        degree = relative_degree(model, h, self.derivative)
+        if degree != 1:
+            raise RelativeDegreeError(
+                f"barrier {barrier.name} has relative degree {degree}; {self.name} is for relative"
+                " degree 1. Use hocbf, scbf or szcbf"
+            )
+        beta = _FORMS[self.form]
+        slope = sp.diff(beta, _H)
+        demand = sp.simplify(sp.Float(self.gamma, 17) / beta / slope)
+        if self.stochastic:
+            demand -= sp.simplify(sp.diff(beta, _H, 2) / slope / 2) * quadratic_variation_rate(
+                model, h
+            )
+        return AffineConstraint.after(
+            model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h)
+        )
+
+
+@dataclass(frozen=True)
+class RCBF(_Reciprocal):
+    """L_f B + L_g B u <= gamma / B, for relative degree 1, without noise.
+
+    Outside C it has no meaning: the filter gives the action of the largest rate of h there, flagged
+    as infeasible.
+
+    Attributes:
+        gamma: weight > 0, in 1/s times the square of the unit of B; no rate, so that the gains of a
+            problem do not set it.
+        form: "inverse" for B = 1/h, "log" for B = -log(h/(1 + h)).
+
+    Source: thesis Sec. 2.1.2, Def. 2.1.6.
+    """
+
+    name = "rcbf"
+
+
+@dataclass(frozen=True)
+class SRCBF(_Reciprocal):
+    """A B <= gamma / B with the Ito generator A, for relative degree 1.
+
+    Under noise the second derivative of B asks for unbounded control towards the edge: a box breaks
+    the condition there. Outside C it has no meaning: the filter gives the action of the largest A h
+    there, flagged as infeasible.
+
+    Attributes:
+        gamma: weight > 0, in 1/s times the square of the unit of B; no rate, so that the gains of a
+            problem do not set it.
+        form: "inverse" for B = 1/h, "log" for B = -log(h/(1 + h)).
+
+    Source: thesis Def. 4.2.1, Sec. 4.2.2 and 4.3.1.
+    """
+
+    name = "srcbf"
+    stochastic = True
+    almost_sure = True

@@ -9,12 +9,10 @@ from safe_envs import plugins
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.filters.conditions.base import Condition
 from safe_envs.filters.conditions.bayesian import BayesianSCBF
-from safe_envs.filters.conditions.cbf import CBF, ECBF, HOCBF
+from safe_envs.filters.conditions.cbf import CBF, ECBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF
 from safe_envs.filters.conditions.certified import Certified
 from safe_envs.filters.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
 from safe_envs.filters.conditions.names import BY_THEMSELVES, condition_names, unknown_filter
-from safe_envs.filters.conditions.reciprocal import RCBF, SRCBF
-from safe_envs.filters.conditions.stochastic import SCBF, SZCBF
 from safe_envs.plugins import load_object, place_of
 
 CONDITIONS: dict[str, type[Condition]] = {

@@ -159,11 +159,6 @@ def parts_of(text: str) -> list[ConditionText]:
     return [_part(part, head) for part in (text[:start] + first, *others)]
 
 
-def part_of(text: str) -> ConditionText:
-    """Take the text of one condition apart."""
-    return _part(text, re.compile(head_pattern()))
-
-
 def _part(text: str, head: re.Pattern[str]) -> ConditionText:
     name = _head(text, head)
     rest, *settings = text[len(name) :].split(":")
@@ -186,9 +181,6 @@ def _has_module(name: str) -> bool:
 
 def learned_parts(text: str) -> list[tuple[str, str | None]]:
     """Return the method and the file, None without one, of each condition that needs a model."""
-    # The classes need symbolic algebra, and the rest of this module does not.
-    from safe_envs.filters.conditions.registry import condition_class
-
     return [
         (method, next((s[len("file=") :] for s in part.settings if s.startswith("file=")), None))
         for part in parts_of(text)
@@ -364,7 +356,7 @@ def parse_condition(text: str, gains: Sequence[float]) -> Condition:
         ConfigurationError: The name or a parameter is unknown or comes twice, or a value is not
             allowed.
     """
-    part = part_of(text)
+    part = _part(text, re.compile(head_pattern()))
     return _of_model(part, *_settings(part), gains)
 
 
