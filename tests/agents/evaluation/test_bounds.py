@@ -169,6 +169,8 @@ def test_a_promise_filter_is_a_row_with_its_own_bound(promised):
     row, scbf = found.rows[1:]
     assert row.held_bound == pytest.approx(0.9, abs=1e-3)
     assert (row.held_word, row.continuous_bound, row.continuous_word) == ("computed", None, "none")
+    again = evaluate(SCALAR, "nominal", name, episodes=100, num_envs=7, options=SHORT)
+    assert again.rows == [row]
     # Equal values at all starts.
     assert row.held_error == 0.0
     assert row.ci_high >= row.held_bound
