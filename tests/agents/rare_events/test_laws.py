@@ -185,7 +185,7 @@ def test_splitting_is_unbiased_and_its_interval_covers():
     sigma, dt, horizon = 0.42, 0.1, 1.0
     problem = mean_reverting(1.0, sigma, dt, horizon)
     exact = mean_reverting_passage(1.0, sigma, dt, horizon)
-    row = row_of(problem, engine="numpy", particles=40, repetitions=200)
+    row = row_of(problem, engine="numpy", particles=60, repetitions=200)
     assert row.method.startswith("splitting")
     estimates = np.array(row.estimates)
     assert estimates.mean() == pytest.approx(exact, abs=3 * estimates.std() / math.sqrt(200))
