@@ -152,17 +152,7 @@ def _play(
 def _judge(
     env: SafeVectorEnv, policy: BestPolicy, seeds: list[int], counts: np.ndarray, tell: Progress
 ) -> tuple[int, int]:
-    """Count the episodes of a batch that meet a specification: in the workspace, and outside.
-
-    What was settled before the workspace is left counts as met inside of it.
-
-    Args:
-        env: to simulate.
-        policy: who acts.
-        seeds: of the episodes.
-        counts: which of them count.
-        tell: called with the part that is done.
-    """
+    """Count the episodes of a batch that meet a specification: in the workspace, and outside."""
     plant, problem = env.problem.plant, env.problem
     outside = compile_function(plant.states, (plant.numeric(problem.outside),), "arrays")
     monitor = SpecificationMonitorVector(env, policy.settings.specification)

@@ -610,10 +610,7 @@ def _expanded(given: Filter, belief: float) -> list[tuple[str, Filter, bool]]:
 
 
 def _with_belief(given: Filter, belief: float) -> Filter | None:
-    """Return a filter whose conditions know the belief; None where they cannot, or do already.
-
-    A bound of the error, `measurement_error`, leaves the belief no place.
-    """
+    """Return a filter whose conditions know the belief; None where they cannot, or do already."""
     if _has_belief(given) or _has_bound(given):
         return None
     if isinstance(given, str):

@@ -244,13 +244,7 @@ def _measure(
 
 
 def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]:
-    """Return which horizons to measure, in units of the problem's.
-
-    A lasting bound under noise may take long to fail.
-
-    The long ones get a run of their own, since the instants at which a run is read are spread over
-    the whole of it.
-    """
+    """Return which horizons to measure, in units of the problem's."""
     # Several conditions on more than two inputs go to an iterative solver.
     allowed = _MOST_SOLVED if len(world.barriers) > 1 and len(world.inputs) > 2 else _MOST_STEPS
     most = min(_MOST_INSTANTS, allowed // episodes) / world.steps
@@ -281,10 +275,7 @@ def _all_compared(found: list[MeasuredSafety]) -> list[MeasuredSafety]:
 
 
 def _compared(measurement: MeasuredSafety, horizon: Horizon, comparisons: int) -> Horizon:
-    """Name the bounds above the interval, or above the rate where nothing is random.
-
-    A mean over starts may lie above the mean over all starts by a few of its standard errors.
-    """
+    """Name the bounds above the interval, or above the rate where nothing is random."""
     most = (
         horizon.rate
         if measurement.repeats

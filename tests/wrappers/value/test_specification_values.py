@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.satisfaction import measure_satisfaction
+from tests.oracles.satisfaction import measure_satisfaction
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.filters.specification import SpecificationTracker
