@@ -1,4 +1,4 @@
-"""How safe any policy can be, from the starts of an env, and the yardstick made of it."""
+"""How safe any policy can be, from the starts of an env, and how rows are measured by it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation import attainable, yardstick
+from safe_envs.agents.evaluation import attainable
 from safe_envs.agents.evaluation.attainable import (
     AttainableSafety,
     SimulatedRate,
-    attainable_safety,
-    leaves_safely,
-    simulate,
-)
-from safe_envs.agents.evaluation.yardstick import (
     TimesUnavoidable,
+    attainable_safety,
     best_for,
     held_against,
+    leaves_safely,
+    simulate,
     times_unavoidable,
 )
 from safe_envs.files import VARIABLE, entries
@@ -176,7 +174,7 @@ def test_where_the_countings_are_the_same_is_known():
 
 
 def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache):
-    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    monkeypatch.setattr(attainable, "evaluation_settings", lambda problem: COARSE)
     given = {"options": NEAR_THE_EDGE, "filters": ["none"], "episodes": 50, "bounds": False}
     assert evaluate("Scalar-v0", **given).document()["best"] is None
     computed = evaluate("Scalar-v0", best=True, **given)
@@ -193,12 +191,12 @@ def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache)
 
 
 def test_what_is_attainable_from_the_starts_is_computed_once(monkeypatch, empty_cache):
-    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    monkeypatch.setattr(attainable, "evaluation_settings", lambda problem: COARSE)
     problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
     found = best_for(problem)
     (kept,) = entries("attainable")
     with monkeypatch.context() as patch:
-        patch.setattr(yardstick, "attainable_safety", lambda *_, **__: pytest.fail("again"))
+        patch.setattr(attainable, "attainable_safety", lambda *_, **__: pytest.fail("again"))
         assert best_for(problem) == found
         # From other starts something else is attainable.
         with pytest.raises(pytest.fail.Exception):

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
+from safe_envs.agents.evaluation.attainable import TimesUnavoidable
 from safe_envs.agents.evaluation.latex_table import escape
 from safe_envs.agents.evaluation.notes import computed_notes, evaluation_notes, learned_notes
 from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorSummary
@@ -28,7 +29,6 @@ from safe_envs.agents.evaluation.table import (
     evaluation_table,
     times_text,
 )
-from safe_envs.agents.evaluation.yardstick import TimesUnavoidable
 from safe_envs.scripts.reports.evaluation import heading, print_evaluation
 from tests.agents.evaluation.made_up import LONG_NAME, attainable, nasty_evaluation
 

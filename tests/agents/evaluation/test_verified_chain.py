@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.evaluation import safety_chain as of
+from safe_envs.agents.evaluation.attainable import against_attainable, chained
 from safe_envs.agents.evaluation.bounds import FilteredPolicy
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.safety_chain import (
@@ -18,7 +19,6 @@ from safe_envs.agents.evaluation.safety_chain import (
     safety_chain,
     starts_of,
 )
-from safe_envs.agents.evaluation.yardstick import against_attainable, chained
 from safe_envs.errors import ConfigurationError
 from safe_envs.proofs.feasibility import verify
 from safe_envs.proofs.guarantees import Bound
