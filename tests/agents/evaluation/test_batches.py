@@ -122,9 +122,15 @@ def test_parts_of_the_work_and_files_of_episodes_change_nothing(tmp_path, monkey
 
 
 @pytest.mark.oracle
-@pytest.mark.parametrize("env_id", ["Scalar-v0", "StochasticDubins-v0"])
-def test_processes_change_nothing(env_id):
-    given = {"options": {"horizon": 1.0}, "episodes": 40, "monitoring": "continuous"}
+@pytest.mark.parametrize(
+    ("env_id", "given"),
+    [
+        ("StochasticDubins-v0", {"monitoring": "continuous", "options": {"horizon": 1.0}}),
+        ("Pendulum-v0", {"estimator": "ekf", "options": {"measurement": "default"}}),
+    ],
+)
+def test_processes_change_nothing(env_id, given):
+    given = {"episodes": 40, "bounds": False, **given}
     assert_same_to_the_bit(*(evaluate(env_id, "random", jobs=n, **given) for n in (1, 2)))
 
 

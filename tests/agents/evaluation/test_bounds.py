@@ -352,6 +352,9 @@ def test_a_closed_loop_has_its_bound_at_the_starts_and_that_of_every_policy_is_l
     assert bound.at(starts)[0] > bound.at(starts)[2] == 0.0
     assert (bound.at(np.repeat(starts[:1], 5, axis=0)) == bound.at(starts)[0]).all()
     assert bound.at(np.zeros((0, 1))).shape == (0,)
+    # A promise filter has a table of its own.
+    promise = replace(loop_of(), parts=PromiseSettings(0.9))
+    assert compute_closed_loop(promise) is closed_loop_bound(promise) is None
     # Policies without a formula have that of every policy.
     tables = [compute_closed_loop(loop_of(policy=name)) for name in ("random", "")]
     assert tables[0] is tables[1]

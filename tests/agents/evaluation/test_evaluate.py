@@ -199,7 +199,7 @@ def test_an_episode_that_starts_on_the_edge_is_unsafe_and_counts_no_step():
         "Scalar-v0", Constant(-0.5), ["none", "scbf"], options=options, episodes=2, bounds=False
     )
     for row in answer.rows:
-        assert (row.safe, row.violations, row.safety_rate) == (0, 2, 0.0)
+        assert (row.safe, row.violations, row.touching, row.safety_rate) == (0, 2, 2, 0.0)
         assert (row.intervention_rate, row.infeasible_rate, row.effort_mean) == (None, None, None)
         assert row.min_h_median == row.min_h_p05 == 0.0
         assert row.return_mean > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 from concurrent.futures import Future
 from dataclasses import replace
@@ -27,7 +28,7 @@ from safe_envs.agents.rare_events.estimate import (
     skewed_interval,
 )
 from safe_envs.agents.rare_events.numpy_paths import NumpyPaths, TiltedNoiseEnv
-from safe_envs.agents.rare_events.splitting import ImportanceSampling, Splitting
+from safe_envs.agents.rare_events.splitting import ImportanceSampling, Splitting, optimal_tilt
 from safe_envs.engine.program import Program
 from safe_envs.errors import NotCompilableError
 from safe_envs.problem.problem import Barrier
@@ -164,6 +165,16 @@ def test_scores_are_compared_by_how_high_unbiased_estimates_lie():
     # One that is given up at times loses more than any other.
     lost = np.where(np.arange(21) == 3, 0.0, 100.0)
     assert (better(low, lost), better(lost, low), better(lost, lost)) == (0, 1, 0)
+
+
+def test_the_best_drift_has_the_least_second_moment_and_other_ways_count_against_it():
+    # Paths of noise W_1 = 5, by Girsanov: E[w; violation] = p exp(-5 c + c^2/2), least at c = 5.
+    integrals, shares = np.tile([-5.0, 1.0], (50, 1)), np.full(50, 2e-8)
+    length, deviation = optimal_tilt(integrals, shares, 1.0)
+    assert length == pytest.approx(5.0, rel=1e-4)
+    assert deviation == pytest.approx(math.sqrt(math.exp(-12.5) / 1e-6 - 1.0), rel=1e-6)
+    integrals[0, 0] = 0.0
+    assert optimal_tilt(integrals, shares, 1.0)[1] > 30 * deviation
 
 
 def estimate(p, width, spread=0.1):
