@@ -17,7 +17,7 @@ from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, StateEstimatorVe
 
 ENV = "safe_envs/Pendulum-v0"
 OPTIONS = {"measurement": "default", "horizon": 0.3}
-PLAIN = {"episodes": 40, "bounds": False}
+PLAIN = {"episodes": 20, "bounds": False}
 SHORT = {"options": OPTIONS, "estimator": "ekf", **PLAIN}
 
 
@@ -74,12 +74,12 @@ def test_views_of_a_filter(filters, more, names):
 def test_estimates_are_counted_as_the_envs_report_them():
     (row,) = evaluate(ENV, filters=["scbf:belief=0.1"], **SHORT).rows
     problem = make_problem(ENV, **OPTIONS)
-    env = StateEstimatorVectorWrapper(SafeVectorEnv(problem, 40))
+    env = StateEstimatorVectorWrapper(SafeVectorEnv(problem, 20))
     env = SafetyFilterVectorWrapper(env, "scbf:belief=0.1")
     policy = NominalController(problem.unmeasured)
-    seen, info = env.reset(seed=[episode_seed(0, i) for i in range(40)])
+    seen, info = env.reset(seed=[episode_seed(0, i) for i in range(20)])
     sums = {key: info[key].sum() for key in ("nees", "nees_dof", "nis", "nis_dof")}
-    outside, count, alive = info["belief_barrier"][:, 0] < 0, 40, np.ones(40, dtype=bool)
+    outside, count, alive = info["belief_barrier"][:, 0] < 0, 20, np.ones(20, dtype=bool)
     for _ in range(problem.steps):
         seen, _, ended, cut, info = env.step(policy.predict(seen)[0])
         for key in sums:
