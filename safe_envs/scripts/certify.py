@@ -162,7 +162,7 @@ def _certify_held(named: Named, settings: SynthesisSettings, output: _HeldOutput
 
 def _attainable(problem: SafetyProblem) -> float | None:
     """Return how safe any policy can be at most."""
-    from safe_envs.agents.evaluation.yardstick import best_for
+    from safe_envs.agents.evaluation.attainable import best_for
 
     with progress_bar("Best attainable safety") as tell:
         return best_for(problem, tell).upper

@@ -78,6 +78,7 @@ def verify(
     contradicts is withheld. At the end the rate stands between a bound for the env's own steps and
     what any policy can attain, with --closed-loop and --best.
     """
+    from safe_envs.agents.evaluation.attainable import best_for
     from safe_envs.agents.evaluation.bounds import FilteredPolicy
     from safe_envs.agents.evaluation.safety_chain import (
         measure,
@@ -85,7 +86,6 @@ def verify(
         starts_of,
         withhold_contradicted,
     )
-    from safe_envs.agents.evaluation.yardstick import best_for
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.engine.choice import require_engine
     from safe_envs.filters.conditions.text import parse_conditions

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from safe_envs.agents.evaluation import yardstick
+from safe_envs.agents.evaluation import attainable
 from safe_envs.values import solve
 from safe_envs.values.tables import load_table, save_table
 from tests.agents.policies.coarse import COARSE
@@ -27,7 +27,7 @@ def own_cache(monkeypatch, tmp_path):
     folder = tmp_path / "cache"
     folder.mkdir()
     monkeypatch.setattr(solve, "cache_folder", lambda name: folder)
-    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    monkeypatch.setattr(attainable, "evaluation_settings", lambda problem: COARSE)
 
 
 def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, tmp_path):

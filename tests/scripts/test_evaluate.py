@@ -12,8 +12,8 @@ import pytest
 from rich.console import Console
 
 from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation.attainable import chained
 from safe_envs.agents.evaluation.bounds import judged
-from safe_envs.agents.evaluation.yardstick import chained
 from safe_envs.scripts.reports.evaluation import print_evaluation
 from tests.agents.evaluation.made_up import attainable
 from tests.scripts.conftest import strictly

@@ -77,7 +77,7 @@ def test_each_hypothesis_has_the_word_of_the_judge(verify):
 
 
 def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
-    best = "safe_envs.agents.evaluation.yardstick.best_for"
+    best = "safe_envs.agents.evaluation.attainable.best_for"
     monkeypatch.setattr(best, lambda problem, progress: attainable(0.2, 0.3))
     arguments = ("Scalar-v0", "--start", "-1", "--horizon", 0.2, "--episodes", 40, "--json", "o.js")
     assert verify(*arguments)[0] == 0

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.satisfaction import measure_satisfaction
 from safe_envs.agents.policies.best import BestPolicy
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.filters.specification import SpecificationTracker
@@ -16,6 +15,7 @@ from safe_envs.registry import make_problem
 from safe_envs.values.look_ahead import LookAhead, start_values
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueFileError, ValueSettings, load_table, save_table
+from tests.oracles.satisfaction import measure_satisfaction
 from tests.oracles.walks import (
     NOISE,
     PERIOD,

@@ -1,8 +1,7 @@
 """Bounds for the env's own steps: the input is held, and safety is judged at control instants.
 
 Each is a lower bound on the probability of a safe episode of a policy under a filter, or of every
-policy under it, and is made by one of `MAKERS`: from the table of a promise filter, say. What makes
-a new kind of bound is added there, and nowhere else.
+policy under it: from the table of a promise filter, say. `held_bound_of` chooses among them.
 
 A bound is withheld, and the reason said, where the episodes themselves show that it, or a number it
 uses, is wrong: a start or a visited state has a b_j above the supremum c_j, the filter violated a
@@ -24,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -91,6 +90,34 @@ class FilteredPolicy:
     closed_loop: bool = False
 
 
+class HeldInputBound:
+    """A lower bound on the probability of a safe episode, in the env's own steps.
+
+    Attributes:
+        word: what it is worth; see `safe_envs.agents.evaluation.rows.HeldWord`.
+        note: what it is of.
+        why_none: why there is none at any start; "" where there may be one.
+        nowhere: what to say where it is 0 at all starts.
+    """
+
+    word: Literal["proved", "certified", "computed"]
+    note: str
+    why_none: str
+    nowhere: str
+
+    def at(self, starts: np.ndarray) -> np.ndarray:
+        """Return the bound up to the problem's horizon at starts (B, n): values in [0, 1], (B,)."""
+        raise NotImplementedError
+
+    def contradiction(self, visited: VisitedStates) -> str:
+        """Return how states of episodes contradict it; "" where none could, but their rate.
+
+        Args:
+            visited: states of the episodes.
+        """
+        return ""
+
+
 COMPUTED_PLANS = "1 where a backup law keeps the start safe; plans are of floating-point numbers"
 """Note on such a bound."""
 
@@ -98,7 +125,7 @@ STATED = "; that {} keep the terminal sets that are stated is assumed, but for s
 """What is added to it where terminal sets were not derived."""
 
 
-class BackupBound:
+class BackupBound(HeldInputBound):
     """The guarantee of a backup filter: no violation from where a law keeps the system safe.
 
     It holds for every policy and horizon, as `safe_envs.proofs.backup_filter` proves, for
@@ -108,15 +135,9 @@ class BackupBound:
         settings: of the filter.
         problem: what is simulated.
         knowledge: of the filter, "model" or "plant".
-
-    Attributes:
-        word: "computed".
-        note: what it is of.
-        why_none: why there is none at any start; "" where there may be one.
-        nowhere: what to say where it is 0 at all starts.
     """
 
-    word: Literal["computed"] = "computed"
+    word = "computed"
     nowhere = "no backup law keeps any of the starts safe"
 
     def __init__(self, settings: BackupSettings, problem: SafetyProblem, knowledge: str) -> None:
@@ -132,31 +153,12 @@ class BackupBound:
         h = np.array([np.broadcast_to(c, len(starts)) for c in plans.barriers(plans.part(x))])
         return (self._filter.domain(x) & (h > 0.0).all(axis=0)).astype(float)
 
-    def contradiction(self, visited: VisitedStates) -> str:
-        """Return "": what no state of an episode could show, its rate does.
-
-        Args:
-            visited: states of the episodes.
-        """
-        return ""
-
-
-def backup_bound(of: FilteredPolicy) -> BackupBound | None:
-    """Return the bound of a backup filter; None for other filters.
-
-    Args:
-        of: a policy, which does not matter, and the filter.
-    """
-    if not isinstance(of.parts, BackupSettings):
-        return None
-    return BackupBound(of.parts, of.problem, of.knowledge)
-
 
 _FORMULAS = ("nominal", "zero")
 """Policies that are formulas of the state."""
 
 
-class ClosedLoopBound:
+class ClosedLoopBound(HeldInputBound):
     """What a table of a closed loop says of a controller, or of every policy under a filter.
 
     It holds up to the horizon of the problem, as proposition 9 of the page on values proves.
@@ -164,15 +166,9 @@ class ClosedLoopBound:
     Args:
         table: of the closed loop; None where there is none.
         note: what it is of, or why there is none.
-
-    Attributes:
-        word: "certified".
-        note: what it is of.
-        why_none: why there is no table; "" where there is one.
-        nowhere: what to say where it is 0 at all starts.
     """
 
-    word: Literal["certified"] = "certified"
+    word = "certified"
     nowhere = (
         "the table of the closed loop has 0 at these starts: a step moves states by too little for"
         " its cells"
@@ -191,14 +187,6 @@ class ClosedLoopBound:
             one = self._table.start_bounds(starts[0][:, None])
             return np.repeat(one, len(starts))
         return self._table.start_bounds(tuple(np.ascontiguousarray(starts.T)))
-
-    def contradiction(self, visited: VisitedStates) -> str:
-        """Return "": what no state of an episode could show, its rate does.
-
-        Args:
-            visited: states of the episodes.
-        """
-        return ""
 
 
 def closed_loop_bound(of: FilteredPolicy) -> ClosedLoopBound | None:
@@ -267,21 +255,16 @@ PROVED = "the certificate's statements are proved by branch and bound"
 """Note on such a bound."""
 
 
-class HeldCertificateBound:
+class HeldCertificateBound(HeldInputBound):
     """The bound of a certificate of held input, which holds for every policy under its filter.
 
     Args:
         certificate: of the filter.
         conditions: all of the filter.
         problem: what is simulated.
-
-    Attributes:
-        word: "proved".
-        note: what it is of.
-        nowhere: what to say where it is 0 at all starts.
     """
 
-    word: Literal["proved"] = "proved"
+    word = "proved"
     note = PROVED
     nowhere = "the certificate says nothing at any start"
 
@@ -293,10 +276,9 @@ class HeldCertificateBound:
     ) -> None:
         self._certificate, self._conditions, self._problem = certificate, conditions, problem
         self._bound = stated_bound(certificate)
+        self.why_none = self._why_none()
 
-    @property
-    def why_none(self) -> str:
-        """Why there is none at any start; "" where there may be one."""
+    def _why_none(self) -> str:
         if any(condition != self._conditions[0] for condition in self._conditions):
             return "other conditions act besides that of the certificate"
         differing = system_differences(self._certificate.plant, self._problem.plant)
@@ -337,7 +319,7 @@ COMPUTED_TABLE = "computed: the table is of floating-point numbers"
 """Note on such a bound."""
 
 
-class PromiseBound:
+class PromiseBound(HeldInputBound):
     """The guarantee of a promise filter: p_0 = min(p, one step of look-ahead).
 
     It holds for every policy, up to the horizon, as `safe_envs.values.promise_filter`
@@ -349,15 +331,9 @@ class PromiseBound:
         settings: of the filter.
         problem: what is simulated.
         knowledge: of the filter, "model" or "plant".
-
-    Attributes:
-        word: "computed".
-        note: why it is no more than that.
-        why_none: why there is none at any start; "" where there may be one.
-        nowhere: what to say where it is 0 at all starts.
     """
 
-    word: Literal["computed"] = "computed"
+    word = "computed"
     note = COMPUTED_TABLE
     nowhere = "no start is in the table's safe set"
 
@@ -381,17 +357,6 @@ class PromiseBound:
         if lost <= ROUNDING:
             return ""
         return f"no input kept p_k in a step, which fell by {lost:.2g}: the table is wrong"
-
-
-def promise_bound(of: FilteredPolicy) -> PromiseBound | None:
-    """Return the bound of a promise filter; None for other filters.
-
-    Args:
-        of: a policy, which does not matter, and the filter.
-    """
-    if not isinstance(of.parts, PromiseSettings):
-        return None
-    return PromiseBound(of.parts, of.problem, of.knowledge)
 
 
 SURE = 0.999
@@ -546,65 +511,29 @@ def without_continuous(row: Bounded, reason: str) -> Bounded:
     return replace(row, posterior_bound=none)
 
 
-class HeldInputBound(Protocol):
-    """A lower bound on the probability of a safe episode, in the env's own steps."""
-
-    @property
-    def word(self) -> Literal["proved", "certified", "computed"]:
-        """What it is worth; see `safe_envs.agents.evaluation.rows.HeldWord`."""
-        ...
-
-    @property
-    def note(self) -> str:
-        """What it is of, in words."""
-        ...
-
-    @property
-    def why_none(self) -> str:
-        """Why there is none at any start; "" where there may be one."""
-        ...
-
-    @property
-    def nowhere(self) -> str:
-        """What to say where it is 0 at all starts."""
-        ...
-
-    def at(self, starts: np.ndarray) -> np.ndarray:
-        """Return the bound up to the problem's horizon at starts (B, n): values in [0, 1], (B,)."""
-        ...
-
-    def contradiction(self, visited: VisitedStates) -> str:
-        """Return how states of episodes contradict it; "" if they do not."""
-        ...
-
-
-Maker = Callable[[FilteredPolicy], HeldInputBound | None]
-"""From a policy under a filter to its bound; None where such a bound is not for such filters."""
-
-MAKERS: tuple[Maker, ...] = (closed_loop_bound, held_certificate_bound, promise_bound, backup_bound)
-"""All that makes such bounds, the best one first."""
-
 NO_FILTER = "there is no filter"
-NO_MAKER = "neither a table nor a certificate of the env's own step is known for it"
+_NO_BOUND = "neither a table nor a certificate of the env's own step is known for it"
 _BETWEEN = "it is of control instants, not of the time between them"
 
 
-def held_bound_of(
-    of: FilteredPolicy, makers: Sequence[Maker] | None = None
-) -> HeldInputBound | str:
+def held_bound_of(of: FilteredPolicy) -> HeldInputBound | str:
     """Return the bound of a policy under a filter for the env's own steps, or why there is none.
 
     Args:
         of: the policy and the filter.
-        makers: of bounds; by default all.
     """
     why_not = why_not_direct(of.problem, "bounds of a filter")
     if why_not:
         return why_not
-    made = (make(of) for make in (MAKERS if makers is None else makers))
-    found = [bound for bound in made if bound is not None]
+    found: list[HeldInputBound] = [
+        bound for bound in (closed_loop_bound(of), held_certificate_bound(of)) if bound is not None
+    ]
+    if isinstance(of.parts, PromiseSettings):
+        found.append(PromiseBound(of.parts, of.problem, of.knowledge))
+    if isinstance(of.parts, BackupSettings):
+        found.append(BackupBound(of.parts, of.problem, of.knowledge))
     if not found:
-        return NO_MAKER if of.parts else NO_FILTER
+        return _NO_BOUND if of.parts else NO_FILTER
     best = next((bound for bound in found if not bound.why_none), found[0])
     return best.why_none or best
 
@@ -648,21 +577,6 @@ class HeldAverager:
             held_note=bound.note,
             held_error=self._values.error,
         )
-
-
-def held_averager_of(of: FilteredPolicy, monitoring: str, why_not: str | None) -> HeldAverager:
-    """Return what averages the bound of a policy under a filter for the env's own steps.
-
-    Args:
-        of: the policy and the filter.
-        monitoring: where h is checked, "discrete" or "continuous".
-        why_not: why not to look for a bound at all, if so.
-    """
-    if monitoring == "continuous":
-        why_not = why_not or _BETWEEN
-    if why_not:
-        return HeldAverager(why_not if of.parts else NO_FILTER)
-    return HeldAverager(held_bound_of(of))
 
 
 SECONDS = 6.0
@@ -711,17 +625,12 @@ class GuaranteeAverager:
         self._lost, self._starts = 0, 0
         self._against, self._nothing = "", VisitedStates.nothing(problem)
         if conditions and not why_not:
-            self._look(conditions, problem, knowledge)
-
-    def _look(
-        self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str
-    ) -> None:
-        try:
-            self._found = guarantee_of(problem, conditions, knowledge, SECONDS)
-            self._why_none = self._found.note or _refuted(self._found) or None
-        except SafeEnvsError as error:
-            # The search covers the whole safe set, where the episodes may never be.
-            self._why_none = str(error)
+            try:
+                self._found = guarantee_of(problem, conditions, knowledge, SECONDS)
+                self._why_none = self._found.note or _refuted(self._found) or None
+            except SafeEnvsError as error:
+                # The search covers the whole safe set, where the episodes may never be.
+                self._why_none = str(error)
 
     def add(self, starts: np.ndarray) -> None:
         """Add the starts of a batch, shape (E, n)."""
@@ -810,10 +719,7 @@ def _undecided(found: Guarantee) -> str:
 def _outside_of(
     conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str
 ) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Return a function that finds the states in C but outside the sets C_j of conditions.
-
-    It maps states (B, n) to booleans (B,); None where the sets are not known.
-    """
+    """Return a function that finds the states in C but outside the sets C_j of conditions."""
     corrected = any(c.corrects_model for c in conditions)
     known = problem.plant if knowledge == "plant" and not corrected else problem.model
     if conditions:
@@ -892,7 +798,9 @@ class BoundAverager:
     def __init__(
         self, of: FilteredPolicy, monitoring: str = "discrete", why_not: str | None = None
     ) -> None:
-        self._held: HeldAverager = held_averager_of(of, monitoring, why_not)
+        why_not_held = why_not or (_BETWEEN if monitoring == "continuous" else "")
+        nothing = why_not_held if of.parts else NO_FILTER
+        self._held = HeldAverager(nothing if why_not_held else held_bound_of(of))
         self._continuous: GuaranteeAverager | str
         if isinstance(of.parts, FilterSettings):
             self._continuous = of.parts.only_of_steps

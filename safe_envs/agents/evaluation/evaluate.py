@@ -10,7 +10,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety, WorkParts
+from safe_envs.agents.evaluation.attainable import (
+    WorkParts,
+    best_for,
+    chained,
+    progress_of_part,
+)
 from safe_envs.agents.evaluation.bounds import (
     BoundAverager,
     FilteredPolicy,
@@ -44,7 +49,6 @@ from safe_envs.agents.evaluation.statistics import (
     paired_difference_interval,
 )
 from safe_envs.agents.evaluation.table import evaluation_table, setting_lines
-from safe_envs.agents.evaluation.yardstick import best_for, chained
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.learning.models.base import LearnedModel
 from safe_envs.problem.problem import SafetyProblem
@@ -119,7 +123,7 @@ class EvaluationRunner:
         resolved, spec, settings = self._resolved, self._spec, self._settings
         for each in self._all:
             each.learn(self._work.part)
-        best = self._best()
+        best = best_for(resolved.truth, self._work.part()) if spec.best else None
         bounded = {view.name: self._bounded(view) for view in self._views}
         # The bounds find the tables as long as they are in use here.
         tables = [
@@ -146,7 +150,9 @@ class EvaluationRunner:
                 sinks.append(opened.enter_context(episodes_file(path, resolved.problem.dt)))
             for view in self._views:
                 name = view.name
-                averagers = [self._averager(of, view) for of in bounded[name]]
+                asked = None if spec.bounds else "it was not asked for"
+                why_not = view.resolved.target.why_no_bound or asked or view.why_no_bound
+                averagers = [BoundAverager(of, spec.monitoring, why_not) for of in bounded[name]]
                 totals, seconds = self._simulated(
                     name, list(zip(players[name], averagers, strict=True)), trajectories, sinks
                 )
@@ -172,10 +178,6 @@ class EvaluationRunner:
             best,
         )
 
-    def _best(self) -> AttainableSafety | None:
-        """Return how safe any policy can be, if it is asked for."""
-        return best_for(self._resolved.truth, self._work.part()) if self._spec.best else None
-
     def _bounded(self, view: View) -> list[FilteredPolicy]:
         """Return what the bounds of a filter are of, for each identification."""
         spec = self._spec
@@ -183,11 +185,6 @@ class EvaluationRunner:
         policy = spec.policy if isinstance(spec.policy, str) else ""
         given = (spec.knowledge, policy, spec.objective, spec.closed_loop)
         return [FilteredPolicy(view.resolved.truth, parts, *given) for parts in view.filters]
-
-    def _averager(self, of: FilteredPolicy, view: View) -> BoundAverager:
-        asked = None if self._spec.bounds else "it was not asked for"
-        why_not = view.resolved.target.why_no_bound or asked or view.why_no_bound
-        return BoundAverager(of, self._spec.monitoring, why_not)
 
     def _simulated(
         self,
@@ -322,7 +319,7 @@ def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSett
         repeats: number of identifications of what is learned.
         monitoring: where h is checked, "discrete" or "continuous".
         best: whether to compute how safe any policy can be, see
-            `safe_envs.agents.evaluation.yardstick`.
+            `safe_envs.agents.evaluation.attainable`.
         closed_loop: whether to compute certified tables for the bound of the env's own steps, see
             `safe_envs.values.closed_loop`.
         estimator: of the state of a measured problem, "kf", "ekf" or "ukf".
@@ -519,7 +516,12 @@ def refine(
         raise ConfigurationError(
             "the control period of a third-party env is its own, and cannot be refined"
         )
-    shares = _shares(progress)
+    # The work of each evaluation is that of its control periods.
+    work = (1, *DIVISORS)
+    shares = [
+        progress_of_part(progress, sum(work[:i]) / sum(work), part / sum(work))
+        for i, part in enumerate(work)
+    ]
     of_given = {"record": record, "episodes_out": episodes_out}
     given = evaluate(problem, policy, progress=shares[0], **of_given, **arguments)
     arguments |= {
@@ -560,19 +562,6 @@ def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
         finer_row = evaluation.row(row.filter)
         row = continuous_judged(row, *upper_ends_of(finer_row, evaluation.spec.confidence))
     return row
-
-
-def _shares(progress: Progress | None) -> list[Progress | None]:
-    """Return the progress of each evaluation, whose work is that of its control periods."""
-    parts, before, found = (1, *DIVISORS), 0, []
-    for part in parts:
-        found.append(progress and _share(progress, before / sum(parts), part / sum(parts)))
-        before += part
-    return found
-
-
-def _share(progress: Progress, before: float, size: float) -> Progress:
-    return lambda done: progress(before + size * done)
 
 
 def _divided(problem: SafetyProblem, divisor: int, coupled: bool) -> SafetyProblem:

@@ -240,10 +240,7 @@ def _repeats(rows: Sequence[EvaluationRow]) -> int:
 
 
 def _may_have_a_bound(problem: SafetyProblem) -> bool:
-    """Return whether a problem has one barrier, of relative degree 1.
-
-    Others have no robust condition, which such a bound needs.
-    """
+    """Return whether a problem has one barrier, of relative degree 1."""
     if len(problem.barriers) != 1:
         return False
     (barrier,) = problem.barriers

@@ -603,18 +603,15 @@ def _expanded(given: Filter, belief: float) -> list[tuple[str, Filter, bool]]:
     """Return a filter at the true state, at the estimate, and with the belief if it can have it."""
     name = filter_text(given)
     known = _with_belief(given, belief)
-    if known is None and _has_belief(given):
+    if known is None and _sets(given, "belief"):
         return [(name, given, False)]
     rows: list[tuple[str, Filter, bool]] = [(name + AT_STATE, given, True), (name, given, False)]
     return rows if known is None else [*rows, (filter_text(known), known, False)]
 
 
 def _with_belief(given: Filter, belief: float) -> Filter | None:
-    """Return a filter whose conditions know the belief; None where they cannot, or do already.
-
-    A bound of the error, `measurement_error`, leaves the belief no place.
-    """
-    if _has_belief(given) or _has_bound(given):
+    """Return a filter whose conditions know the belief; None where they cannot, or do already."""
+    if _sets(given, "belief") or _sets(given, "measurement_error"):
         return None
     if isinstance(given, str):
         parts = [] if given == UNFILTERED else parts_of(given)
@@ -627,16 +624,11 @@ def _with_belief(given: Filter, belief: float) -> Filter | None:
     return tuple(replace(condition, belief=belief) for condition in conditions)
 
 
-def _has_belief(given: Filter) -> bool:
+def _sets(given: Filter, parameter: str) -> bool:
+    """Return whether a filter sets a parameter of its conditions itself."""
     if isinstance(given, str):
-        return ":belief=" in given
-    return any(condition.belief is not None for condition in conditions_in(given))
-
-
-def _has_bound(given: Filter) -> bool:
-    if isinstance(given, str):
-        return ":measurement_error=" in given
-    return any(condition.measurement_error for condition in conditions_in(given))
+        return f":{parameter}=" in given
+    return any(getattr(condition, parameter) for condition in conditions_in(given))
 
 
 def _without_sensor(spec: EvaluationSpec, filters: Sequence[Filter]) -> EvaluationSpec:

@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.attainable import (
+    AttainableSafety,
+    best_document,
+    times_unavoidable,
+)
 from safe_envs.agents.evaluation.episodes import Trajectories, VisitedStates
 from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
 from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.evaluation.statistics import Comparison, SafeFlags
-from safe_envs.agents.evaluation.yardstick import best_document, times_unavoidable
 from safe_envs.agents.jobs.store import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.learning.models.base import LearnedModel

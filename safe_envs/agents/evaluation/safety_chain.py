@@ -6,13 +6,18 @@ next to it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety, contradicted
+from safe_envs.agents.evaluation.attainable import (
+    AttainableSafety,
+    against_attainable,
+    contradicted,
+    progress_of_part,
+)
 from safe_envs.agents.evaluation.bounds import (
     FilteredPolicy,
     HeldAverager,
@@ -26,15 +31,13 @@ from safe_envs.agents.evaluation.bounds import (
 from safe_envs.agents.evaluation.episodes import VisitedStates
 from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
 from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import exact_upper_end
-from safe_envs.agents.evaluation.yardstick import against_attainable
 from safe_envs.filters.conditions.text import FilterSettings, spec_of
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.proofs.feasibility import Verification
 from safe_envs.proofs.guarantees import HOLDING, Bound
 from safe_envs.proofs.safe_set import draw_starts
-
-Progress = Callable[[float], None]
 
 STARTS = 2**14
 """How many starts of a distribution a bound is averaged over."""
@@ -176,7 +179,7 @@ def measure(
         )
     found = []
     for i, (name, world) in enumerate(worlds):
-        part = None if progress is None else _part_of(progress, i / len(worlds), 1.0 / len(worlds))
+        part = progress_of_part(progress, i / len(worlds), 1.0 / len(worlds))
         found.append(_measure(verification, name, world, policy, episodes, seed, engine, part))
     return _all_compared(found)
 
@@ -189,11 +192,6 @@ def starts_of(problem: SafetyProblem, seed: int = 0) -> np.ndarray:
         seed: of the draws.
     """
     return draw_starts(problem, STARTS if problem.starts[problem.start].uniforms else 1, seed)
-
-
-def _part_of(progress: Progress, before: float, size: float) -> Progress:
-    """From the part of a piece of the work that is done to the part of the whole."""
-    return lambda done: progress(before + size * done)
 
 
 def _measure(
@@ -226,9 +224,7 @@ def _measure(
             knowledge=formulas.knowledge,
             bounds=False,
             engine=engine,
-            progress=(
-                None if progress is None else _part_of(progress, done / whole, run[-1] / whole)
-            ),
+            progress=progress_of_part(progress, done / whole, run[-1] / whole),
         )
         horizons += [_horizon(verification, answer, k * world.duration, starts) for k in run]
         visited += answer.visited[answer.rows[0].filter]
@@ -244,13 +240,7 @@ def _measure(
 
 
 def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]:
-    """Return which horizons to measure, in units of the problem's.
-
-    A lasting bound under noise may take long to fail.
-
-    The long ones get a run of their own, since the instants at which a run is read are spread over
-    the whole of it.
-    """
+    """Return which horizons to measure, in units of the problem's."""
     # Several conditions on more than two inputs go to an iterative solver.
     allowed = _MOST_SOLVED if len(world.barriers) > 1 and len(world.inputs) > 2 else _MOST_STEPS
     most = min(_MOST_INSTANTS, allowed // episodes) / world.steps
@@ -281,10 +271,7 @@ def _all_compared(found: list[MeasuredSafety]) -> list[MeasuredSafety]:
 
 
 def _compared(measurement: MeasuredSafety, horizon: Horizon, comparisons: int) -> Horizon:
-    """Name the bounds above the interval, or above the rate where nothing is random.
-
-    A mean over starts may lie above the mean over all starts by a few of its standard errors.
-    """
+    """Name the bounds above the interval, or above the rate where nothing is random."""
     most = (
         horizon.rate
         if measurement.repeats

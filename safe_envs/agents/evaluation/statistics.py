@@ -625,10 +625,7 @@ def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.nda
 
 @lru_cache(maxsize=64)
 def _parts(states: tuple[sp.Symbol, ...], barriers: tuple[sp.Expr, ...]) -> tuple[Any, list[int]]:
-    """Compile the terms of each barrier, and each state times its slope.
-
-    The list has a 0, and where the terms of each barrier end.
-    """
+    """Compile the terms of each barrier, and each state times its slope."""
     parts = [
         [*sp.Add.make_args(h), *(s * slope for s in states if not _jumps(slope := sp.diff(h, s)))]
         for h in barriers

@@ -9,11 +9,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.attainable import (
+    AttainableSafety,
+    TimesUnavoidable,
+    times_unavoidable,
+)
 from safe_envs.agents.evaluation.results import EvaluationData, FilterTiming
 from safe_envs.agents.evaluation.rows import BoundSummary, EstimationSummary, EvaluationRow
 from safe_envs.agents.evaluation.statistics import Comparison, percent, percent_in, points_in
-from safe_envs.agents.evaluation.yardstick import TimesUnavoidable, times_unavoidable
 from safe_envs.filters.estimation.consistency import Consistency
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.text import (

@@ -431,14 +431,7 @@ class _Estimator:
     def _estimated(
         self, nothing: RareRow, pilot: Pilot, particles: int, chosen: ChosenPlayer
     ) -> RareRow:
-        """Fill the row of a filter.
-
-        Args:
-            nothing: the row without an estimate.
-            pilot: which chooses how.
-            particles: of splitting.
-            chosen: simulates the paths.
-        """
+        """Fill the row of a filter."""
         spec, steps = self.resolved.spec, pilot.run.paths.steps
         seen, levels, check = pilot.run, pilot.run.levels[pilot.part], None
         best, drift_steps = self._by_drift(pilot, particles, chosen)
@@ -475,10 +468,7 @@ class _Estimator:
     def _by_drift(
         self, pilot: Pilot, particles: int, chosen: ChosenPlayer
     ) -> tuple[RareEstimate | None, int]:
-        """Return the estimate by importance sampling, and the control periods that it took.
-
-        There is none unless the pilot predicts that it is much better.
-        """
+        """Return the estimate by importance sampling, and the control periods that it took."""
         if pilot.often or not (pilot.estimates > 0.0).all():
             return None, 0
         length, deviation = optimal_tilt(

@@ -107,14 +107,7 @@ class NumpyPaths:
 
 
 class _Batch:
-    """Paths in the first rows of an env, which go on from their last records.
-
-    Args:
-        env: of them and of rows that do not count.
-        paths: their numbers, shape (B,).
-        keys: of them.
-        records: of all paths.
-    """
+    """Paths in the first rows of an env, which go on from their last records."""
 
     def __init__(self, env: Any, paths: np.ndarray, keys: np.ndarray, records: Records) -> None:
         self._env, self._paths, self._records = env, paths, records
@@ -129,13 +122,7 @@ class _Batch:
         env.restore(snapshot, seed=self._seeds)
 
     def begin(self, policy: Any, bridge: BrownianBridge | None, first: int) -> None:
-        """Begin the streams of a policy and of the bridges.
-
-        Args:
-            policy: who acts.
-            bridge: gives the minimum h between control instants, if it is to be looked at.
-            first: row of the first path, if all were in one batch.
-        """
+        """Begin the streams of a policy and of the bridges."""
         if isinstance(policy, Policy):
             rows = range(first, first + self._env.num_envs)
             policy.resume(rows, self._seeds, self._begun.tolist())
@@ -145,13 +132,7 @@ class _Batch:
             self._draws = Exponentials(self._seeds, bridge.draws, self._begun.tolist())
 
     def play(self, policy: Any, heights: Heights, simulation: Simulation) -> np.ndarray:
-        """Simulate the paths until they end or violate; return when.
-
-        Args:
-            policy: who acts.
-            heights: of all paths.
-            simulation: of the problem, which gives the first observation.
-        """
+        """Simulate the paths until they end or violate; return when."""
         count, world, lowest, time = len(self._paths), self._world, self._lowest, self._time
         x = world.components
         rest, _ = center_and_half_width(world.problem)

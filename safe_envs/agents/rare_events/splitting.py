@@ -479,10 +479,7 @@ class Repetitions:
         return self.paths.girsanov_integrals(np.flatnonzero(own)), np.repeat(each, counts)
 
     def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return which paths to kill, which to continue in their place, and from which level.
-
-        None if the repetition is at its end.
-        """
+        """Return which paths to kill, which to continue in their place, and from which level."""
         own = np.arange(r * self._particles, (r + 1) * self._particles)
         lowest = self.paths.lowest[own]
         place = self._particles - self._rank

@@ -21,10 +21,10 @@ import yaml
 from yaml.composer import ComposerError
 from yaml.constructor import ConstructorError
 
+from safe_envs.agents.evaluation.attainable import best_document
 from safe_envs.agents.evaluation.evaluate import run_evaluation
 from safe_envs.agents.evaluation.resolve import views_of
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, RunSettings
-from safe_envs.agents.evaluation.yardstick import best_document
 from safe_envs.agents.jobs.store import (
     file_checksum,
     json_checksum,

@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.attainable import AttainableSafety
-from safe_envs.agents.evaluation.frontier import Frontier
-from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.agents.evaluation.yardstick import (
+from safe_envs.agents.evaluation.attainable import (
+    AttainableSafety,
     best_for,
     evaluation_settings,
 )
+from safe_envs.agents.evaluation.frontier import Frontier
+from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.jobs.store import ResultStore, package_versions, reading
 from safe_envs.agents.training.config import ALGORITHMS
 from safe_envs.agents.training.study import (

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from safe_envs.agents.evaluation.attainable import times_between
 from safe_envs.agents.evaluation.spec import is_unfiltered
 from safe_envs.agents.evaluation.statistics import percent, rate_of
 from safe_envs.agents.evaluation.table import bound_cells, ends_text, times_text
-from safe_envs.agents.evaluation.yardstick import times_between
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_columns, print_rows
 from safe_envs.text import Column, without_empty

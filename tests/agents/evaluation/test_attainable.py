@@ -1,4 +1,4 @@
-"""How safe any policy can be, from the starts of an env, and the yardstick made of it."""
+"""How safe any policy can be, from the starts of an env, and how rows are measured by it."""
 
 from __future__ import annotations
 
@@ -8,20 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation import attainable, yardstick
+from safe_envs.agents.evaluation import attainable
 from safe_envs.agents.evaluation.attainable import (
     AttainableSafety,
     SimulatedRate,
-    attainable_safety,
-    leaves_safely,
-    simulate,
-)
-from safe_envs.agents.evaluation.yardstick import (
     TimesUnavoidable,
+    attainable_safety,
     best_for,
     held_against,
+    leaves_safely,
+    simulate,
     times_unavoidable,
 )
 from safe_envs.files import VARIABLE, entries
@@ -44,25 +41,24 @@ def made_up(lower, upper) -> AttainableSafety:
     )
 
 
-def test_the_greedy_policy_has_a_rate_between_the_ends():
-    found, _ = attainable_safety(make_problem("Scalar-v0", **NEAR_THE_EDGE), COARSE, episodes=2000)
+@pytest.fixture(scope="module")
+def greedy():
+    """What is attainable near the edge, and the greedy policy of its table."""
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
+    return attainable_safety(problem, coarse(leaving="safe"), episodes=300, num_envs=128)
+
+
+def test_the_greedy_policy_has_a_rate_between_the_ends_and_is_simulated_as_evaluate_does(greedy):
+    found, policy = greedy
     s = found.simulated
-    assert s is not None
-    assert found.lower is not None
-    assert found.upper is not None
     assert 0.5 < found.lower < found.upper < 1.0
     assert found.lower <= s.high
     assert s.low <= found.upper
     assert found.contradiction == ""
-
-
-def test_the_simulation_is_that_of_evaluate():
     problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
-    found, policy = attainable_safety(problem, coarse(leaving="safe"), episodes=300, num_envs=128)
-    row = evaluate(problem, policy, "none", episodes=300, bounds=False, best=False).rows[0]
-    assert found.simulated is not None
-    assert found.simulated.safe == row.safe < 300
-    assert (found.simulated.low, found.simulated.high) == (row.ci_low, row.ci_high)
+    row = evaluate(problem, policy, "none", episodes=300, bounds=False).rows[0]
+    assert (s.safe, s.low, s.high) == (row.safe, row.ci_low, row.ci_high)
+    assert s.safe < 300
 
 
 def test_leaving_is_counted_as_it_was_asked_for():
@@ -74,14 +70,14 @@ def test_leaving_is_counted_as_it_was_asked_for():
     as_counted = simulate(policy, 400, 0, 0.95, 400)
     assert staying.leave_rate == as_counted.leave_rate > 0.05
     assert as_counted.rate == pytest.approx(staying.rate + staying.leave_rate)
-    row = evaluate(problem, policy, "none", episodes=400, bounds=False, best=False).rows[0]
+    row = evaluate(problem, policy, "none", episodes=400, bounds=False).rows[0]
     assert as_counted.safe == row.safe
 
 
 def test_the_worlds_of_plant_and_model_differ():
     # The plant cannot be held at this angle, the model can.
-    problem = make_problem("Pendulum-v0", horizon=0.3, start=[0.3, 0.0], plant={"m": 4.0})
-    settings = ValueSettings(knowledge="plant", cells=(60, 60), inputs=3)
+    problem = make_problem("Pendulum-v0", horizon=0.2, start=[0.3, 0.0], plant={"m": 4.0})
+    settings = ValueSettings(knowledge="plant", cells=(30, 30), inputs=3)
     found = [
         attainable_safety(each, replace(settings, knowledge=knowledge), episodes=50)[0]
         for each, knowledge in (
@@ -90,20 +86,17 @@ def test_the_worlds_of_plant_and_model_differ():
             (replace(problem, plant=problem.model), "plant"),
         )
     ]
-    assert found[0].upper != found[1].upper
-    assert found[1].simulated == found[2].simulated
-    assert (found[1].lower, found[1].upper) == (found[2].lower, found[2].upper)
+    ends = [(each.lower, each.upper) for each in found]
+    assert ends[0] != ends[1] == ends[2]
+    assert found[0].simulated != found[1].simulated == found[2].simulated
 
 
 @pytest.mark.parametrize(
     ("lower", "upper", "where"),
     [(0.7, 0.9, ""), (0.7, 0.75, "above the upper"), (0.85, 0.9, "below the lower")],
 )
-def test_bounds_that_the_greedy_policy_contradicts_are_withheld(lower, upper, where):
-    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
-    found, _ = attainable_safety(problem, COARSE, episodes=10)
-    assert found.simulated is not None
-    rate = replace(found.simulated, rate=0.8, safe=8000, episodes=10_000)
+def test_bounds_that_the_greedy_policy_contradicts_are_withheld(greedy, lower, upper, where):
+    rate = replace(greedy[0].simulated, rate=0.8, safe=8000, episodes=10_000)
     judged = attainable.judged(replace(made_up(lower, upper), simulated=rate))
     assert where in judged.contradiction
     assert (judged.lower is None) == (judged.upper is None) == bool(where)
@@ -127,15 +120,8 @@ def test_a_single_violation_contradicts_no_lower_bound(safe, lower, kept):
 
 
 def test_bounds_that_a_row_exceeds_are_withheld():
-    rows = evaluate(
-        "Scalar-v0",
-        "zero",
-        "cbf",
-        options={"horizon": 0.2, "start": [0.0]},
-        episodes=60,
-        bounds=False,
-        best=False,
-    ).rows
+    given = {"options": {"horizon": 0.2, "start": [0.0]}, "episodes": 60, "bounds": False}
+    rows = evaluate("Scalar-v0", "zero", "cbf", **given).rows
     assert rows[0].safe == 60
     assert held_against(made_up(0.5, 1.0), rows).upper == 1.0
     judged = held_against(made_up(0.5, 0.7), rows)
@@ -188,7 +174,7 @@ def test_where_the_countings_are_the_same_is_known():
 
 
 def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache):
-    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    monkeypatch.setattr(attainable, "evaluation_settings", lambda problem: COARSE)
     given = {"options": NEAR_THE_EDGE, "filters": ["none"], "episodes": 50, "bounds": False}
     assert evaluate("Scalar-v0", **given).document()["best"] is None
     computed = evaluate("Scalar-v0", best=True, **given)
@@ -205,12 +191,12 @@ def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache)
 
 
 def test_what_is_attainable_from_the_starts_is_computed_once(monkeypatch, empty_cache):
-    monkeypatch.setattr(yardstick, "evaluation_settings", lambda problem: COARSE)
+    monkeypatch.setattr(attainable, "evaluation_settings", lambda problem: COARSE)
     problem = make_problem("Scalar-v0", **NEAR_THE_EDGE)
     found = best_for(problem)
     (kept,) = entries("attainable")
     with monkeypatch.context() as patch:
-        patch.setattr(yardstick, "attainable_safety", lambda *_, **__: pytest.fail("again"))
+        patch.setattr(attainable, "attainable_safety", lambda *_, **__: pytest.fail("again"))
         assert best_for(problem) == found
         # From other starts something else is attainable.
         with pytest.raises(pytest.fail.Exception):
@@ -218,12 +204,3 @@ def test_what_is_attainable_from_the_starts_is_computed_once(monkeypatch, empty_
     for damaged in ("", "[]", "{}", json.dumps({**vars(found), "lower": 2.0})):
         kept.place.write_text(damaged)
         assert best_for(problem) == found
-
-
-def test_what_has_no_table_is_an_error(empty_cache):
-    with pytest.raises(ConfigurationError, match="12 coordinates"):
-        evaluate("Quadrotor-v0", best=True)
-    with pytest.raises(ConfigurationError, match="monitoring = 'continuous'"):
-        evaluate("Scalar-v0", best=True, monitoring="continuous")
-    with pytest.raises(ConfigurationError, match="give True or False"):
-        evaluate("Scalar-v0", best="yes")  # pyright: ignore[reportArgumentType]

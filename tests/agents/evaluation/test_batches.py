@@ -1,22 +1,23 @@
-"""An evaluation depends on neither the batch nor the way it was asked for, and keeps little."""
+"""An evaluation depends on neither the batch nor the processes, and keeps little."""
 
 from __future__ import annotations
 
 import json
 import tracemalloc
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
-from safe_envs import ConfigurationError, RelativeDegreeError
+from safe_envs import ConfigurationError
 from safe_envs.agents import NominalController, evaluate, make_problem
-from safe_envs.agents.evaluation import episodes as played
-from safe_envs.agents.evaluation.episodes import Trajectories, play
-from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.agents.evaluation.evaluate import refine
+from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow
+
+SHORT = {"options": {"horizon": 0.05}, "bounds": False}
 
 
 def assert_same_to_the_bit(first, second):
@@ -28,82 +29,120 @@ def assert_same_to_the_bit(first, second):
     assert first.config == second.config
     assert first.trajectories.keys() == second.trajectories.keys()
     for name, recorder in first.trajectories.items():
-        assert recorder.barrier.tobytes() == second.trajectories[name].barrier.tobytes()
-        assert recorder.states.tobytes() == second.trajectories[name].states.tobytes()
-        assert recorder.log.table().tobytes() == second.trajectories[name].log.table().tobytes()
+        other = second.trajectories[name]
+        for one, there in (
+            (recorder.barrier, other.barrier),
+            (recorder.states, other.states),
+            (recorder.log.table(), other.log.table()),
+        ):
+            assert one.tobytes() == there.tobytes()
+        # The flags are the same episodes, however many come at once.
+        flags = [each.safe[name][0].array for each in (first, second)]
+        assert flags[0].tolist() == flags[1].tolist() == first.episodes[name][0].safe.tolist()
 
 
 def test_answer_is_the_same_for_every_num_envs(env_id):
     problem = make_problem(env_id, noise=0.2)
     problem = problem.configured(horizon=6 * problem.dt)
-    # The mean of a bound over the starts goes the same way for all ids.
-    arguments = {
-        "episodes": 5,
-        "seed": 3,
-        "record": True,
-        "bounds": env_id.endswith("CubicSDEDisk-v0"),
-    }
-    answers = [evaluate(problem, num_envs=n, **arguments) for n in (100, 3, 1)]
-    for other in answers[1:]:
-        assert_same_to_the_bit(answers[0], other)
-    assert len(answers[0].rows) == 2
-    assert len(answers[0].comparisons) == 1
+    given = {"episodes": 5, "seed": 3, "record": True, "bounds": False}
+    first, *others = (evaluate(problem, num_envs=n, **given) for n in (100, 3, 1))
+    for other in others:
+        assert_same_to_the_bit(first, other)
+    # By the id it is the same; the defaults are the problem's own controller and filter.
+    options = {"noise": 0.2, "horizon": problem.horizon}
+    by_id = evaluate(env_id, NominalController, options=options, **given)
+    assert [row.filter for row in by_id.rows] == ["none", problem.filter]
+    assert by_id.config["problem"] == first.config["problem"]
+    assert (by_id.config["env_id"], first.config["env_id"]) == (env_id, None)
+    for a, b in zip(by_id.rows, first.rows, strict=True):
+        assert replace(a, policy="") == replace(b, policy="")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("policy", ["nominal", "random"])
 @pytest.mark.parametrize(
-    ("env_id", "filters", "options"),
+    ("env_id", "policy", "filters", "options", "more"),
     [
         # Episodes that end at different times: out of the workspace, and at the goal.
-        ("Scalar-v0", ("none", "cbf:alpha=3"), {"noise": 0.9, "horizon": 3.0, "dt": 0.02}),
+        ("Scalar-v0", "random", ("none", "cbf:alpha=3"), {"noise": 0.9, "dt": 0.02}, {}),
         (
             "DubinsObstacle-v0",
+            "nominal",
             ("none", "hocbf"),
-            {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0], "horizon": 2.0},
+            {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0]},
+            {},
         ),
-        # More control periods than the noise is drawn ahead for.
-        ("StochasticDubins-v0", ("none", "scbf"), {"dt": 0.01, "horizon": 2.7, "substeps": 2}),
+        # More control periods than the noise is drawn ahead for, and bridges.
+        (
+            "Scalar-v0",
+            "nominal",
+            ("none",),
+            {"noise": 0.6, "horizon": 3.0, "dt": 0.008},
+            {"monitoring": "continuous"},
+        ),
+        # The mean of a bound over the starts goes the same way.
+        ("CubicSDEDisk-v0", "random", ("scbf",), {"horizon": 0.2}, {"bounds": True}),
     ],
 )
-def test_long_and_ending_episodes_are_the_same_for_every_num_envs(policy, env_id, filters, options):
-    problem = make_problem(env_id, **options)
-    given = {"episodes": 3, "seed": 1, "record": True, "bounds": False}
-    answers = [evaluate(problem, policy, filters, num_envs=n, **given) for n in (3, 1, 2)]
-    for other in answers[1:]:
-        assert_same_to_the_bit(answers[0], other)
+def test_long_and_ending_episodes_are_the_same_for_every_num_envs(
+    env_id, policy, filters, options, more
+):
+    problem = make_problem(env_id, **{"horizon": 2.0, **options})
+    given = {"episodes": 5, "seed": 1, "record": True, "bounds": False, **more}
+    first, *others = (evaluate(problem, policy, filters, num_envs=n, **given) for n in (5, 2))
+    for other in others:
+        assert_same_to_the_bit(first, other)
 
 
-def test_another_seed_is_another_answer():
-    first, second = (
-        evaluate("Scalar-v0", episodes=20, seed=s, options={"horizon": 0.5}, bounds=False)
-        for s in (0, 1)
+def test_parts_of_the_work_and_files_of_episodes_change_nothing(tmp_path, monkeypatch):
+    # What processes compute, without their start; with it in `make oracle`.
+    here = lambda function, shared, parts, jobs: (function(shared, part) for part in parts)  # noqa: E731
+    monkeypatch.setattr("safe_envs.agents.evaluation.episodes.compute_in_order", here)
+    found, contents = [], set()
+    given = {"options": {"horizon": 1.0, "noise": 0.8}, "episodes": 40, "bounds": False}
+    for i, how in enumerate(({}, {"num_envs": 7}, {"jobs": 2}, {"keep_episodes": False})):
+        place = tmp_path / f"{i}.parquet"
+        found.append(evaluate("Scalar-v0", "random", episodes_out=str(place), **given, **how))
+        contents.add(place.read_bytes())
+    first, *others = found
+    assert len(contents) == 1
+    for other in others:
+        assert (other.rows, other.comparisons) == (first.rows, first.comparisons)
+    table, columns = pq.read_table(place), first.episode_columns()
+    assert table.column_names == list(columns)
+    assert table["return"].to_pylist() == columns["return"].tolist()
+    assert table["first_violation"].null_count == columns["safe"].sum()
+    with pytest.raises(ConfigurationError, match="keep_episodes"):
+        others[-1].episode_columns()
+    # A refinement writes the evaluation as given.
+    place = tmp_path / "refined.parquet"
+    refined = refine("Scalar-v0", "random", filters="none", episodes_out=place, **given)
+    lengths = pq.read_table(place)["length"].to_pylist()
+    assert max(lengths) == refined.given.problem.steps
+    returns = pq.read_table(place)["return"].to_pylist()
+    assert returns == refined.given.episode_columns()["return"].tolist()
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize(
+    ("env_id", "given"),
+    [
+        ("StochasticDubins-v0", {"monitoring": "continuous", "options": {"horizon": 1.0}}),
+        ("Pendulum-v0", {"estimator": "ekf", "options": {"measurement": "default"}}),
+    ],
+)
+def test_processes_change_nothing(env_id, given):
+    given = {"episodes": 40, "bounds": False, **given}
+    assert_same_to_the_bit(*(evaluate(env_id, "random", jobs=n, **given) for n in (1, 2)))
+
+
+def test_seeds_and_numbers_of_episodes():
+    few, many, other = (
+        evaluate("Scalar-v0", "random", episodes=n, seed=s, num_envs=8, record=True, **SHORT)
+        for n, s in ((10, 0), (25, 0), (25, 1))
     )
-    assert first.rows[0].return_mean != second.rows[0].return_mean
-
-
-def test_more_episodes_begin_with_the_same_ones():
-    arguments = {"options": {"horizon": 0.5}, "num_envs": 8, "record": True, "bounds": False}
-    few, many = (evaluate("Scalar-v0", "random", episodes=n, **arguments) for n in (10, 25))
     for name, recorder in few.trajectories.items():
-        assert (
-            recorder.barrier.tobytes()
-            == np.ascontiguousarray(many.trajectories[name].barrier[:, :10]).tobytes()
-        )
-
-
-def test_batches_have_the_starts_of_their_episodes():
-    problem = make_problem("StochasticDubins-v0", horizon=0.2)
-    policy = NominalController(problem)
-    found = [batch.starts for batch in play(SafeVectorEnv(problem, 4), policy, range(10), 7)]
-    assert [x.shape for x in found] == [(4, 3), (4, 3), (2, 3)]
-    starts = np.concatenate(found)
-    recorded = (
-        evaluate(problem, policy, ["none"], episodes=10, seed=7, record=True)
-        .trajectories["none"]
-        .states[0]
-    )
-    np.testing.assert_array_equal(starts, recorded)
+        later = many.trajectories[name].barrier[:, :10]
+        np.testing.assert_array_equal(recorder.barrier, later)
+    assert many.rows[0].return_mean != other.rows[0].return_mean
 
 
 def test_config_is_enough_to_run_it_again():
@@ -114,92 +153,44 @@ def test_config_is_enough_to_run_it_again():
         "barrier": {"radius": 2.5},
         "dt": 0.1,
         "substeps": 2,
-        "horizon": 1.5,
+        "horizon": 1.0,
         "box": [-4.0, 5.0],
         "start": [0.5, 0.0, 1.0],
     }
-    first = evaluate(
-        "StochasticDubins-v0",
-        "random",
-        ["none", "hocbf"],
-        options=options,
-        episodes=25,
-        seed=9,
-        knowledge="plant",
-    )
+    given = {"episodes": 10, "seed": 9, "knowledge": "plant", "bounds": False}
+    first = evaluate("StochasticDubins-v0", "random", ["none", "hocbf"], options=options, **given)
     config = json.loads(json.dumps(first.config, allow_nan=False))
     again = evaluate(
         config["env_id"],
         config["policy"]["name"],
         [f["spec"] for f in config["filters"]],
         options=config["options"],
-        episodes=config["episodes"],
-        seed=config["seed"],
-        knowledge=config["knowledge"],
-        num_envs=4,
+        **{name: config[name] for name in ("episodes", "seed", "knowledge")},
+        bounds=False,
     )
-    assert [f["name"] for f in config["filters"]] == ["none", "hocbf"]
     assert config["env_id"] == "safe_envs/StochasticDubins-v0"
-    assert config["problem"]["plant"]["v"] == 1.7
-    assert config["problem"]["model"]["v"] == 1.9
+    assert (config["problem"]["plant"]["v"], config["problem"]["model"]["v"]) == (1.7, 1.9)
     for a, b in zip(first.rows, again.rows, strict=True):
         assert replace(a, filter="") == replace(b, filter="")
-    assert "versions" in first.document()
-
-
-def test_a_problem_gives_the_same_as_its_id_and_defaults_are_the_natural_filter(env_id):
-    options = {"horizon": 5 * make_problem(env_id).dt}
-    problem = make_problem(env_id, **options)
-    # The bounds go the same way for all ids.
-    arguments = {"episodes": 5, "bounds": env_id.endswith(("CubicSDEDisk-v0", "Pendulum-v0"))}
-    by_id = evaluate(env_id, options=options, **arguments)
-    by_problem = evaluate(problem, NominalController(problem), **arguments)
-    assert [row.filter for row in by_id.rows] == ["none", problem.filter]
-    for a, b in zip(by_id.rows, by_problem.rows, strict=True):
-        assert replace(a, policy="") == replace(b, policy="")
-    assert (by_id.config["env_id"], by_problem.config["env_id"]) == (env_id, None)
-    assert by_id.config["problem"] == by_problem.config["problem"]
 
 
 def test_trajectories_keep_a_bounded_number_of_episodes():
-    recorder = Trajectories(make_problem("Quadrotor-v0", horizon=1.0, dt=0.01), 10**9)
-    assert recorder.barrier.shape == (101, 256)
-    assert recorder.states.shape == (101, 32, 12)
-    answer = evaluate(
-        "Scalar-v0",
-        filters=["none"],
-        episodes=300,
-        num_envs=90,
-        options={"horizon": 0.05},
-        record=True,
-    )
-    kept = answer.trajectories["none"]
-    assert kept.barrier.shape == (6, 256)
-    assert kept.states.shape == (6, 32, 1)
-    assert np.isfinite(kept.barrier).all()
-    np.testing.assert_allclose(kept.barrier[:, :32], 1 - kept.states[:, :, 0])
-    assert (
-        evaluate("Scalar-v0", filters=["none"], episodes=2, options={"horizon": 0.05}).trajectories
-        == {}
-    )
+    given = {"filters": ["none"], **SHORT}
+    kept = evaluate("Scalar-v0", episodes=300, num_envs=90, record=True, **given).trajectories
+    assert kept["none"].barrier.shape == (6, 256)
+    assert kept["none"].states.shape == (6, 32, 1)
+    np.testing.assert_allclose(kept["none"].barrier[:, :32], 1 - kept["none"].states[:, :, 0])
+    assert evaluate("Scalar-v0", episodes=2, **given).trajectories == {}
 
 
-@pytest.mark.slow
 def test_memory_does_not_grow_with_episodes():
     problem = make_problem("Scalar-v0", horizon=0.02)
+    how = {"num_envs": 256, "record": True, "bounds": False, "keep_episodes": False}
 
     def peak(episodes):
         tracemalloc.start()
         try:
-            evaluate(
-                problem,
-                filters=["none"],
-                episodes=episodes,
-                num_envs=256,
-                record=True,
-                bounds=False,
-                keep_episodes=False,
-            )
+            evaluate(problem, filters=["none"], episodes=episodes, **how)
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
@@ -210,40 +201,23 @@ def test_memory_does_not_grow_with_episodes():
     assert many - few < 10 * (5120 - 512)
 
 
-def test_parts_of_processes_do_not_grow_with_episodes(monkeypatch):
-    def largest(episodes):
-        sizes, told = [], []
-
-        def done(function, shared, parts, jobs):
-            sizes.extend(map(len, parts))
-            return ([] for _ in parts)
-
-        monkeypatch.setattr(played, "compute_in_order", done)
-        how = (episodes, 0, 1024, 2, False, told.append)
-        no_env: Any = None
-        assert list(played.play_in_processes(no_env, None, *how)) == []
-        assert sum(sizes) == told[-1] == episodes
-        return max(sizes)
-
-    assert largest(5) == 1
-    assert largest(800) == 100
-    assert largest(10**7) == largest(10**8) == 65_536
-
-
-def test_progress_goes_from_nothing_to_all():
+@pytest.mark.parametrize(
+    ("call", "shares"),
+    [
+        (evaluate, (0.5,)),
+        (refine, (1 / 16, 1 / 8, 2 / 8, 4 / 8)),
+    ],
+)
+def test_progress_goes_from_nothing_to_all(call, shares):
     told = []
-    evaluate(
-        "Scalar-v0",
-        filters=["none", "scbf"],
-        episodes=7,
-        num_envs=3,
-        options={"horizon": 0.05},
-        progress=told.append,
+    call(
+        "Scalar-v0", filters=["none", "scbf"], episodes=7, num_envs=3, progress=told.append, **SHORT
     )
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.1
     assert told[-1] == 1.0
-    assert 0.5 in told
+    for share in shares:
+        assert min(abs(t - share) for t in told) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -257,41 +231,8 @@ def test_progress_goes_from_nothing_to_all():
     ],
 )
 def test_evaluations_of_one_episode_over_and_over_are_marked(env_id, policy, options, repeats):
-    answer = evaluate(
-        env_id, policy, ["none"], options={**options, "horizon": 0.2}, episodes=4, record=True
-    )
+    problem = problem_of(f"safe_envs/{env_id}", **options, horizon=0.2)
+    answer = evaluate(problem, policy, ["none"], episodes=4, record=True)
     assert answer.is_deterministic == repeats
     barrier = answer.trajectories["none"].barrier
     assert (barrier == barrier[:, :1]).all() == repeats
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"episodes": 0}, "episodes = 0"),
-        ({"episodes": 1.5}, "episodes = 1.5"),
-        ({"episodes": True}, "episodes = True"),
-        ({"seed": -1}, "seed = -1"),
-        ({"num_envs": 0}, "num_envs = 0"),
-        ({"knowledge": "plan"}, "did you mean 'plant'"),
-        ({"confidence": 1.0}, "confidence = 1.0; give a number above 0 and below 1"),
-        ({"filters": ["hocbf+none"]}, "'hocbf\\+none': 'none' is the unfiltered env"),
-        ({"filters": ["scb"]}, "unknown filter 'scb'; did you mean 'scbf'"),
-        ({"filters": ["non"]}, "did you mean 'none'"),
-        ({"filters": ["hocbf:q=1,1"]}, "no parameter 'q'"),
-        ({"policy": "nominl"}, "did you mean 'nominal'"),
-        ({"options": {"nois": 1}}, "did you mean 'noise'"),
-    ],
-)
-def test_arguments_out_of_range_are_named(arguments, message):
-    with pytest.raises(ConfigurationError, match=message):
-        evaluate("StochasticDubins-v0", **arguments)
-
-
-def test_conditions_that_do_not_suit_are_errors_before_any_episode():
-    told = []
-    with pytest.raises(RelativeDegreeError, match="use hocbf"):
-        evaluate("StochasticDubins-v0", filters=["none", "cbf"], progress=told.append)
-    assert told == []
-    with pytest.raises(ConfigurationError, match="options"):
-        evaluate(make_problem("Scalar-v0"), options={"noise": 1.0})

@@ -1,4 +1,4 @@
-"""What an evaluation is asked for: as data, with objects, and how it is run."""
+"""What an evaluation is asked for: as data, with objects, how it is run, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safe_envs import ConfigurationError
+from safe_envs import ConfigurationError, RelativeDegreeError
 from safe_envs.agents import NominalController, evaluate
-from safe_envs.agents.evaluation.evaluate import run_evaluation
+from safe_envs.agents.evaluation.evaluate import refine, run_evaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.registry import make_problem
-from safe_envs.wrappers import CBF, HOCBF, SCBF, spec_of
+from safe_envs.wrappers import CBF, HOCBF, FilterSpec, spec_of
+from tests.wrappers.backup.carts import cart_problem
 
-SHORT = {"episodes": 5, "bounds": False}
 SPEC = EvaluationSpec(
     "Scalar-v0",
     "zero",
@@ -27,6 +27,7 @@ SPEC = EvaluationSpec(
     seed=3,
     confidence=0.9,
 )
+PENDULUM = f"{Path(__file__).parents[3] / 'examples' / 'pendulum_v1.py'}:spec"
 
 
 def test_a_spec_is_json_and_back():
@@ -36,20 +37,16 @@ def test_a_spec_is_json_and_back():
     assert again.filters == ("none", spec_of(SPEC.filters[1]))
     assert (again.options, again.learned) == ({"horizon": 0.2}, ("model.npz",))
     assert set(data) == {field.name for field in fields(EvaluationSpec)} - {"trust"}
+    names = ("none", "promise:p=0.9:robust=v:1.0..2.0:leaving=safe", "backup:horizon=3")
+    promised = replace(SPEC, filters=names)
+    assert EvaluationSpec.from_dict(json.loads(json.dumps(promised.as_dict()))).filters == names
 
 
 def test_data_cannot_grant_itself_the_right_to_run_code():
     assert not EvaluationSpec.from_dict(replace(SPEC, trust=True).as_dict()).trust
     assert EvaluationSpec.from_dict(SPEC.as_dict(), trust=True).trust
-    with pytest.raises(ConfigurationError, match="has no 'trust'"):
+    with pytest.raises(ConfigurationError, match="trust"):
         EvaluationSpec.from_dict({**SPEC.as_dict(), "trust": True})
-
-
-def test_objects_without_text_are_no_json():
-    problem = make_problem("Scalar-v0")
-    for change in ({"problem": problem}, {"policy": NominalController(problem)}):
-        with pytest.raises(ConfigurationError, match=f"{next(iter(change))} of the evaluation"):
-            replace(SPEC, **change).as_dict()
 
 
 def test_numbers_of_numpy_and_paths_are_those_of_python():
@@ -60,31 +57,6 @@ def test_numbers_of_numpy_and_paths_are_those_of_python():
     data = json.loads(json.dumps(spec.as_dict()))
     assert data["options"] == {"noise": 0.1, "start": [0.5], "box": [-1, 1]}
     assert EvaluationSpec.from_dict(data).as_dict() == spec.as_dict() == data
-    evaluate("Scalar-v0", "zero", "none", episodes=np.int64(3), bounds=False)
-
-
-@pytest.mark.parametrize("given", [None, CBF, 3])
-def test_filters_that_are_neither_text_nor_condition_are_refused(given):
-    with pytest.raises(ConfigurationError, match="filters hold"):
-        evaluate("Scalar-v0", filters=[given], **SHORT)
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ({}, "needs problem"),
-        ({"problem": "Scalar-v0", "episode": 3}, "did you mean 'episodes'"),
-        ({"problem": "Scalar-v0", "episodes": 0}, "episodes = 0"),
-        ({"problem": "Scalar-v0", "monitoring": "never"}, "monitoring = 'never'"),
-        ({"problem": "Scalar-v0", "bounds": "false"}, "bounds = 'false'; give True or False"),
-        ({"problem": "Scalar-v0", "filters": 3}, "filters = 3"),
-        ({"problem": "Scalar-v0", "filters": []}, "no filter"),
-        ({"problem": "Scalar-v0", "options": [1]}, "give a dictionary"),
-    ],
-)
-def test_data_that_is_no_spec_is_refused(data, message):
-    with pytest.raises(ConfigurationError, match=message):
-        EvaluationSpec.from_dict(data)
 
 
 def test_a_spec_runs_like_its_arguments_however_it_is_run():
@@ -95,32 +67,109 @@ def test_a_spec_runs_like_its_arguments_however_it_is_run():
     assert found.spec == spec
 
 
-def test_filters_may_be_conditions():
-    problem = make_problem("StochasticDubins-v0", horizon=0.5, noise=0.4)
-    two = HOCBF(p=(1.0, 2.0))
-    found = evaluate(problem, filters=["none", two, (SCBF.for_gains((1.0, 1.0)),)], **SHORT)
-    texts = evaluate(problem, filters=["none", spec_of(two), "scbf"], **SHORT)
-    strip = [{**row.as_dict(), "filter": ""} for row in found.rows]
-    assert [row.filter for row in found.rows][:2] == ["none", spec_of(two)]
-    assert strip[:2] == [{**row.as_dict(), "filter": ""} for row in texts.rows][:2]
-    (one,) = evaluate(problem, filters=two, **SHORT).rows
-    assert one == found.rows[1]
+DUBINS, TWO = "StochasticDubins-v0", HOCBF(p=(1.0, 1.0))
+MEASURED = {"problem": "Pendulum-v0", "options": {"measurement": "default"}, "estimator": "ekf"}
+EXTERNAL = {"problem": "Pendulum-v1", "filter_spec": PENDULUM}
 
 
 @pytest.mark.parametrize(
-    ("filters", "message"),
+    ("given", "fragment"),
     [
-        ([3], "int"),
-        ([()], "an empty tuple"),
-        ([("scbf",)], "filters hold str"),
-        ([(HOCBF(p=(1.0, 1.0)),) * 3], "holds 3 conditions"),
+        ({"episodes": 0}, "episodes = 0"),
+        ({"episodes": 1.5}, "episodes = 1.5"),
+        ({"episodes": True}, "episodes = True"),
+        ({"seed": -1}, "seed = -1"),
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"knowledge": "plan"}, "'plant'"),
+        ({"monitoring": "continous"}, "'continuous'"),
+        ({"confidence": 1.0}, "confidence = 1.0"),
+        ({"policy": "nominl"}, "'nominal'"),
+        ({"options": {"nois": 1}}, "'noise'"),
+        ({"keep_episodes": "no"}, "keep_episodes = 'no'"),
+        ({"episodes_out": "nowhere/out.parquet"}, "nowhere"),
+        ({"episodes_out": "out.csv"}, "out.csv"),
+        ({"jobs": 2, "record": True}, "trajectories"),
+        ({"bounds": "false"}, "bounds = 'false'"),
+        ({"best": "yes"}, "True or False"),
+        ({"best": True, "monitoring": "continuous"}, "monitoring = 'continuous'"),
+        ({"problem": "Quadrotor-v0", "best": True}, "12 coordinates"),
+        ({"closed_loop": "yes"}, "closed_loop = 'yes'"),
+        ({"closed_loop": True, "bounds": False}, "closed_loop = "),
+        ({"closed_loop": True, "monitoring": "continuous"}, "closed_loop = "),
+        ({"problem": "Quadrotor-v0", "closed_loop": True}, "4 inputs"),
+        ({"problem": make_problem("Scalar-v0"), "options": {"noise": 1.0}}, "options"),
+        # Filters.
+        ({"filters": ["hocbf+none"]}, "'none'"),
+        ({"filters": ["scb"]}, "'scbf'"),
+        ({"filters": ["non"]}, "'none'"),
+        ({"filters": ["hocbf:q=1,1"]}, "'q'"),
+        ({"filters": []}, "no filter"),
+        ({"filters": [None]}, "NoneType"),
+        ({"filters": [CBF]}, "filters hold"),
+        ({"filters": [3]}, "int"),
+        ({"filters": [()]}, "empty tuple"),
+        ({"filters": [("scbf",)]}, "str"),
+        ({"filters": [(TWO,) * 3]}, "3 conditions"),
+        ({"filters": ["promise:p=0.9+scbf"]}, "alone"),
+        ({"filters": ["promise:p=0.9:robust=u:1..2"]}, "'u'"),
+        ({"problem": "ACC-v0", "filters": ["promise:p=0.9"], "objective": "clf"}, "nearest"),
+        ({"filters": ["backup"]}, "backup"),
+        ({"problem": cart_problem(), "filters": ["backup"], "objective": "clf"}, "nearest"),
+        # Sensors.
+        ({"filters": ["scbf@state"]}, "without an estimator"),
+        ({**MEASURED, "estimator": "ekff"}, "'ekf'"),
+        ({**MEASURED, "belief": 0.0}, "belief"),
+        ({**MEASURED, "observe": "all"}, "observe"),
+        ({**MEASURED, "options": {}}, "nothing to estimate"),
+        ({**MEASURED, "estimator": None, "filters": ["scbf"]}, "estimator"),
+        ({**MEASURED, "estimator": None, "observe": "measurement"}, "estimator"),
+        # Envs of others.
+        ({**EXTERNAL, "filters": ["bayesian-scbf"]}, "log"),
+        ({**EXTERNAL, "policy": "clf"}, "Lyapunov"),
+        ({**EXTERNAL, "engine": "compiled"}, "third-party"),
+        ({**EXTERNAL, "knowledge": "plant"}, "the model"),
+        ({**EXTERNAL, "options": {"noise": 0.1}}, "noise"),
+        ({**EXTERNAL, "monitoring": "continuous"}, "unknown"),
+        ({**EXTERNAL, "problem": "safe_envs/Pendulum-v0"}, "barriers of its own"),
+        ({**EXTERNAL, "filter_spec": "nowhere.py:spec"}, "nowhere.py"),
+        ({**EXTERNAL, "filter_spec": PENDULUM.replace(":spec", ":pendulum")}, "FilterSpec"),
     ],
 )
-def test_what_is_no_filter_is_refused(filters, message):
-    with pytest.raises((ConfigurationError, TypeError), match=message):
-        evaluate("StochasticDubins-v0", filters=filters, **SHORT)
+def test_what_cannot_be_is_refused_and_named(given, fragment):
+    given = {"problem": DUBINS, "episodes": 2, "bounds": given.get("closed_loop") is True, **given}
+    with pytest.raises(ConfigurationError, match=fragment):
+        evaluate(**given)
 
 
-def test_trajectories_are_kept_in_one_process():
-    with pytest.raises(ConfigurationError, match="trajectories for pictures"):
-        RunSettings(jobs=2, record=True)
+@pytest.mark.parametrize(
+    ("data", "fragment"),
+    [
+        ({}, "problem"),
+        ({"problem": "Scalar-v0", "episode": 3}, "'episodes'"),
+        ({"problem": "Scalar-v0", "episodes": 0}, "episodes = 0"),
+        ({"problem": "Scalar-v0", "filters": 3}, "filters = 3"),
+        ({"problem": "Scalar-v0", "options": [1]}, "dictionary"),
+    ],
+)
+def test_data_that_is_no_spec_is_refused(data, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        EvaluationSpec.from_dict(data)
+
+
+def test_objects_without_text_are_no_json():
+    problem = make_problem("Scalar-v0")
+    for name, value in (("problem", problem), ("policy", NominalController(problem))):
+        with pytest.raises(ConfigurationError, match=name):
+            replace(SPEC, **{name: value}).as_dict()
+    assert isinstance(FilterSpec.load(PENDULUM), FilterSpec)
+
+
+def test_errors_come_before_any_episode():
+    told = []
+    with pytest.raises(RelativeDegreeError, match="hocbf"):
+        evaluate(DUBINS, filters=["none", "cbf"], progress=told.append)
+    assert told == []
+    tiny = {"options": {"dt": 5e-324, "horizon": 5e-324}}
+    for given in ({"episodes": 0}, {"confidence": 2}, {"filters": ["scb"]}, tiny):
+        with pytest.raises(ConfigurationError):
+            refine("Scalar-v0", **given)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.evaluation.attainable import AttainableSafety
+from safe_envs.agents.evaluation.attainable import AttainableSafety, best_for
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.agents.evaluation.yardstick import best_for
 from safe_envs.agents.training import leaderboard
 from safe_envs.agents.training.leaderboard import (
     attainable_of,
