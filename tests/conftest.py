@@ -55,15 +55,15 @@ FOUR = tuple(
     f"safe_envs/{name}-v0"
     for name in ("Scalar", "StochasticDubins", "QuadrotorLimits", "DubinsReach")
 )
-"""Ids that stand for all: of degree 1; with noise and of degree 2; with several constraints and inputs;
-with a goal and signals."""
+"""Ids that stand for all: of degree 1; with noise and of degree 2; with several constraints and
+inputs; with a goal and signals."""
 EVERY_ENV = tuple(
     pytest.param(
         env_id, marks=[] if env_id in FOUR else pytest.mark.oracle, id=env_id.split("/")[1]
     )
     for env_id in safe_envs.ENV_IDS
 )
-"""Parameters of a test of every registered id: the four in each run, the others in `make oracle`."""
+"""Parameters of a test of every registered id: the four in each run, all in `make oracle`."""
 
 
 @pytest.fixture(params=EVERY_ENV)

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import numbers_in
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.dynamics.symbols import declared_sign
 from safe_envs.errors import (
     ConfigurationError,
     SystemDefinitionError,
     nearest,
-    numbers_in,
     shown,
     unexpected_argument,
 )

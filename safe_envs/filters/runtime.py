@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import real_array
 from safe_envs.dynamics.codegen import finite
 from safe_envs.dynamics.symbols import declared_sign
-from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, real_array, shown
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, shown
 from safe_envs.filters.arguments import WIDEST, require_ends
 from safe_envs.filters.conditions.estimates import belief_places
 from safe_envs.filters.qp import FilterQP

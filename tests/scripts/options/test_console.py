@@ -18,7 +18,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import cli
 from safe_envs.scripts.options import console
 from safe_envs.scripts.options.console import run
-from safe_envs.scripts.options.wrapping import visible_text
+from safe_envs.scripts.options.terminal import visible_text
 from tests.wrappers.verification.verified import verify_once
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
-from safe_envs.files import checksum, write_arrays
+from safe_envs.arrays import checksum, write_arrays
 from safe_envs.filters.conditions.text import conditions_for
 from safe_envs.registry import make_problem
 from safe_envs.values import closed_loop

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.files import checksum, reading, write_arrays
+from safe_envs.arrays import checksum, reading, write_arrays
 from safe_envs.registry import make_problem
 from safe_envs.values import tables
 from safe_envs.values.grid import Axis, Grid
