@@ -1,8 +1,8 @@
 """Registration of this project's ids with Gymnasium, in whatever order the two are imported.
 
 Gymnasium and NumPy take several times as long to import as a command needs to print its help, and
-Gymnasium loads no entry points. So the package does not import them itself: where Gymnasium is there
-already, the ids are registered at once, and else at the end of its import.
+Gymnasium loads no entry points. So the package does not import them itself: where Gymnasium is
+there already, the ids are registered at once, and else at the end of its import.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files: only regular ones are read, within bounds; locks are held by one at a time; the cache is the
+"""Files: only regular ones are read, within bounds; one at a time holds a lock; the cache is the
 user's alone."""
 
 from __future__ import annotations
@@ -169,20 +169,34 @@ def test_a_name_that_is_too_long_or_a_pipe_is_no_place_for_a_result(tmp_path: Pa
     assert re.sub(r"\s", "", longest.read_text()) == "[1]"
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path):
-    path = tmp_path / "result.json"
-    write_json(path, [1])
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+@pytest.mark.parametrize("before", [None, "old"])
+def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path, error, before):
+    path = tmp_path / "out.json"
+    if before:
+        path.write_text(before)
 
-    def fail(part: Path) -> None:
+    def half(part: Path) -> None:
         part.write_text("half")
-        raise RuntimeError
+        raise error
 
-    with pytest.raises(RuntimeError):
-        write_atomically(path, fail)
+    with pytest.raises(error):
+        write_atomically(path, half)
     with pytest.raises(ValueError, match="JSON"):
         write_json(path, [math.nan])
-    assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+    assert [p.read_text() for p in tmp_path.iterdir()] == ([before] if before else [])
+    write_json(path, [1])
     assert read_json(path, "") == [1]
+    assert [p.name for p in tmp_path.iterdir()] == ["out.json"]
+
+
+def test_places_that_cannot_be_written_are_named(tmp_path: Path):
+    (tmp_path / "plain").touch()
+    for name in (".", "no/file.json", "plain/file.json", "plain/no/file.json"):
+        for write in (require_writable, lambda path: write_json(path, [])):
+            with pytest.raises(ConfigurationError, match="cannot write"):
+                write(tmp_path / name)
+    assert [p.name for p in tmp_path.iterdir()] == ["plain"]
 
 
 # --- locks ----------------------------------------------------------------------------------------

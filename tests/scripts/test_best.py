@@ -69,10 +69,9 @@ def test_check_certifies_both_ends_or_refuses_the_table(safe_envs_command, tmp_p
     status, _, err = safe_envs_command("best", *asked, "--check")
     assert status == 2
     assert f"k = 3 on cell {cell}," in err
-    specified = (*SCALAR, "--spec", "always safe", *COARSELY, "--check")
+    specified = (*SCALAR, *COARSELY, "--spec 'always safe' --check")
     status, _, err = safe_envs_command("best", *specified)
-    assert status == 2
-    assert "only tables of staying safe" in err
+    assert (status, "only tables of staying safe" in err) == (2, True)
 
 
 def test_leaving_and_knowledge_are_as_asked_for(safe_envs_command):
@@ -99,33 +98,9 @@ def test_a_table_is_written_and_read_again(safe_envs_command, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("Quadrotor-v0",), "12 coordinates"),
-        (("Scalar-v0", "--cells", "4x"), "a whole number for each coordinate"),
-        (("Scalar-v0", "--cells", "40x40", "--episodes", 0), "cells"),
-        (("Scalar-v0", "--leaving", "violations"), "did you mean 'violation'"),
-        (("Scalar-v0", "--knowledge", "plants"), "did you mean 'plant'"),
-        (("Scalar-v0", "--inputs", 1), "inputs = 1"),
-        (("Scalar-v0", "--episodes", -1), "episodes = -1"),
-        (("Scalar-v0", "--seed", -1), "seed = -1"),
-        (("Scalar-v0", "--table", "no/where.npz"), "no/where.npz"),
-        (("Scalar-v0", "--plot", "x.txt"), "unknown format 'txt'"),
-        (("Scalar-v1",), "Scalar-v0"),
-    ],
-)
-def test_errors_come_at_once(safe_envs_command, arguments, text):
-    status, _, err = safe_envs_command("best", *arguments)
-    assert status == 2
-    assert text in err
-    assert "Traceback" not in err
-
-
-@pytest.mark.parametrize(
     "arguments",
     [
         (*SCALAR, "--cells", "400"),
-        ("Pendulum-v0", "--horizon", 0.05, "--cells", "30x30"),
         ("DubinsObstacle-v0", "--horizon", 0.1, "--cells", "8x8x8"),
     ],
 )
@@ -163,9 +138,9 @@ def test_a_sweep_has_it_in_its_cells(safe_envs_command, tmp_path):
     fixed = {"env": "Scalar-v0", "horizon": 0.3, "noise": 1.5, "start": [0.8], "best": True}
     document = {"fixed": {**fixed, "episodes": 40}, "grid": {"filter": ["none", "cbf"]}}
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
-    status, _, err = safe_envs_command("sweep", "sweep.yaml", "--out", "cells", "--jobs", 1)
+    status, _, err = safe_envs_command("sweep sweep.yaml --out cells --jobs 1")
     assert (status, err) == (0, "")
-    status, out, _ = safe_envs_command("sweep-report", "cells", "--json", "r.json")
+    status, out, _ = safe_envs_command("sweep-report cells --json r.json")
     assert status == 0
     assert "avoidable" in out
     for cell in strictly("r.json")["worst"]:
@@ -173,5 +148,5 @@ def test_a_sweep_has_it_in_its_cells(safe_envs_command, tmp_path):
     (tmp_path / "sweep.yaml").write_text(
         yaml.safe_dump({"fixed": {**fixed, "env": "Quadrotor-v0"}})
     )
-    status, _, err = safe_envs_command("sweep", "sweep.yaml", "--out", "others")
+    status, _, err = safe_envs_command("sweep sweep.yaml --out others")
     assert status == 2

@@ -45,19 +45,3 @@ def test_a_policy_that_is_no_formula_has_a_note(safe_envs_command):
     status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked)
     assert status == 0
     assert "for none: the policy 'random' is no formula of the state" in " ".join(out.split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("Quadrotor-v0",), "4 inputs"),
-        (("StochasticDubins-v0",), "3 states"),
-        (("Scalar-v0", "--monitoring", "continuous"), "of control instants"),
-        (("Scalar-v0", "--rare"), "--rare does not go with --closed-loop"),
-    ],
-)
-def test_what_has_no_table_is_an_error_at_once(safe_envs_command, arguments, text):
-    status, _, err = safe_envs_command("evaluate", *arguments, "--closed-loop")
-    assert status == 2
-    assert text in err
-    assert "Traceback" not in err

@@ -59,22 +59,3 @@ def test_leaving_may_count_as_safe(frontier, tmp_path):
     )
     assert status == 0
     assert all(point["left"] == 0 for point in strictly(path)["points"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("Quadrotor-v0",), "coordinates"),
-        (("Scalar-v0", "--cells", "10x10"), "give a number for each"),
-        (("Scalar-v0", "--cells", "ten"), "such as 120x80"),
-        (("Scalar-v0", "--leaving", "no"), "violation, safe"),
-        (("Scalar-v0", "--filter", "wrong"), "unknown filter"),
-        (("Scalar-v0", "--policy", "missing.zip"), "no such file"),
-        (("Scalar-v0", "--episodes", "0"), "episodes"),
-        (("Scalar-v0", "--plot", "a.xyz"), "unknown format"),
-    ],
-)
-def test_errors_of_the_user_end_with_status_2(frontier, arguments, message):
-    status, out, err = frontier(*arguments)
-    assert (status, out) == (2, "")
-    assert message in " ".join(err.split())

@@ -48,9 +48,7 @@ def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tm
     status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
     assert (status, out) == (0, "12 of 12 cells are in done, of which 8 were there before.\n")
 
-    status, out, _ = safe_envs_command(
-        "sweep-report", "done", "--worst", 2, "--json", "report.json"
-    )
+    status, out, _ = safe_envs_command("sweep-report done --worst 2 --json report.json")
     assert status == 0
     assert "12 of 12 cells are done, 0 failed, 0 are missing." in out
     assert (tmp_path / "done" / "report.png").stat().st_size > 10_000
@@ -97,7 +95,7 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
     (tmp_path / "done" / "sweep.json").write_text(
         json.dumps({**index, "swept": [*index["swept"], "dt"]})
     )
-    status, out, _ = safe_envs_command("sweep-report", "done", "--plot", "rates.svg")
+    status, out, _ = safe_envs_command("sweep-report done --plot rates.svg")
     assert status == 0
     assert "5 of 8 cells are done, 2 failed, 1 are missing." in out
     assert re.search(
@@ -140,10 +138,10 @@ def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
     )
     assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
     for option in ("--x", "--lines"):
-        status, _, err = safe_envs_command("sweep-report", "done", option, "noise")
+        status, _, err = safe_envs_command("sweep-report done", option, "noise")
         assert status == 2
         assert f"{option} noise: it was not swept; allowed: filter" in err
-    status, _, err = safe_envs_command("sweep-report", "done", "--plot", "picture.txt")
+    status, _, err = safe_envs_command("sweep-report done --plot picture.txt")
     assert status == 2
     assert "unknown format" in err
 

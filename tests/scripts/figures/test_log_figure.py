@@ -8,7 +8,6 @@ from matplotlib.collections import PolyCollection
 
 from safe_envs import ConfigurationError, DecisionLog, plot_log
 from safe_envs.filters.decision_log import LogColumns
-from safe_envs.scripts.figures.log import LogColors
 
 COLUMNS = LogColumns.of(("x",), ("u", "rotor_speed"), ("wall",), units={"u": "m/s^2"})
 
@@ -152,15 +151,6 @@ def test_the_panel_says_where_it_is_cut_off():
     assert cut.axes[1].get_title("right") == "$h$ cut off at 2.1"
     whole = plot_log(with_barriers([[1.0, 1.0], [2.0, 2.0]]))
     assert whole.axes[1].get_title("right") == ""
-
-
-def test_lines_differ_as_long_as_they_can():
-    for colors, count in ((LogColors(), 32), (LogColors(barriers=("black",)), 8)):
-        styles = {str(sorted(colors.barrier(i).items())) for i in range(40)}
-        assert len(styles) == colors.distinct == count
-        assert len(colors.legend(dict.fromkeys(range(count), "h"))) == count
-        last = colors.legend(dict.fromkeys(range(count + 1), "h"))[-1]
-        assert last.get_label() == f"lines repeat after {count}"
 
 
 @pytest.mark.parametrize(

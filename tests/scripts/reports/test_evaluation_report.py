@@ -27,7 +27,7 @@ def evaluated(safe_envs_command):
     """Evaluates a system of `SYSTEM`."""
     Path("own.py").write_text(SYSTEM)
     return lambda name, *arguments: safe_envs_command(
-        "evaluate", "--system", f"own.py:{name}", "--episodes", 40, *arguments
+        "evaluate --system", f"own.py:{name}", "--episodes", 40, *arguments
     )
 
 
@@ -60,9 +60,7 @@ def test_noise_that_is_no_parameter_cannot_be_set(evaluated, name, told):
 
 
 def test_starts_from_which_nothing_is_promised_are_told(evaluated):
-    status, out, _ = evaluated(
-        "falling", "--filter", "none", "--filter", "scbf", "--json", "out.json"
-    )
+    status, out, _ = evaluated("falling --filter none --filter scbf --json out.json")
     assert status == 0
     bare, scbf = strictly("out.json")["rows"]
     assert bare["outside_rate"] is None
@@ -72,7 +70,7 @@ def test_starts_from_which_nothing_is_promised_are_told(evaluated):
         "lie outside the sets C_j = {b_j >= 0}, j >= 1, that scbf keeps: no bound holds from there"
     )
     assert f"Note: {100 * scbf['outside_rate']:.3g} % of the starts {told}\n" in out
-    assert "no bound holds" not in evaluated("falling", "--filter", "scbf", "--start", "1,1")[1]
+    assert "no bound holds" not in evaluated("falling --filter scbf --start 1,1")[1]
 
 
 def printed(answer):
@@ -114,20 +112,6 @@ def test_an_early_end_is_noted_by_the_mean_length_of_all_episodes():
 
     assert early in printed(taking(45))
     assert "the mean episode" not in printed(taking(120))
-
-
-def test_the_compiled_engine_is_named_by_the_speed():
-    answer = evaluate(moving(0.5, 2 - X), filters=["none", "cbf"], episodes=2, bounds=False)
-    assert "compiled" not in printed(answer)
-    first, second = answer.timing.rows
-
-    def said(*rows):
-        return printed(replace(answer, timing=Timing(1, list(rows))))
-
-    fast, faster = (replace(row, engine="compiled", jobs=2) for row in (first, second))
-    assert "the steps/s are those of the compiled engine, in 2 threads" in said(fast, faster)
-    assert "the steps/s of cbf are those of the compiled engine" in said(first, faster)
-    assert "in one thread" in said(replace(fast, jobs=1), second)
 
 
 def test_violations_that_are_no_more_than_rounding_are_told():

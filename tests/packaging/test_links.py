@@ -1,4 +1,4 @@
-"""One import root: only `safe_envs` is installed; the links at the top level are short cuts."""
+"""Only `safe_envs` is installed; the links at the top level of a checkout are short cuts."""
 
 from __future__ import annotations
 
