@@ -15,7 +15,7 @@ from tests.rendering.drawn import SCENE, shown, stepped
 
 
 def test_the_disk_is_to_scale():
-    from safe_envs.rendering.viewer import Picture
+    from safe_envs.rendering.picture import Picture
 
     for radius in (1.0, 2.5):
         env = SafeEnv(
