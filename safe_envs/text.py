@@ -1,10 +1,9 @@
-"""Lines of text that fit a width: names folded where they have joints, sentences at blanks.
+"""Texts: numbers read and rounded, lines of a width, and tables that fit one.
 
 No text says more than the number that was proved. A float counts as the decimal number that JSON
-has for it, so that 0.9 is 90.0 %.
-
-Columns that do not fit become a further table with the same names in front, so that nothing is cut
-off. A title or a name may contain soft hyphens, which show only where a line ends at them.
+has for it, so that 0.9 is 90.0 %. Columns that do not fit become a further table with the same
+names in front, so that nothing is cut off. A title or a name may contain soft hyphens, which show
+only where a line ends at them.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from fractions import Fraction
@@ -477,7 +476,7 @@ def arranged(names: Sequence[Column], columns: Sequence[Column], width: int) -> 
         first = [replace(name, column=replace(name.column, part=-1)) for name in short]
         return _packed([_fitted(numbers)], [*first, *others], width)
     tables, folded_tables = _packed(whole, others, width), _packed(short, others, width)
-    if len(folded_tables) < len(tables) or _widest(tables) > width:
+    if len(folded_tables) < len(tables) or max(map(_total, tables), default=0) > width:
         return folded_tables
     return tables
 
@@ -577,10 +576,6 @@ def _total(table: Sequence[FittedColumn] | Iterator[FittedColumn]) -> int:
     return sum(widths) + GAP * max(len(widths) - 1, 0)
 
 
-def _widest(tables: Sequence[FittedTable]) -> int:
-    return max(map(_total, tables), default=0)
-
-
 def _cell_width(cell: Any) -> int:
     return max(map(text_width, str(cell).splitlines()), default=0)
 
@@ -624,15 +619,8 @@ def _broken(title: str, width: int) -> tuple[str, ...]:
 
 
 def _line(table: FittedTable, cells: Sequence[str]) -> str:
-    pad: dict[str, Callable[[str, int], str]] = {"r": _right}
-    return (" " * GAP).join(
-        pad.get(c.column.kind, _left)(cell, c.width) for c, cell in zip(table, cells, strict=True)
-    )
-
-
-def _left(text: str, width: int) -> str:
-    return text + " " * (width - text_width(text))
-
-
-def _right(text: str, width: int) -> str:
-    return " " * (width - text_width(text)) + text
+    padded = []
+    for c, cell in zip(table, cells, strict=True):
+        blanks = " " * (c.width - text_width(cell))
+        padded.append(blanks + cell if c.column.kind == "r" else cell + blanks)
+    return (" " * GAP).join(padded)

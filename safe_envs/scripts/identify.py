@@ -16,7 +16,7 @@ from safe_envs.scripts.options import completion, early_checks, evaluation_optio
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
-from safe_envs.scripts.options.method_settings import (
+from safe_envs.scripts.options.settings import (
     SETTINGS,
     SETTINGS_HELP,
     read_settings,

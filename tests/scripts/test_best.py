@@ -31,7 +31,7 @@ def own_cache(monkeypatch, tmp_path):
 
 
 def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, tmp_path):
-    status, out, _ = safe_envs_command("best", *SCALAR, *COARSELY, "--json", "best.json")
+    status, out, _ = safe_envs_command("best", *SCALAR, *COARSELY, "--json best.json")
     assert status == 0
     for text in ("lower", "simulated", "upper", "P(leave)", "no policy is safer", "not proved"):
         assert text in out
@@ -50,8 +50,8 @@ def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, 
 
 def test_check_certifies_both_ends_or_refuses_the_table(safe_envs_command, tmp_path):
     asked = (*SCALAR, *COARSELY, "--table", "mine.npz")
-    safe_envs_command("best", *asked, "--json", "1.json")
-    status, out, _ = safe_envs_command("best", *asked, "--check", "--json", "2.json")
+    safe_envs_command("best", *asked, "--json 1.json")
+    status, out, _ = safe_envs_command("best", *asked, "--check --json 2.json")
     assert status == 0
     assert "lower and upper are certified" in out
     assert "not proved" not in out
@@ -83,11 +83,11 @@ def test_leaving_and_knowledge_are_as_asked_for(safe_envs_command):
 
 
 def test_a_table_is_written_and_read_again(safe_envs_command, tmp_path):
-    first = safe_envs_command("best", *SCALAR, *COARSELY, "--table", "mine.npz", "--json", "1.json")
+    first = safe_envs_command("best", *SCALAR, *COARSELY, "--table mine.npz --json 1.json")
     assert first[0] == 0
     for path in (tmp_path / "cache").glob("*.npz"):
         path.unlink()
-    again = safe_envs_command("best", *SCALAR, *COARSELY, "--table", "mine.npz", "--json", "2.json")
+    again = safe_envs_command("best", *SCALAR, *COARSELY, "--table mine.npz --json 2.json")
     assert again[0] == 0
     assert strictly("1.json") == strictly("2.json")
     # Of another problem it is refused.
@@ -99,10 +99,7 @@ def test_a_table_is_written_and_read_again(safe_envs_command, tmp_path):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        (*SCALAR, "--cells", "400"),
-        ("DubinsObstacle-v0", "--horizon", 0.1, "--cells", "8x8x8"),
-    ],
+    [(*SCALAR, "--cells", "400"), ("DubinsObstacle-v0", "--horizon", 0.1, "--cells", "8x8x8")],
 )
 def test_the_value_is_drawn_over_any_number_of_coordinates(safe_envs_command, tmp_path, arguments):
     how = ("--inputs", 3, "--episodes", 0, "--plot", "value.svg")
@@ -117,7 +114,7 @@ def test_evaluate_shows_it_where_it_is_asked_for(safe_envs_command):
     status, before, _ = safe_envs_command("evaluate", *SCALAR, *asked)
     assert status == 0
     assert "best attainable safety" not in before
-    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked, "--best", "--json", "e.json")
+    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked, "--best --json e.json")
     assert status == 0
     assert "best attainable safety: " in out
     assert "avoidable" in out
@@ -129,7 +126,7 @@ def test_evaluate_shows_it_where_it_is_asked_for(safe_envs_command):
     assert safe_envs_command("evaluate", *SCALAR, *asked) == (0, before, "")
     again = safe_envs_command("evaluate", *SCALAR, *asked, "--best")
     assert again == (0, out, "")
-    status, _, err = safe_envs_command("evaluate", *SCALAR, "--rare", "--policy", "best")
+    status, _, err = safe_envs_command("evaluate", *SCALAR, "--rare --policy best")
     assert status == 2
     assert "--rare does not go with --policy best" in err
 

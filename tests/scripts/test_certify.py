@@ -60,14 +60,14 @@ def test_held_input(safe_envs_command):
     assert_says_no_more_than(found, out)
     assert float(certificate.sag) == found["sag"]
     assert found["degrees"][0]["proved"] > 0.7
-    status, out, _ = safe_envs_command("certify", *held, "--start", 1, "--json", "-")
+    status, out, _ = safe_envs_command("certify", *held, "--start 1 --json -")
     assert (status, json.loads(out)["proved"]) == (1, None)
-    status, out, _ = safe_envs_command("certify", *held, "--start", 1)
+    status, out, _ = safe_envs_command("certify", *held, "--start 1")
     assert (status, "no barrier of degree 4" in out) == (1, True)
 
 
 def test_the_nominal_controller_alone(safe_envs_command):
-    status, out, _ = safe_envs_command("certify", *SCALAR[:-1], 0.2, "--policy", "nominal")
+    status, out, _ = safe_envs_command("certify", *SCALAR[:-1], "0.2 --policy nominal")
     assert status == 0
     assert "barrier certificate for the nominal controller" in out
 
@@ -77,7 +77,7 @@ def test_what_is_not_found_is_said(safe_envs_command):
     status, out, _ = safe_envs_command("certify", *SCALAR, *asked)
     assert status == 1
     assert json.loads(out)["proved"] is None
-    status, out, _ = safe_envs_command("certify", *SCALAR, "--start", 1, "--out", "psi.json")
+    status, out, _ = safe_envs_command("certify", *SCALAR, "--start 1 --out psi.json")
     assert status == 1
     assert "No bound above 0 is proved" in out
     assert "no barrier of degree 6" in out

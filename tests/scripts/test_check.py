@@ -25,7 +25,7 @@ def written(tmp_path):
 
 def test_a_proof_ends_with_0_and_says_what_it_proves(safe_envs_command, written):
     starts = ("--state=0,0", "--state", "-.1,.7", "--state", "0,1.5")
-    found = safe_envs_command("check", written(disk()), *starts, "--json", "found.json")
+    found = safe_envs_command("check", written(disk()), *starts, "--json found.json")
     status, out, err = found
     assert (status, err) == (0, "")
     for text in ("psi has degree 2 in x_1, x_2", "every input", "m = 0.080000001", "T = 1"):
@@ -61,7 +61,7 @@ def test_what_is_refuted_or_undecided_ends_with_1(safe_envs_command, written):
     assert (status, err) == (1, "")
     assert json.loads(out)["word"] == "undecided"
     assert json.loads(out)["bounds"] == [{"state": [0, 0], "bound": None}]
-    status, out, _ = safe_envs_command("check psi.json", "--seconds 1e-9 --state 0,0")
+    status, out, _ = safe_envs_command("check psi.json --seconds 1e-9 --state 0,0")
     assert status == 1
     assert "not proved" in out
     assert ">= 9" not in out
@@ -69,7 +69,7 @@ def test_what_is_refuted_or_undecided_ends_with_1(safe_envs_command, written):
 
 def test_a_proof_of_another_system_is_none_of_the_env(safe_envs_command, written):
     other = replace(brownian(), env_id="safe_envs/Scalar-v0")
-    status, out, _ = safe_envs_command("check", written(other), "--json", "found.json")
+    status, out, _ = safe_envs_command("check", written(other), "--json found.json")
     assert status == 1
     assert "differs from that of safe_envs/Scalar-v0" in out
     document = strictly("found.json")
@@ -88,7 +88,7 @@ def test_the_second_opinion(safe_envs_command, written, monkeypatch):
     assert status == 2
     assert ".[proofs]" in err
     pytest.importorskip("flint")
-    status, out, _ = safe_envs_command("check", name, "--arb", "--json", "found.json")
+    status, out, _ = safe_envs_command("check", name, "--arb --json found.json")
     assert status == 0
     assert "ball arithmetic" in out
     assert set(strictly("found.json")["checks"]) == {"intervals", "balls"}

@@ -33,9 +33,7 @@ def test_a_filter_is_compared_at_states_estimates_and_beliefs(safe_envs_command,
 
 def test_without_a_filter_nothing_intervenes_at_states_and_at_estimates(safe_envs_command):
     given = (*QUICK, "--no-bounds", "--json", "out.json")
-    status, out, _ = safe_envs_command(
-        "evaluate", DUBINS, "--filter", "none", "--filter", "scbf", *given
-    )
+    status, out, _ = safe_envs_command("evaluate", DUBINS, "--filter none --filter scbf", *given)
     assert status == 0
     rows = strictly("out.json")["rows"]
     assert [(row["filter"], row["kind"]) for row in rows] == [
@@ -55,8 +53,8 @@ def test_without_a_filter_nothing_intervenes_at_states_and_at_estimates(safe_env
 def test_training_and_the_evaluation_of_its_policy_take_an_estimator(safe_envs_command, tmp_path):
     status, out, _ = safe_envs_command(
         *("train", "Scalar-v0", "--algo", "ppo", "--filter", "scbf", "--out", tmp_path / "run"),
-        *("--n-timesteps", 128, "--num-envs", 4, "--set", "n_steps=32", "--eval-episodes", 4),
-        *("--horizon", 0.3, "--measurement", "default", "--estimator", "kf"),
+        "--n-timesteps 128 --num-envs 4 --set n_steps=32 --eval-episodes 4 --horizon 0.3",
+        "--measurement default --estimator kf",
     )
     assert status == 0
     assert "--estimator=kf" in out.replace("\n", " ")

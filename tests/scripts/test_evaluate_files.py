@@ -32,16 +32,16 @@ def test_a_trained_policy_needs_trust_only_as_a_zip(safe_envs_command, ppo):
         ("evaluate", DUBINS, *QUICK, "--filter", "none"),
         ("verify", "Scalar-v0", "--no-simulate"),
     )
-    assert safe_envs_command(*evaluation, "--policy", "ppo")[0] == 0
-    assert safe_envs_command(*evaluation, "--policy", "ppo/model.zip", "--trust")[0] == 0
+    assert safe_envs_command(*evaluation, "--policy ppo")[0] == 0
+    assert safe_envs_command(*evaluation, "--policy ppo/model.zip --trust")[0] == 0
     for command in (evaluation, verification):
-        status, out, err = safe_envs_command(*command, "--policy", "ppo/model.zip")
+        status, out, err = safe_envs_command(*command, "--policy ppo/model.zip")
         assert (status, out) == (2, "")
         assert (
             "loading ppo/model.zip runs code that it contains; if you trust its source, pass"
             " --trust" in " ".join(err.split())
         )
-    status, _, err = safe_envs_command(*verification, "--policy", "ppo/model.zip", "--trust")
+    status, _, err = safe_envs_command(*verification, "--policy ppo/model.zip --trust")
     assert (status, "another observation space" in " ".join(err.split())) == (2, True)
 
 
@@ -81,7 +81,7 @@ def test_a_failed_picture_leaves_no_part_of_it(safe_envs_command, monkeypatch):
         raise OSError("no space left")
 
     monkeypatch.setattr(Figure, "savefig", fail)
-    status, _, err = safe_envs_command("evaluate Scalar-v0", *QUICK, "--plot", "out.png")
+    status, _, err = safe_envs_command("evaluate Scalar-v0", *QUICK, "--plot out.png")
     assert status == 2
     assert "cannot write out.png: no space left" in err
     assert list(Path().iterdir()) == []

@@ -24,7 +24,7 @@ def learned(safe_envs_command, tmp_path):
     """A file of `safe-envs identify`."""
     assert (
         safe_envs_command(
-            "identify", DISK[0], "--method", "bayesian", *SMALL, "--seed", 7, "--out", "disk.npz"
+            "identify", DISK[0], "--method bayesian", *SMALL, "--seed 7 --out disk.npz"
         )[0]
         == 0
     )
@@ -49,7 +49,7 @@ def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
 @pytest.mark.slow
 def test_a_file_is_used_in_its_place(evaluate, learned):
     filters = ("--filter", "bayesian-scbf", "--filter", "bayesian-scbf:confidence=0.9")
-    status, out, _ = evaluate(filters, "--learned", learned, "--json", "out.json")
+    status, out, _ = evaluate(filters, "--learned", learned, "--json out.json")
     assert status == 0
     assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())
     assert (
@@ -58,8 +58,7 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
             f"bayesian-scbf:file={learned}",
             "--filter",
             f"bayesian-scbf:file={learned}:confidence=0.9",
-            "--json",
-            "named.json",
+            "--json named.json",
         )[0]
         == 0
     )
@@ -76,7 +75,7 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
 @pytest.mark.slow
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
     filters = "--filter scbf --filter bayesian-scbf --filter bayesian-scbf:simultaneous=0.9"
-    status, out, err = evaluate(filters, "--repeats", 2, "--json", "out.json")
+    status, out, err = evaluate(filters, "--repeats 2 --json out.json")
     assert (status, err) == (0, "")
     document = strictly("out.json")
     assert document["config"]["repeats"] == 2

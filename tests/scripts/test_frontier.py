@@ -47,15 +47,7 @@ def test_points_lie_on_or_below_the_curve(frontier, tmp_path):
 def test_leaving_may_count_as_safe(frontier, tmp_path):
     path = tmp_path / "found.json"
     status, _, _ = frontier(
-        "Scalar-v0",
-        *SMALL,
-        "--leaving",
-        "safe",
-        "--start=-2.99",
-        "--policy",
-        "random",
-        "--json",
-        path,
+        "Scalar-v0", *SMALL, "--leaving safe --start=-2.99 --policy random --json", path
     )
     assert status == 0
     assert all(point["left"] == 0 for point in strictly(path)["points"])

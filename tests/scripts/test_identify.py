@@ -13,7 +13,7 @@ from safe_envs.agents.jobs.store import package_versions
 from safe_envs.filters.learning import METHODS, learner_of, load_learned
 from safe_envs.filters.learning.collection import collect
 from safe_envs.registry import make_problem
-from safe_envs.scripts.options.method_settings import SETTINGS, read_settings, settings_of
+from safe_envs.scripts.options.settings import SETTINGS, read_settings, settings_of
 from safe_envs.scripts.reports.identify import Function, unit_of
 from safe_envs.scripts.reports.tables import relative_text
 from tests.scripts.conftest import strictly

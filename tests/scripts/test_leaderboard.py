@@ -20,7 +20,7 @@ def test_agents_are_compared_over_seeds_and_nothing_is_done_twice(safe_envs_comm
     arguments = (
         "leaderboard Scalar-v0 safe_envs/Scalar-v0 --quick --episodes 8 --jobs 1 --out board"
     )
-    status, out, err = safe_envs_command(arguments, "--json", "board.json")
+    status, out, err = safe_envs_command(arguments, "--json board.json")
     assert (status, err) == (0, "")
     document = strictly("board.json")
     assert document["settings"]["seeds"] == 2
@@ -36,7 +36,7 @@ def test_agents_are_compared_over_seeds_and_nothing_is_done_twice(safe_envs_comm
     monkeypatch.setattr("safe_envs.agents.training.trainer.train", None)  # An error, if called.
     Path("page.md").write_text(f"# Title\n\n{BEGIN}\n{END}\n")
     more = ("--markdown", "--quiet", "--pictures", "pictures", "--page", "page.md")
-    status, out, _ = safe_envs_command(arguments, *more, "--json", "again.json")
+    status, out, _ = safe_envs_command(arguments, *more, "--json again.json")
     assert status == 0
     assert strictly("again.json")["rows"] == rows
     assert Path("pictures/Scalar.png").stat().st_size > 10_000

@@ -16,7 +16,7 @@ FEW = ("--particles", "50", "--repetitions", "10")
 
 @pytest.mark.slow
 def test_acceptance_in_small(safe_envs_command):
-    status, out, err = safe_envs_command(ACC, "--rare", *FEW, "--json", "rare.json")
+    status, out, err = safe_envs_command(ACC, "--rare", *FEW, "--json rare.json")
     assert (status, err) == (0, "")
     assert "rare violations, 10 repetitions" in out
     assert "P(violation) [95 % interval]" in out
@@ -41,7 +41,7 @@ def test_acceptance_in_small(safe_envs_command):
 
 def test_reason_in_place_of_a_number(safe_envs_command):
     status, out, _ = safe_envs_command(
-        "evaluate DubinsDisk-v0 --filter hocbf --knowledge plant --rare", *FEW, "--json", "-"
+        "evaluate DubinsDisk-v0 --filter hocbf --knowledge plant --rare", *FEW, "--json -"
     )
     assert status == 0
     assert '"probability": null' in out
@@ -58,7 +58,7 @@ def test_reason_in_place_of_a_number(safe_envs_command):
 def test_starts_outside_the_safe_set_are_told(safe_envs_command):
     arguments = "evaluate Scalar-v0 --filter scbf --start 2 --horizon 0.2 --json out.json"
     told = "all episodes start where h <= 0: they count as violated whatever a filter does"
-    assert told in safe_envs_command(arguments, "--episodes", "20")[1]
+    assert told in safe_envs_command(arguments, "--episodes 20")[1]
     assert told in safe_envs_command(arguments, "--rare", *FEW)[1]
     (row,) = strictly("out.json")["rows"]
     assert (row["method"], row["plain"]["outside"], row["plain"]["kept_length"]) == (
@@ -73,7 +73,7 @@ def test_starts_outside_the_safe_set_are_told(safe_envs_command):
 def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
     arguments = "evaluate Scalar-v0 --filter none --episodes 20 --horizon 0.2"
     assert "monitored" not in safe_envs_command(arguments)[1]
-    status, out, _ = safe_envs_command(arguments, "--monitoring", "continuous")
+    status, out, _ = safe_envs_command(arguments, "--monitoring continuous")
     assert status == 0
     assert "horizon 0.2 s, monitored continuously" in out
     status, out, _ = safe_envs_command(

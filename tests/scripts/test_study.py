@@ -34,7 +34,7 @@ def arguments(tmp_path):
 
 @pytest.mark.slow
 def test_agents_are_trained_once_and_compared(safe_envs_command, arguments):
-    status, out, _ = safe_envs_command(*arguments, "--json", "s.json")
+    status, out, _ = safe_envs_command(*arguments, "--json s.json")
     assert status == 0
     for word in ("unfiltered", "behind it", "scbf", "no filter", "2 seeds", "20 episodes"):
         assert word in out
@@ -48,7 +48,7 @@ def test_agents_are_trained_once_and_compared(safe_envs_command, arguments):
     agents = {each["policy"] for each in document["rows"]}
     assert len(agents) == 4  # two agents of two seeds: each is trained once
     changed = {path: path.stat().st_mtime_ns for path in Path("found").rglob("*.*")}
-    status, out, _ = safe_envs_command(*arguments, "--markdown", "--against", "unfiltered")
+    status, out, _ = safe_envs_command(*arguments, "--markdown --against unfiltered")
     assert status == 0
     assert "differences from unfiltered" in out
     lines = [line for line in out.splitlines() if line.startswith("| behind it")]

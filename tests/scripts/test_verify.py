@@ -30,7 +30,7 @@ def verify(monkeypatch, safe_envs_command):
 
 
 def test_the_report_names_what_was_found(verify):
-    status, out, err = verify(CUBIC_DISK, "--episodes", 100, "--dt", 0.05)
+    status, out, err = verify(CUBIC_DISK, "--episodes 100 --dt 0.05")
     assert (status, err) == (0, "")
     for text in (
         "relative degree 1 with scbf",
@@ -178,7 +178,7 @@ def test_json_holds_all_of_it(verify, tmp_path):
 
 def test_the_picture_is_drawn(verify, tmp_path):
     path = tmp_path / "found.svg"
-    assert verify("StochasticDubins-v0 --no-simulate", "--plot", path)[0] == 0
+    assert verify("StochasticDubins-v0 --no-simulate --plot", path)[0] == 0
     picture = path.read_text()
     assert "no action meets the condition" in picture
     assert "worst state" in picture
@@ -213,7 +213,7 @@ def problem():
 def test_what_a_search_misses_is_not_printed_as_a_fact(verify, safe_envs_command):
     Path("own.py").write_text(SPIKE)
     asked = ("--system", "own.py:problem", "--filter", "scbf")
-    status, out, _ = verify(*asked, "--no-simulate", "--json", "o.js")
+    status, out, _ = verify(*asked, "--no-simulate --json o.js")
     assert status == 0
     assert "c = sup h over C <= 50.6831, proved" in out
     assert "violated by at most 4.00001e+08, proved; by 0.08 at" in out

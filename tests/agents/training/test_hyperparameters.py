@@ -9,7 +9,7 @@ from torch import nn
 from safe_envs import ConfigurationError
 from safe_envs.agents.training.config import ALGORITHMS, Training, python_value
 from safe_envs.agents.training.trainer import TrainingSession, train
-from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
+from safe_envs.scripts.options.settings import read_hyperparameters
 
 SMALL = {"n_timesteps": 16, "num_envs": 2, "eval_episodes": 2, "options": {"horizon": 0.2}}
 

@@ -133,19 +133,6 @@ def with_barriers(rows, names=None, bounds=(-1.0, 1.0), proposed=0.0):
     return log
 
 
-def test_the_legend_has_what_can_be_seen():
-    rows = [[0.1 * k, 1e6, 2e6] for k in range(3)]
-    figure = plot_log(with_barriers(rows, bounds=(-1e6, np.inf)))
-    assert [t for t in texts_of(figure) if t.strip()] == [
-        "executed input",
-        "$h$ b0, min 0",
-        "outside the panel: 2 more",
-    ]
-    figure = plot_log(with_barriers(rows, proposed=0.8))
-    assert {"nominal input", "input bounds"} <= set(texts_of(figure))
-    assert "intervention" not in texts_of(figure)
-
-
 def test_the_panel_says_where_it_is_cut_off():
     cut = plot_log(with_barriers([[1.0, 7.0], [2.0, 1e6]]))
     assert cut.axes[1].get_title("right") == "$h$ cut off at 2.1"

@@ -18,7 +18,6 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import cli
 from safe_envs.scripts.options import console
 from safe_envs.scripts.options.console import run
-from safe_envs.scripts.options.terminal import visible_text
 from tests.wrappers.verification.verified import verify_once
 
 pytestmark = pytest.mark.slow
@@ -75,15 +74,6 @@ def test_control_characters_in_what_is_said_are_written_out(capsys, kind, wrap):
     assert capsys.readouterr().out == "of a\\x1b[31mb\\u202ec\nand more\n"
 
 
-def test_what_is_written_out_keeps_its_style():
-    text = visible_text(Text.assemble(("a\x1bb", "bold"), " c"))
-    assert isinstance(text, Text)
-    assert (text.plain, [(s.start, s.end, str(s.style)) for s in text.spans][:1]) == (
-        "a\\x1bb c",
-        [(0, 6, "bold")],
-    )
-
-
 def test_a_request_to_terminate_is_like_ctrl_c():
     with pytest.raises(KeyboardInterrupt):
         run(lambda: os.kill(os.getpid(), signal.SIGTERM))
@@ -104,8 +94,8 @@ def test_errors_of_gymnasium_are_of_the_users_making(capsys):
 
 @pytest.mark.parametrize("arguments", [(QUICK, "--quiet"), ("--quiet", QUICK)])
 def test_quiet_prints_the_table_only(safe_envs_command, arguments):
-    whole = safe_envs_command(QUICK, "--json", "whole.json")[1].splitlines()
-    status, out, err = safe_envs_command(*arguments, "--json", "quiet.json")
+    whole = safe_envs_command(QUICK, "--json whole.json")[1].splitlines()
+    status, out, err = safe_envs_command(*arguments, "--json quiet.json")
     assert (status, err) == (0, "")
     lines = out.splitlines()
     assert [line.split()[0] for line in lines[-2:]] == ["none", "scbf"]
@@ -139,10 +129,10 @@ def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments
     )
     monkeypatch.setattr("safe_envs.agents.evaluation.safety_chain.STARTS", 512)
     monkeypatch.setattr("safe_envs.proofs.feasibility.verify", verify_once)
-    status, out, err = safe_envs_command(arguments, "--json", "-")
+    status, out, err = safe_envs_command(arguments, "--json -")
     assert (status, err) == (0, "")
     given = json.loads(out)
-    assert safe_envs_command(arguments, "--json", "file.json")[0] == 0
+    assert safe_envs_command(arguments, "--json file.json")[0] == 0
     written = json.loads(Path("file.json").read_text())
     for document in (given, written):
         document.pop("timing", None)

@@ -101,7 +101,7 @@ def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, opt
     path = Path("own.py")
     path.write_text(SYSTEM)
     status, out, err = safe_envs_command(
-        command, "--system", "own.py:problem", *COMMANDS[command], option, "./own.py"
+        command, "--system own.py:problem", *COMMANDS[command], option, "./own.py"
     )
     assert (status, out) == (2, "")
     assert (
@@ -123,7 +123,7 @@ def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, opt
     ],
 )
 def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
-    status, out, err = safe_envs_command(*arguments, "--json", "own.py")
+    status, out, err = safe_envs_command(*arguments, "--json own.py")
     assert (status, out) == (2, "")
     assert f"--json own.py would overwrite the file of {file}" in " ".join(err.split())
     assert not Path("own.py").exists()
@@ -140,6 +140,6 @@ def test_bounds_are_of_the_horizon_that_is_simulated(safe_envs_command):
     assert "T = 2.1 s" in out
     found = strictly("found.json")
     assert found["config"]["horizon"] == pytest.approx(2.1)
-    assert safe_envs_command("verify", arguments, "--horizon", 2.1)[0] == 0
+    assert safe_envs_command("verify", arguments, "--horizon 2.1")[0] == 0
     assert strictly("found.json")["bounds"] == found["bounds"]
     assert any(bound["value"] and not bound["forever"] for bound in found["bounds"])

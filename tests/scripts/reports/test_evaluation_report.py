@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from rich.console import Console
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.results import Timing
 from safe_envs.agents.evaluation.statistics import touches
 from safe_envs.scripts.reports.evaluation import print_evaluation
 from tests.scripts.conftest import strictly
@@ -27,7 +25,7 @@ def evaluated(safe_envs_command):
     """Evaluates a system of `SYSTEM`."""
     Path("own.py").write_text(SYSTEM)
     return lambda name, *arguments: safe_envs_command(
-        "evaluate --system", f"own.py:{name}", "--episodes", 40, *arguments
+        "evaluate --system", f"own.py:{name}", "--episodes 40", *arguments
     )
 
 
@@ -36,27 +34,13 @@ def evaluated(safe_envs_command):
     [("problem", "noise sigma = 0.1,"), ("fixed", "fixed noise,"), ("still", "no noise,")],
 )
 def test_the_heading_has_the_noise_and_the_horizon_of_what_is_simulated(evaluated, name, noise):
-    status, out, err = evaluated(name, "--filter", "none")
+    status, out, err = evaluated(name, "--filter none")
     assert (status, err) == (0, "")
     # 33 whole periods.
     assert (
         out.splitlines()[1]
         == f"{noise} model = plant, dt = 0.03 s, horizon 0.99 s; filters know the model"
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "told"),
-    [
-        ("fixed", "write it as a parameter, so that it can be changed"),
-        ("still", "no noise channels\n"),
-    ],
-)
-def test_noise_that_is_no_parameter_cannot_be_set(evaluated, name, told):
-    status, _, err = evaluated(name, "--noise", 0.2)
-    assert status == 2
-    assert "cart has no noise channels" in err
-    assert told in err
 
 
 def test_starts_from_which_nothing_is_promised_are_told(evaluated):
@@ -91,27 +75,6 @@ def moving(rate, barrier, *, start=0.0, horizon=4.0, nominal=0):
         "nominal": nominal,
     }
     return state_problem(system, [barrier], box=(-1, 1), **options)
-
-
-def test_an_early_end_is_noted_by_the_mean_length_of_all_episodes():
-    early = (
-        "with none the mean episode ends after 3.0 of 8 steps, at the goal or outside the workspace"
-    )
-    answer = evaluate(moving(0.5, 2 - X), filters=["none"], episodes=5, bounds=False)
-    # From 0 to 1.25, in steps of .25: five of eight.
-    assert early.replace("3.0", "5.0") in printed(answer)
-    assert "the mean episode" not in printed(
-        evaluate(moving(0.2, 2 - X), filters=["none"], episodes=5, bounds=False)
-    )
-    # Of three identifications the steps and the episodes are three times as many.
-    (row,), (speed,) = answer.rows, answer.timing.rows
-    thrice = replace(answer, rows=[replace(row, episodes=15)])
-
-    def taking(steps):
-        return replace(thrice, timing=Timing(1, [replace(speed, steps=steps)]))
-
-    assert early in printed(taking(45))
-    assert "the mean episode" not in printed(taking(120))
 
 
 def test_violations_that_are_no_more_than_rounding_are_told():
