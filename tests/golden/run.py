@@ -36,7 +36,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
-from safe_envs.files import VARIABLE  # noqa: E402
+from safe_envs.files import own_cache  # noqa: E402
 from safe_envs.scripts.cli import main as safe_envs_main  # noqa: E402
 from tests.golden.cases import SYSTEMS, cases  # noqa: E402
 from tests.golden.environments import rows  # noqa: E402
@@ -276,9 +276,7 @@ def main() -> int:
         return 2
     wrong = 0
     with (
-        # Tables that the user has at hand would be read.
-        tempfile.TemporaryDirectory() as cache,
-        mock.patch.dict(os.environ, {VARIABLE: cache}),
+        own_cache(),  # Tables that the user has would be read.
         ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn"))
         if given.jobs > 1
         else contextlib.nullcontext() as pool,

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.files import VARIABLE
+from safe_envs.files import own_cache
 from tests.golden import run
 
 
 @pytest.mark.oracle
 @pytest.mark.parametrize("name", run.names())
-def test_a_case_is_as_it_is_stored(name: str, tmp_path, monkeypatch):
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
-    assert run.compared(name, run.compute(name)) == []
+def test_a_case_is_as_it_is_stored(name: str):
+    with own_cache():
+        found = run.compute(name)
+    assert run.compared(name, found) == []
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
 
 @pytest.mark.slow
 def test_a_file_is_used_in_its_place(evaluate, learned):
-    filters = ("--filter", "bayesian-scbf", "--filter", "bayesian-scbf:confidence=0.9")
+    filters = "--filter bayesian-scbf --filter bayesian-scbf:confidence=0.9"
     status, out, _ = evaluate(filters, "--learned", learned, "--json out.json")
     assert status == 0
     assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())

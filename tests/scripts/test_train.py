@@ -21,21 +21,9 @@ QUICK = "--n-timesteps 512 --num-envs 4 --eval-freq 256 --eval-episodes 8 --hori
 @pytest.mark.slow
 def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_path):
     arguments = (
-        "train",
-        DUBINS,
-        "--algo",
-        "ppo",
-        "--filter",
-        "scbf",
+        f"train {DUBINS} --algo ppo --filter scbf --engine numpy --out run",
         QUICK,
-        "--set",
-        "learning_rate=lin_1e-3",
-        "--set",
-        "ent_coef=1e-3",
-        "--engine",
-        "numpy",
-        "--out",
-        "run",
+        "--set learning_rate=lin_1e-3 --set ent_coef=1e-3",
     )
     status, out, err = safe_envs_command(*arguments, "--tensorboard logs")
     assert (status, err) == (0, "")
@@ -59,7 +47,7 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
 
 def test_an_agent_under_a_limit_is_told_to_keep_it_or_not(safe_envs_command):
     Path("own.py").write_text(SYSTEM)
-    given = ("--algo", "ppo-lag", "--num-envs", 4, "--eval-episodes", 8, "--set", "n_steps=32")
+    given = "--algo ppo-lag --num-envs 4 --eval-episodes 8 --set n_steps=32"
     arguments = ("train", "--system", "own.py:problem", given, "--n-timesteps", 1024)
     limit = ("--eval-freq", 1024, "--out", "run", "--violation-limit")
     status, out, err = safe_envs_command(*arguments, *limit, "0.2 --json run.json")

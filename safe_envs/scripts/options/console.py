@@ -101,7 +101,7 @@ Json = Annotated[
     typer.Option(
         "--json",
         metavar="FILE",
-        help="Write the results; - writes them to stdout, and nothing else.",
+        help="Write all that was found; - for stdout, and nothing else there.",
     ),
 ]
 
