@@ -124,9 +124,6 @@ def test_errors_are_not_quiet(safe_envs_command):
 
 @pytest.mark.parametrize("arguments", [QUICK, "list", "verify Scalar-v0 --no-simulate"])
 def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments):
-    monkeypatch.setattr(
-        "safe_envs.systems.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
-    )
     monkeypatch.setattr("safe_envs.agents.evaluation.safety_chain.STARTS", 512)
     monkeypatch.setattr("safe_envs.proofs.feasibility.verify", verify_once)
     status, out, err = safe_envs_command(arguments, "--json -")
