@@ -13,13 +13,15 @@ import re
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal
-from fractions import Fraction
 from itertools import groupby
 from numbers import Rational
-from typing import Any, Literal, SupportsFloat
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 
 from safe_envs.errors import ConfigurationError, shown
+
+if TYPE_CHECKING:  # Not imported before they are needed: the help of a command does without.
+    from decimal import Decimal
+    from fractions import Fraction
 
 _PIECES = re.compile(r"[^\s:+,;/=]*[:+,;/=\s]+|[^\s:+,;/=]+")
 """Where a name may be folded: after the signs that part the settings of a filter or a path."""
@@ -268,6 +270,9 @@ def rounded(value: Number, places: int, *, up: bool) -> Decimal:
         places: after the decimal point; negative ones are before it.
         up: whether it is an upper bound.
     """
+    from decimal import Decimal
+    from fractions import Fraction
+
     scaled = _exact(value) * Fraction(10) ** places
     whole = math.ceil(scaled) if up else math.floor(scaled)
     return Decimal(f"{whole}e{-places}")
@@ -346,6 +351,8 @@ def number_at_least(value: Number, digits: int = 4) -> str:
 
 
 def _significant(value: Number, digits: int, *, up: bool) -> str:
+    from decimal import Decimal
+
     if not math.isfinite(float(value)):
         return "infinite" if float(value) == math.inf else str(float(value))
     exact = _exact(value)
@@ -356,6 +363,8 @@ def _significant(value: Number, digits: int, *, up: bool) -> str:
 
 
 def _exact(value: Number) -> Fraction:
+    from fractions import Fraction
+
     return Fraction(value) if isinstance(value, Rational) else Fraction(repr(float(value)))
 
 
