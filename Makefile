@@ -1,7 +1,7 @@
 # make demo        train a small agent, then print safety rates with and without filters
 # make test        run the test suite
 # make check       run its quick part, after every edit
-# make oracle      run the long comparisons with exact solutions
+# make oracle      run the long comparisons, with exact solutions and with stored results
 # make clusters    run sweeps on local Dask and Ray clusters
 # make mutants     check that the tests fail on faulty versions of the code
 # make golden      compare the output of commands and envs with stored results, when refactoring

@@ -1,35 +1,31 @@
-"""Files that are there whole or not at all.
+"""Files: written whole or not at all, read within bounds, locked, and kept in the user's cache.
 
-Whoever keeps something there gives it a name of hexadecimal digits, marks it with `mark_used` where
-it is used again, and calls `make_room` afterwards: what was not used for longest is removed first.
-Files of other names are not ours, and remain.
+Whoever keeps something in the cache names it by hexadecimal digits, marks it with `mark_used`
+where it is used again, and calls `make_room` afterwards: what was not used for longest is removed
+first. Files of other names are not ours, and remain.
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
-import math
 import os
 import re
 import shutil
 import stat
 import struct
-import sys
 import tempfile
 import time
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, BinaryIO
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from safe_envs.errors import ConfigurationError, shortened
+
+if TYPE_CHECKING:
+    import zipfile
 
 _STEM = 40
 
@@ -254,6 +250,8 @@ def open_archive(stream: BinaryIO, most: int = MOST_BYTES) -> zipfile.ZipFile:
     Raises:
         ValueError: it is damaged, or too large when it is unpacked.
     """
+    import zipfile
+
     size = stream.seek(0, os.SEEK_END)
     stream.seek(max(size - _LARGE_END.size - _LOCATOR - _END.size, 0))
     tail = stream.read().rjust(_LARGE_END.size + _LOCATOR + _END.size, b"\0")
@@ -278,8 +276,8 @@ def _too_large(most: int) -> str:
     return f"it is larger than {most / 1e6:g} MB, the largest that is read"
 
 
-_HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
-"""What the operating system says of a lock that somebody else holds."""
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP)
+"""What the operating system says of a lock on a file system that has none."""
 
 _PAUSE = 0.2
 """Seconds between two attempts to get a lock."""
@@ -304,52 +302,27 @@ def locked(path: Path, taken: str, wait: Callable[[], object] | None = None) -> 
         ConfigurationError: another process holds the lock and `wait` is not given, or the file
             cannot be made.
     """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path)
     with writing(path):
-        file = _opened(path)
-    if file is None:
-        if wait is None:
-            raise ConfigurationError(taken)
-        wait()
-    while file is None:
-        time.sleep(_PAUSE)
-        with writing(path):
-            file = _opened(path)
+        try:
+            lock.acquire(blocking=False)
+        except Timeout:
+            if wait is None:
+                raise ConfigurationError(taken) from None
+            wait()
+            lock.acquire(poll_interval=_PAUSE)
+        except OSError as error:
+            if error.errno not in _WITHOUT_LOCKS:
+                raise
     try:
         yield
     finally:
-        # Windows removes no file that is open.
+        # Windows removes no file that is open. Whoever waits takes none that was removed.
         with suppress(OSError):
             path.unlink()
-        file.close()
-
-
-def _opened(path: Path) -> IO[bytes] | None:
-    """Return the locked file, or None if another process holds its lock."""
-    while True:
-        file = path.open("ab")
-        try:
-            _lock(file)
-            # Whoever held the lock before has removed its file.
-            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                return file
-        except OSError as error:
-            if error.errno not in _HELD:
-                return file
-            file.close()
-            return None
-        file.close()
-
-
-def _lock(file: IO[bytes]) -> None:
-    """Lock an open file; raise OSError where another process holds the lock."""
-    try:
-        import fcntl
-    except ImportError:
-        import msvcrt
-
-        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
-    else:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock.release()
 
 
 VARIABLE = "SAFE_ENVS_CACHE"
@@ -400,10 +373,17 @@ def cache_folder(name: str) -> Path | None:
     if given == "":
         return None
     try:
-        folder = (_user_folder() if given is None else Path(given)) / name
+        if given is None:
+            from platformdirs import user_cache_path
+
+            folder = user_cache_path("safe-envs", appauthor=False, opinion=False) / name
+            if not folder.is_absolute():  # No home.
+                return None
+        else:
+            folder = Path(given) / name
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         return folder if _is_private(folder) else None
-    except (OSError, RuntimeError, ValueError):  # No home, no right, no name of a file.
+    except (OSError, RuntimeError, ValueError):  # No right, no name of a file.
         return None
 
 
@@ -424,16 +404,6 @@ def _anyone_may_rename_in(folder: Path) -> bool:
     """Return whether anyone can put a folder of theirs in the place of one in it."""
     mode = folder.stat().st_mode
     return bool(mode & stat.S_IWOTH) and not mode & stat.S_ISVTX
-
-
-def _user_folder() -> Path:
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "safe-envs"
 
 
 def entries(name: str) -> list[CacheEntry]:
@@ -515,170 +485,3 @@ def _remove(place: Path) -> None:
         shutil.rmtree(place, ignore_errors=True)
     with suppress(OSError):
         place.unlink()
-
-
-_HEADER = "header"
-_MOST_PARTS = 1000
-
-# What zipfile, NumPy, json and Python raise on damaged files, and on JSON of another shape.
-_DAMAGED = (
-    EOFError,
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    RecursionError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-
-_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-
-
-def checksum(described: Any, arrays: Mapping[str, np.ndarray]) -> str:
-    """Return the SHA-256 of all that is saved, as hexadecimal digits.
-
-    Args:
-        described: JSON-able.
-        arrays: numbers by name.
-    """
-    digest = hashlib.sha256(json.dumps(described, sort_keys=True, default=_plain).encode())
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        digest.update(array.reshape(-1).data)
-    return digest.hexdigest()
-
-
-def write_arrays(
-    path: Path,
-    header: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
-    most: int = MOST_BYTES,
-) -> None:
-    """Write a file, whole or not at all.
-
-    Args:
-        path: where.
-        header: JSON-able.
-        arrays: numbers by name; none may be called "header".
-        most: bytes that are read of such a file.
-
-    Raises:
-        ConfigurationError: It cannot be written there, or would be too large to be read.
-    """
-    size = sum(np.asarray(array).nbytes for array in arrays.values())
-    if size > most:
-        raise ConfigurationError(
-            f"{path} would take {size / 1e6:.3g} MB; at most {most / 1e6:g} MB are read: save"
-            " less in a file"
-        )
-    encoded = np.frombuffer(
-        json.dumps(header, allow_nan=False, default=_plain).encode(), dtype=np.uint8
-    )
-
-    def write(part: Path) -> None:
-        with part.open("wb") as stream:
-            plain = {name: np.asarray(array) for name, array in arrays.items()}
-            np.savez(stream, allow_pickle=False, header=encoded, **plain)
-
-    write_atomically(path, write)
-
-
-class ArrayFile:
-    """An open file, of which nothing but the header has been read.
-
-    Args:
-        archive: of the file.
-
-    Attributes:
-        header: what its JSON says.
-
-    Raises:
-        Exception: One of those that `reading` knows: it is no such file.
-    """
-
-    def __init__(self, archive: zipfile.ZipFile) -> None:
-        parts = {part.filename.removesuffix(".npy"): part for part in archive.infolist()}
-        if len(parts) != len(archive.infolist()) or len(parts) > _MOST_PARTS:
-            raise ValueError("too many parts, or two of one name")
-        # Ours are as large in the file as in memory.
-        if any(
-            part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size
-            for part in parts.values()
-        ):
-            raise ValueError("a part is compressed")
-        if parts[_HEADER].file_size > MOST_BYTES_OF_TEXT:
-            raise ValueError("the header is too large")
-        self.header: Any = json.loads(_array(archive, parts.pop(_HEADER)).tobytes())
-        self._archive, self._parts = archive, parts
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays by name."""
-        return {key: _array(self._archive, part) for key, part in self._parts.items()}
-
-
-@contextmanager
-def reading(
-    path: Path,
-    writer: str,
-    error_type: type[ConfigurationError] = ConfigurationError,
-    most: int = MOST_BYTES,
-) -> Iterator[ArrayFile]:
-    """Yield an open file; what goes wrong while it is read is an error that names it.
-
-    Args:
-        path: of the file.
-        writer: command that writes such files, for the messages.
-        error_type: of the errors; the caller's own of this type are passed on.
-        most: largest size in bytes of the file, and of its arrays together.
-
-    Raises:
-        ConfigurationError: It is missing, a folder, no such file, truncated or altered.
-    """
-    name = shortened(path)
-    try:
-        with open_regular(path, most) as stream, open_archive(stream, most) as archive:
-            yield ArrayFile(archive)
-    except FileNotFoundError as error:
-        raise error_type(f"{name} does not exist; `{writer}` writes such files") from error
-    except IsADirectoryError as error:
-        raise error_type(f"{name} is a folder; name a file in it that `{writer}` wrote") from error
-    except OSError as error:
-        raise error_type(
-            f"{name} cannot be read: {error.strerror}; name a file that `{writer}` wrote"
-        ) from error
-    except _DAMAGED as error:
-        if isinstance(error, error_type):
-            raise
-        raise error_type(
-            f"{name} is no file of `{writer}`, or it is truncated or altered"
-            f" ({type(error).__name__})"
-        ) from error
-
-
-def _plain(value: Any) -> Any:
-    """Return a number of NumPy, which settings and seeds may be, as one of Python."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"{value!r} is no JSON")
-
-
-def _array(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array of numbers, without taking more memory than the part has bytes."""
-    with archive.open(part) as stream:
-        shape, _, kind = _HEADERS[np.lib.format.read_magic(stream)](stream)
-        if (
-            kind.kind not in "biuf"
-            or math.prod(shape) * kind.itemsize != part.file_size - stream.tell()
-        ):
-            raise ValueError("it holds no numbers, or others than its header says")
-        stream.seek(0)
-        return np.lib.format.read_array(stream, allow_pickle=False)

@@ -215,7 +215,7 @@ def _module_name(path: Path) -> str:
 @lru_cache(maxsize=32)
 def _loaded(path: Path, _changed: int) -> ModuleType:
     """Import a file, once until it changes, so that its symbols are compiled once."""
-    name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
+    name = _module_name(path)
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigurationError(f"{path} cannot be read as Python")

@@ -1,10 +1,9 @@
-"""Lines of text that fit a width: names folded where they have joints, sentences at blanks.
+"""Texts: numbers read and rounded, lines of a width, and tables that fit one.
 
 No text says more than the number that was proved. A float counts as the decimal number that JSON
-has for it, so that 0.9 is 90.0 %.
-
-Columns that do not fit become a further table with the same names in front, so that nothing is cut
-off. A title or a name may contain soft hyphens, which show only where a line ends at them.
+has for it, so that 0.9 is 90.0 %. Columns that do not fit become a further table with the same
+names in front, so that nothing is cut off. A title or a name may contain soft hyphens, which show
+only where a line ends at them.
 """
 
 from __future__ import annotations
@@ -12,15 +11,17 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal
-from fractions import Fraction
 from itertools import groupby
 from numbers import Rational
-from typing import Any, Literal, SupportsFloat
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat
 
 from safe_envs.errors import ConfigurationError, shown
+
+if TYPE_CHECKING:  # Not imported before they are needed: the help of a command does without.
+    from decimal import Decimal
+    from fractions import Fraction
 
 _PIECES = re.compile(r"[^\s:+,;/=]*[:+,;/=\s]+|[^\s:+,;/=]+")
 """Where a name may be folded: after the signs that part the settings of a filter or a path."""
@@ -269,6 +270,9 @@ def rounded(value: Number, places: int, *, up: bool) -> Decimal:
         places: after the decimal point; negative ones are before it.
         up: whether it is an upper bound.
     """
+    from decimal import Decimal
+    from fractions import Fraction
+
     scaled = _exact(value) * Fraction(10) ** places
     whole = math.ceil(scaled) if up else math.floor(scaled)
     return Decimal(f"{whole}e{-places}")
@@ -347,6 +351,8 @@ def number_at_least(value: Number, digits: int = 4) -> str:
 
 
 def _significant(value: Number, digits: int, *, up: bool) -> str:
+    from decimal import Decimal
+
     if not math.isfinite(float(value)):
         return "infinite" if float(value) == math.inf else str(float(value))
     exact = _exact(value)
@@ -357,6 +363,8 @@ def _significant(value: Number, digits: int, *, up: bool) -> str:
 
 
 def _exact(value: Number) -> Fraction:
+    from fractions import Fraction
+
     return Fraction(value) if isinstance(value, Rational) else Fraction(repr(float(value)))
 
 
@@ -477,7 +485,7 @@ def arranged(names: Sequence[Column], columns: Sequence[Column], width: int) -> 
         first = [replace(name, column=replace(name.column, part=-1)) for name in short]
         return _packed([_fitted(numbers)], [*first, *others], width)
     tables, folded_tables = _packed(whole, others, width), _packed(short, others, width)
-    if len(folded_tables) < len(tables) or _widest(tables) > width:
+    if len(folded_tables) < len(tables) or max(map(_total, tables), default=0) > width:
         return folded_tables
     return tables
 
@@ -577,10 +585,6 @@ def _total(table: Sequence[FittedColumn] | Iterator[FittedColumn]) -> int:
     return sum(widths) + GAP * max(len(widths) - 1, 0)
 
 
-def _widest(tables: Sequence[FittedTable]) -> int:
-    return max(map(_total, tables), default=0)
-
-
 def _cell_width(cell: Any) -> int:
     return max(map(text_width, str(cell).splitlines()), default=0)
 
@@ -624,15 +628,8 @@ def _broken(title: str, width: int) -> tuple[str, ...]:
 
 
 def _line(table: FittedTable, cells: Sequence[str]) -> str:
-    pad: dict[str, Callable[[str, int], str]] = {"r": _right}
-    return (" " * GAP).join(
-        pad.get(c.column.kind, _left)(cell, c.width) for c, cell in zip(table, cells, strict=True)
-    )
-
-
-def _left(text: str, width: int) -> str:
-    return text + " " * (width - text_width(text))
-
-
-def _right(text: str, width: int) -> str:
-    return " " * (width - text_width(text)) + text
+    padded = []
+    for c, cell in zip(table, cells, strict=True):
+        blanks = " " * (c.width - text_width(cell))
+        padded.append(blanks + cell if c.column.kind == "r" else cell + blanks)
+    return (" " * GAP).join(padded)

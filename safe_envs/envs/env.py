@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from safe_envs.arrays import real_array
 from safe_envs.dynamics.noise import Key, StreamReader, key_of
 from safe_envs.envs.episode import Actuators, Episode
 from safe_envs.envs.info import Info
@@ -18,7 +19,7 @@ from safe_envs.envs.simulation import LARGEST, Simulation, require_sound, steps_
 from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.envs.spec import OwnSpec
 from safe_envs.envs.starts import RequestedStart, ResetOptions
-from safe_envs.errors import IndependentCopies, InvalidInputError, NumericalError, flag, real_array
+from safe_envs.errors import IndependentCopies, InvalidInputError, NumericalError, flag
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 

@@ -9,8 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from safe_envs.arrays import real_array
 from safe_envs.dynamics.codegen import Components, constants, finite
-from safe_envs.errors import InvalidInputError, real_array
+from safe_envs.errors import InvalidInputError
 from safe_envs.problem.measurement import Channel
 from safe_envs.problem.problem import SafetyProblem
 

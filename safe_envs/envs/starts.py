@@ -8,16 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.utils import seeding
 
+from safe_envs.arrays import real_array
 from safe_envs.dynamics.noise import Key, StreamReader, key_of
 from safe_envs.envs.simulation import start_sampler
-from safe_envs.errors import (
-    ConfigurationError,
-    InvalidInputError,
-    nearest,
-    real_array,
-    require_whole,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest, require_whole, shown
 from safe_envs.problem.actuators import input_ranges
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.starts import StartSampler

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import numbers_in, real_array
 from safe_envs.dynamics.codegen import finite
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.dynamics.symbols import declared_sign
@@ -22,8 +23,6 @@ from safe_envs.errors import (
     InvalidInputError,
     SystemDefinitionError,
     nearest,
-    numbers_in,
-    real_array,
     shown,
     unexpected_argument,
 )

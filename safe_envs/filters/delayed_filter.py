@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import real_array
 from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.dynamics.integrators import Integrator
@@ -18,7 +19,6 @@ from safe_envs.errors import (
     ConfigurationError,
     InvalidInputError,
     NumericalError,
-    real_array,
     require_whole,
     shown,
 )

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.arrays import real_array
 from safe_envs.envs.sensor import Sample
-from safe_envs.errors import ConfigurationError, InvalidInputError, real_array, shown
+from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 from safe_envs.filters.arguments import doubles
 from safe_envs.filters.conditions.estimates import belief_symbols
 from safe_envs.filters.estimation.estimator import Estimator, require_fixed, unpacked

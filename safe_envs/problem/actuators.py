@@ -39,14 +39,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import numbers_in
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import (
-    ConfigurationError,
-    SystemDefinitionError,
-    numbers_in,
-    require_whole,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_whole, shown
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.measurement import Channel
 from safe_envs.problem.option_errors import LONGEST_DELAY

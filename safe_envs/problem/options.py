@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shown, unexpected_argument
-from safe_envs.problem.measurement import read_items
 from safe_envs.problem.option_errors import refused_noise
 from safe_envs.text import finite_number, named_values, numbers
 
@@ -45,6 +44,8 @@ def _read_box(option: str, texts: Sequence[str]) -> list[float] | list[list[floa
 
 
 def _read_measurement(option: str, texts: Sequence[str]) -> list[str]:
+    from safe_envs.problem.measurement import read_items
+
     return read_items(option, texts)
 
 
@@ -223,7 +224,7 @@ def noise_levels(problem: Any, noise: float | Sequence[float] | None) -> dict[st
     # Not imported before it is needed: a command reads the options first.
     import numpy as np
 
-    from safe_envs.errors import numbers_in
+    from safe_envs.arrays import numbers_in
 
     names = problem.noise
     if not names:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import numbers_in
 from safe_envs.dynamics import symbols
-from safe_envs.errors import numbers_in
 from safe_envs.problem.option_errors import refused_box
 
 TIME = symbols.TIME

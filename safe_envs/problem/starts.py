@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import numbers_in
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.dynamics.noise import START, Key, StreamReader
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.engine.draws import MOST_TRIES
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, numbers_in
+from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.option_errors import wrong_start
 from safe_envs.problem.signals import Variable
 from safe_envs.text import finite_number

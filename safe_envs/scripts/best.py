@@ -11,7 +11,7 @@ from safe_envs.errors import require_whole
 from safe_envs.files import require_writable
 from safe_envs.scripts.options import evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 
@@ -46,18 +46,9 @@ def best(
         typer.Option("--check", help="Prove both ends by outward-rounded arithmetic."),
     ] = False,
     seed: text_options.Seed = 0,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
-        ),
-    ] = None,
+    json: Json = None,
     plot: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help=f"Draw the value over the coordinates of the grid: {text_options.FORMATS}",
-        ),
+        Path | None, text_options.plot_option("Draw the value over the coordinates of the grid")
     ] = None,
     size: evaluation_options.Size = None,
 ) -> None:

@@ -13,7 +13,13 @@ from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.files import require_writable
 from safe_envs.scripts.options import completion, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
+from safe_envs.scripts.options.console import (
+    Json,
+    progress_bar,
+    require_result,
+    stdout,
+    write_result,
+)
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
@@ -58,12 +64,7 @@ def certify(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the certificate: a JSON file.")
     ] = None,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
-        ),
-    ] = None,
+    json: Json = None,
 ) -> None:
     """Look for a polynomial psi that bounds how safe episodes are, and prove the bound.
 

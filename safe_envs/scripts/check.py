@@ -11,7 +11,7 @@ import typer
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import require_result, stdout, write_result
+from safe_envs.scripts.options.console import Json, require_result, stdout, write_result
 
 
 def check(
@@ -35,12 +35,7 @@ def check(
         ),
     ] = False,
     seconds: Annotated[float, typer.Option(help="Limit of time of each check.")] = 120.0,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
-        ),
-    ] = None,
+    json: Json = None,
 ) -> None:
     """Check the certificate in a file: what it states, and whether that is so.
 

@@ -10,7 +10,7 @@ import typer
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
@@ -64,12 +64,7 @@ def export(
     ] = False,
     states: Annotated[int, typer.Option(help="States of the comparison.")] = 1_000_000,
     seed: text_options.Seed = 0,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
-        ),
-    ] = None,
+    json: Json = None,
 ) -> None:
     """Write a filter as C99: filter.h, filter.c, a self-test, CMakeLists.txt and README.md.
 

@@ -11,7 +11,7 @@ import typer
 from safe_envs.errors import require_whole
 from safe_envs.scripts.options import completion, early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
@@ -74,16 +74,8 @@ def frontier(
         int, typer.Option(help="Episodes of each of the policies that prices lead to.")
     ] = 500,
     seed: text_options.Seed = 0,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
-        ),
-    ] = None,
-    plot: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help=f"Draw the curve and the points: {text_options.FORMATS}"),
-    ] = None,
+    json: Json = None,
+    plot: Annotated[Path | None, text_options.plot_option("Draw the curve and the points")] = None,
     size: evaluation_options.Size = None,
 ) -> None:
     """Print the largest returns that can be had at each risk, next to those of filters.

@@ -14,9 +14,9 @@ import typer
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.scripts.options import completion, early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
-from safe_envs.scripts.options.method_settings import (
+from safe_envs.scripts.options.settings import (
     SETTINGS,
     SETTINGS_HELP,
     read_settings,
@@ -57,21 +57,9 @@ def identify(
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help=SETTINGS_HELP)
     ] = None,
     seed: text_options.Seed = 0,
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help=(
-                "Write configuration, versions, record and errors; - for stdout, and nothing else"
-                " there."
-            ),
-        ),
-    ] = None,
+    json: Json = None,
     plot: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help=f"Draw the truth against the estimate: {text_options.FORMATS}"
-        ),
+        Path | None, text_options.plot_option("Draw the truth against the estimate")
     ] = None,
     size: evaluation_options.Size = None,
 ) -> None:

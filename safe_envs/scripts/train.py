@@ -15,7 +15,7 @@ from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
-from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
+from safe_envs.scripts.options.settings import read_hyperparameters
 from safe_envs.text import visible
 
 

@@ -10,7 +10,7 @@ import typer
 from safe_envs.errors import require_whole
 from safe_envs.scripts.options import completion, early_checks, evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 
@@ -51,21 +51,10 @@ def verify(
     best: evaluation_options.Best = False,
     closed_loop: evaluation_options.ClosedLoop = False,
     engine: text_options.Engine = "auto",
-    json: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
-        ),
-    ] = None,
+    json: Json = None,
     plot: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help=(
-                "Draw where the conditions cannot be met, h and the boundaries:"
-                f" {text_options.FORMATS}"
-            ),
-        ),
+        text_options.plot_option("Draw where no action meets the conditions, and h"),
     ] = None,
     size: evaluation_options.Size = None,
 ) -> None:

@@ -18,7 +18,6 @@ from pkgutil import get_data
 from typing import Any
 
 from safe_envs.errors import unknown
-from safe_envs.problem.measurement import require_names
 from safe_envs.problem.option_errors import (
     refused_box,
     refused_noise,
@@ -100,6 +99,8 @@ class SystemSummary:
         if given.rate_limit is not None:
             names += self.inputs
         if isinstance(given.measurement, list):
+            from safe_envs.problem.measurement import require_names
+
             require_names(given.measurement, names)
         if given.rate_limit is None:
             self._require_start(given.start)

@@ -31,18 +31,11 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import checksum, reading, write_arrays
 from safe_envs.dynamics.codegen import Components
 from safe_envs.enclosures.intervals import Interval, IntervalArithmetic, interval_function, negative
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.files import (
-    cache_folder,
-    checksum,
-    locked,
-    make_room,
-    mark_used,
-    reading,
-    write_arrays,
-)
+from safe_envs.files import cache_folder, locked, make_room, mark_used
 from safe_envs.filters.conditions.base import Condition, with_parts
 from safe_envs.lazy_attributes import package_version
 from safe_envs.problem.problem import SafetyProblem

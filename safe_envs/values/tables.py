@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.arrays import checksum, reading, write_arrays
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
-from safe_envs.files import MOST_BYTES_OF_TEXT, checksum, reading, write_arrays
+from safe_envs.files import MOST_BYTES_OF_TEXT
 from safe_envs.filters.specification import MOST_STATES
 from safe_envs.lazy_attributes import package_version
 from safe_envs.problem.problem import SafetyProblem

@@ -10,11 +10,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from safe_envs.arrays import real_array
 from safe_envs.dynamics.codegen import Components, Flavour, stacked
 from safe_envs.dynamics.defined import BarrierFunction
 from safe_envs.envs.episode import Episode, Episodes
 from safe_envs.envs.info import Info, VectorStep, with_masks
-from safe_envs.errors import IndependentCopies, InvalidInputError, real_array
+from safe_envs.errors import IndependentCopies, InvalidInputError
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.wrappers.external_env import FilterSpec
 from safe_envs.wrappers.layers import autoreset_mode, doubt_layers

@@ -105,8 +105,14 @@ def test_page_of_the_command_line_has_every_option(hook: Any):
         assert all(option in section for option in known.options_of(command) - {"--help"})
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[] if page.stem == "extend" else pytest.mark.oracle)
+        for page in WITH_PYTHON
+    ],
+    ids=name_of,
+)
 def test_python_runs(page: Path, hook: Any, monkeypatch: pytest.MonkeyPatch):
     # What is printed is looked at when the site is built; here it is to run.
     for size, few in (("particles", 50), ("repetitions", 10)):

@@ -57,6 +57,7 @@ def own_system(names: dict[str, Any]) -> None:
 CHECKS = {"own-system": own_system}
 
 
+@pytest.mark.oracle
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_is_kept_without_outputs_and_runs_in_an_empty_folder(
     path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

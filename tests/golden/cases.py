@@ -166,6 +166,37 @@ def cases() -> dict[str, Case]:
             " --out corrected.npz",
         )
     )
+    scalar = "Scalar-v0 --horizon 0.3 --noise 1.5 --start 0.8 --cells 400 --inputs 9"
+    found["best/Scalar-v0"] = Case(
+        (
+            f"best {scalar} --episodes 200",
+            f"best {scalar} --episodes 0 --leaving safe --knowledge model",
+            f"evaluate {scalar.partition(' --cells')[0]} --filter promise:p=0.5 --episodes 40 --best",
+        )
+    )
+    found["best/Pendulum-v0"] = Case(
+        ("best Pendulum-v0 --horizon 0.05 --cells 30x30 --inputs 3 --episodes 20",)
+    )
+    found["certify/Scalar-v0"] = Case(
+        (
+            "certify Scalar-v0 --degree 6 --rate 0 --horizon 0.5 --out psi.json",
+            "check psi.json --state 0.5",
+            "certify Scalar-v0 --degree 6 --rate 0 --horizon 0.2 --policy nominal",
+        )
+    )
+    found["export/filters"] = Case(
+        (
+            "export StochasticDubins-v0 --filter scbf --out dubins",
+            "export QuadrotorLimits-v0 --filter hocbf --out quadrotor",
+            "export Pendulum-v0 --filter hocbf --float32 --name own --out pendulum",
+        )
+    )
+    found["render/stills"] = Case(
+        (
+            "render DubinsDisk-v0 --horizon 2 --start 0,0.1,0 --compare none,hocbf:p=2,8 --out still.png",
+            "render Scalar-v0 --policy random --noise 1 --horizon 0.3 --start 0 --seed 3 --out still.png",
+        )
+    )
     found["leaderboard/Scalar-v0"] = Case(
         ("leaderboard Scalar-v0 --quick --episodes 5 --out board",)
     )

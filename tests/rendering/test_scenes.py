@@ -28,7 +28,7 @@ def is_near(pixels, color, most=60) -> bool:
 
 
 def test_the_disk_is_to_scale():
-    from safe_envs.rendering.viewer import Picture
+    from safe_envs.rendering.picture import Picture
 
     for radius in (1.0, 2.5):
         env = drawn(problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -10,6 +11,11 @@ from safe_envs.scripts import cli
 from tests.proofs.verified import hurry
 
 
+def words_of(*arguments):
+    """The words of a command line, of which an argument may have several, as in a shell."""
+    return [word for argument in arguments for word in shlex.split(str(argument))]
+
+
 @pytest.fixture
 def safe_envs_command(monkeypatch, capsys, tmp_path):
     """Runs the command in this process, in an empty folder; returns its exit status and what it
@@ -17,7 +23,7 @@ def safe_envs_command(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["safe-envs", *map(str, arguments)])
+        monkeypatch.setattr(sys, "argv", ["safe-envs", *words_of(*arguments)])
         with pytest.raises(SystemExit) as ended:
             cli.main()
         printed = capsys.readouterr()

@@ -31,7 +31,7 @@ def own_cache(monkeypatch, tmp_path):
 
 
 def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, tmp_path):
-    status, out, _ = safe_envs_command("best", *SCALAR, *COARSELY, "--json", "best.json")
+    status, out, _ = safe_envs_command("best", *SCALAR, *COARSELY, "--json best.json")
     assert status == 0
     for text in ("lower", "simulated", "upper", "P(leave)", "no policy is safer", "not proved"):
         assert text in out
@@ -50,8 +50,8 @@ def test_it_prints_and_writes_both_ends_and_the_rate_between(safe_envs_command, 
 
 def test_check_certifies_both_ends_or_refuses_the_table(safe_envs_command, tmp_path):
     asked = (*SCALAR, *COARSELY, "--table", "mine.npz")
-    safe_envs_command("best", *asked, "--json", "1.json")
-    status, out, _ = safe_envs_command("best", *asked, "--check", "--json", "2.json")
+    safe_envs_command("best", *asked, "--json 1.json")
+    status, out, _ = safe_envs_command("best", *asked, "--check --json 2.json")
     assert status == 0
     assert "lower and upper are certified" in out
     assert "not proved" not in out
@@ -69,10 +69,9 @@ def test_check_certifies_both_ends_or_refuses_the_table(safe_envs_command, tmp_p
     status, _, err = safe_envs_command("best", *asked, "--check")
     assert status == 2
     assert f"k = 3 on cell {cell}," in err
-    specified = (*SCALAR, "--spec", "always safe", *COARSELY, "--check")
+    specified = (*SCALAR, *COARSELY, "--spec 'always safe' --check")
     status, _, err = safe_envs_command("best", *specified)
-    assert status == 2
-    assert "only tables of staying safe" in err
+    assert (status, "only tables of staying safe" in err) == (2, True)
 
 
 def test_leaving_and_knowledge_are_as_asked_for(safe_envs_command):
@@ -84,11 +83,11 @@ def test_leaving_and_knowledge_are_as_asked_for(safe_envs_command):
 
 
 def test_a_table_is_written_and_read_again(safe_envs_command, tmp_path):
-    first = safe_envs_command("best", *SCALAR, *COARSELY, "--table", "mine.npz", "--json", "1.json")
+    first = safe_envs_command("best", *SCALAR, *COARSELY, "--table mine.npz --json 1.json")
     assert first[0] == 0
     for path in (tmp_path / "cache").glob("*.npz"):
         path.unlink()
-    again = safe_envs_command("best", *SCALAR, *COARSELY, "--table", "mine.npz", "--json", "2.json")
+    again = safe_envs_command("best", *SCALAR, *COARSELY, "--table mine.npz --json 2.json")
     assert again[0] == 0
     assert strictly("1.json") == strictly("2.json")
     # Of another problem it is refused.
@@ -99,35 +98,8 @@ def test_a_table_is_written_and_read_again(safe_envs_command, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("Quadrotor-v0",), "12 coordinates"),
-        (("Scalar-v0", "--cells", "4x"), "a whole number for each coordinate"),
-        (("Scalar-v0", "--cells", "40x40", "--episodes", 0), "cells"),
-        (("Scalar-v0", "--leaving", "violations"), "did you mean 'violation'"),
-        (("Scalar-v0", "--knowledge", "plants"), "did you mean 'plant'"),
-        (("Scalar-v0", "--inputs", 1), "inputs = 1"),
-        (("Scalar-v0", "--episodes", -1), "episodes = -1"),
-        (("Scalar-v0", "--seed", -1), "seed = -1"),
-        (("Scalar-v0", "--table", "no/where.npz"), "no/where.npz"),
-        (("Scalar-v0", "--plot", "x.txt"), "unknown format 'txt'"),
-        (("Scalar-v1",), "Scalar-v0"),
-    ],
-)
-def test_errors_come_at_once(safe_envs_command, arguments, text):
-    status, _, err = safe_envs_command("best", *arguments)
-    assert status == 2
-    assert text in err
-    assert "Traceback" not in err
-
-
-@pytest.mark.parametrize(
     "arguments",
-    [
-        (*SCALAR, "--cells", "400"),
-        ("Pendulum-v0", "--horizon", 0.05, "--cells", "30x30"),
-        ("DubinsObstacle-v0", "--horizon", 0.1, "--cells", "8x8x8"),
-    ],
+    [(*SCALAR, "--cells", "400"), ("DubinsObstacle-v0", "--horizon", 0.1, "--cells", "8x8x8")],
 )
 def test_the_value_is_drawn_over_any_number_of_coordinates(safe_envs_command, tmp_path, arguments):
     how = ("--inputs", 3, "--episodes", 0, "--plot", "value.svg")
@@ -142,7 +114,7 @@ def test_evaluate_shows_it_where_it_is_asked_for(safe_envs_command):
     status, before, _ = safe_envs_command("evaluate", *SCALAR, *asked)
     assert status == 0
     assert "best attainable safety" not in before
-    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked, "--best", "--json", "e.json")
+    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked, "--best --json e.json")
     assert status == 0
     assert "best attainable safety: " in out
     assert "avoidable" in out
@@ -154,7 +126,7 @@ def test_evaluate_shows_it_where_it_is_asked_for(safe_envs_command):
     assert safe_envs_command("evaluate", *SCALAR, *asked) == (0, before, "")
     again = safe_envs_command("evaluate", *SCALAR, *asked, "--best")
     assert again == (0, out, "")
-    status, _, err = safe_envs_command("evaluate", *SCALAR, "--rare", "--policy", "best")
+    status, _, err = safe_envs_command("evaluate", *SCALAR, "--rare --policy best")
     assert status == 2
     assert "--rare does not go with --policy best" in err
 
@@ -163,9 +135,9 @@ def test_a_sweep_has_it_in_its_cells(safe_envs_command, tmp_path):
     fixed = {"env": "Scalar-v0", "horizon": 0.3, "noise": 1.5, "start": [0.8], "best": True}
     document = {"fixed": {**fixed, "episodes": 40}, "grid": {"filter": ["none", "cbf"]}}
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(document))
-    status, _, err = safe_envs_command("sweep", "sweep.yaml", "--out", "cells", "--jobs", 1)
+    status, _, err = safe_envs_command("sweep sweep.yaml --out cells --jobs 1")
     assert (status, err) == (0, "")
-    status, out, _ = safe_envs_command("sweep-report", "cells", "--json", "r.json")
+    status, out, _ = safe_envs_command("sweep-report cells --json r.json")
     assert status == 0
     assert "avoidable" in out
     for cell in strictly("r.json")["worst"]:
@@ -173,5 +145,5 @@ def test_a_sweep_has_it_in_its_cells(safe_envs_command, tmp_path):
     (tmp_path / "sweep.yaml").write_text(
         yaml.safe_dump({"fixed": {**fixed, "env": "Quadrotor-v0"}})
     )
-    status, _, err = safe_envs_command("sweep", "sweep.yaml", "--out", "others")
+    status, _, err = safe_envs_command("sweep sweep.yaml --out others")
     assert status == 2

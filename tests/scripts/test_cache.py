@@ -17,7 +17,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def test_it_shows_what_is_kept_and_clears_it(cache, safe_envs_command):
-    status, out, _ = safe_envs_command("cache", "--json", "cache.json")
+    status, out, _ = safe_envs_command("cache --json cache.json")
     assert status == 0
     assert "In all 3 kB of at most 2 GB" in out
     found = strictly("cache.json")
@@ -25,7 +25,7 @@ def test_it_shows_what_is_kept_and_clears_it(cache, safe_envs_command):
         name: int(name in ("values", "closed-loops")) for name in CONTENTS
     }
     assert (found["bytes"], found["removed_bytes"]) == (3000, None)
-    status, out, _ = safe_envs_command("cache", "--clear")
+    status, out, _ = safe_envs_command("cache --clear")
     assert (status, "Removed: 3 kB." in out) == (0, True)
     assert not any(entries(name) for name in CONTENTS)
     assert (cache_folder("values") / "mine.npz").exists()
@@ -33,5 +33,5 @@ def test_it_shows_what_is_kept_and_clears_it(cache, safe_envs_command):
 
 def test_without_a_cache_it_says_so(monkeypatch, safe_envs_command):
     monkeypatch.setenv(VARIABLE, "")
-    status, out, _ = safe_envs_command("cache", "--clear")
+    status, out, _ = safe_envs_command("cache --clear")
     assert (status, "Nothing is kept" in out) == (0, True)

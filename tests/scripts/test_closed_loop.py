@@ -19,9 +19,7 @@ def _own_cache(tmp_path, monkeypatch):
 
 def test_the_bounds_are_shown_by_evaluate_and_verify(safe_envs_command, tmp_path):
     asked = ("--filter", "none", "--filter", "scbf", "--filter", "srcbf", "--episodes", 50)
-    status, out, _ = safe_envs_command(
-        "evaluate", *SCALAR, *asked, "--closed-loop", "--json", "e.json"
-    )
+    status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked, "--closed-loop --json e.json")
     assert status == 0
     rows = json.loads((tmp_path / "e.json").read_text())["rows"]
     assert [row["held_word"] for row in rows] == ["certified", "certified", "none"]
@@ -31,7 +29,7 @@ def test_the_bounds_are_shown_by_evaluate_and_verify(safe_envs_command, tmp_path
     assert text.count("certified, by a table of this policy, 401 cells") == 2
     assert "no bound, held input, for srcbf: the constraint of srcbf is not of the form" in text
     status, out, _ = safe_envs_command(
-        "verify", *SCALAR, "--filter", "scbf", "--episodes", 50, "--json", "v.json", "--closed-loop"
+        "verify", *SCALAR, "--filter scbf --episodes 50 --json v.json --closed-loop"
     )
     assert status == 0
     chain = json.loads((tmp_path / "v.json").read_text())["chain"]
@@ -45,19 +43,3 @@ def test_a_policy_that_is_no_formula_has_a_note(safe_envs_command):
     status, out, _ = safe_envs_command("evaluate", *SCALAR, *asked)
     assert status == 0
     assert "for none: the policy 'random' is no formula of the state" in " ".join(out.split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (("Quadrotor-v0",), "4 inputs"),
-        (("StochasticDubins-v0",), "3 states"),
-        (("Scalar-v0", "--monitoring", "continuous"), "of control instants"),
-        (("Scalar-v0", "--rare"), "--rare does not go with --closed-loop"),
-    ],
-)
-def test_what_has_no_table_is_an_error_at_once(safe_envs_command, arguments, text):
-    status, _, err = safe_envs_command("evaluate", *arguments, "--closed-loop")
-    assert status == 2
-    assert text in err
-    assert "Traceback" not in err

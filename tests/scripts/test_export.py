@@ -36,31 +36,8 @@ def test_the_files_and_the_comparison(export, tmp_path):
 def test_without_a_compiler_it_says_so(export, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
-    status, out, _ = export("Pendulum-v0", "--out", "c", "--compare", "--float32", "--name", "own")
+    status, out, _ = export("Pendulum-v0 --out c --compare --float32 --name own")
     assert status == 0
     assert "No comparison was made" in out
     assert "float theta;" in (tmp_path / "c" / "filter.h").read_text()
     assert "own_decide" in (tmp_path / "c" / "filter.c").read_text()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--filter", "promise:p=0.9", "--out", "c", "--float32"), "double precision"),
-        (("--filter", "promise:p=0.9", "--out", "c", "--objective", "clf"), "objective"),
-        (("--filter", "scbf", "--out", "c", "--name", "a b"), "is no name of C"),
-        (("--out", "no/such/c"), "no/such"),
-        (("--out", "c", "--states", "0"), "states"),
-    ],
-)
-def test_errors_end_with_status_2(export, arguments, message, tmp_path):
-    status, _, err = export("Pendulum-v0", *arguments)
-    assert status == 2
-    assert message in err
-    assert not (tmp_path / "c").exists()
-
-
-def test_the_backup_filter_has_no_form_in_c(export, tmp_path):
-    status, _, error = export("DubinsDisk-v0", "--filter", "backup", "--out", tmp_path / "c")
-    assert status == 2
-    assert "it simulates plans" in error

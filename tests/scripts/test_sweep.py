@@ -42,20 +42,18 @@ def spec(tmp_path: Path) -> Path:
 
 
 def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tmp_path: Path):
-    status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+    status, out, _ = safe_envs_command("sweep", spec, "--out done --jobs 1")
     assert (status, out) == (0, "8 of 8 cells are in done.\n")
     spec.write_text(SPEC.replace("[0, 1]", "[0, 1, 2]"))
-    status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+    status, out, _ = safe_envs_command("sweep", spec, "--out done --jobs 1")
     assert (status, out) == (0, "12 of 12 cells are in done, of which 8 were there before.\n")
 
-    status, out, _ = safe_envs_command(
-        "sweep-report", "done", "--worst", 2, "--json", "report.json"
-    )
+    status, out, _ = safe_envs_command("sweep-report done --worst 2 --json report.json")
     assert status == 0
     assert "12 of 12 cells are done, 0 failed, 0 are missing." in out
     assert (tmp_path / "done" / "report.png").stat().st_size > 10_000
     spec.write_text(SPEC.replace("[0, 1]", "[0]"))
-    status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+    status, out, _ = safe_envs_command("sweep", spec, "--out done --jobs 1")
     assert (status, out.splitlines()[0]) == (
         0,
         "4 of 4 cells are in done, of which 4 were there before.",
@@ -64,7 +62,7 @@ def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tm
         "Note: 8 cells of another grid or version are in done too"
     )
     spec.write_text(SPEC.replace("[0, 1]", "[0, 1, 2]"))
-    assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
+    assert safe_envs_command("sweep", spec, "--out done --jobs 1")[0] == 0
     report = strictly(tmp_path / "report.json")
     rates = sorted(read(tmp_path / "done")["safety_rate"].to_pylist())
     assert [row["safety_rate"] for row in report["worst"]] == rates[:2]
@@ -83,9 +81,7 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
         r" barrier\.second = 1: .*division by zero"
     )
     for there in ("", ", of which 6 were there before"):
-        status, out, err = safe_envs_command(
-            "sweep", spec, "--out", "done", "--jobs", 1, "--json", "done.json"
-        )
+        status, out, err = safe_envs_command("sweep", spec, "--out done --jobs 1 --json done.json")
         assert (status, out) == (2, f"6 of 8 cells are in done{there}.\n")
         assert re.search(told, err)
         document = strictly(tmp_path / "done.json")
@@ -97,7 +93,7 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
     (tmp_path / "done" / "sweep.json").write_text(
         json.dumps({**index, "swept": [*index["swept"], "dt"]})
     )
-    status, out, _ = safe_envs_command("sweep-report", "done", "--plot", "rates.svg")
+    status, out, _ = safe_envs_command("sweep-report done --plot rates.svg")
     assert status == 0
     assert "5 of 8 cells are done, 2 failed, 1 are missing." in out
     assert re.search(
@@ -110,23 +106,14 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
 
 def test_mistakes_end_before_anything_is_made(safe_envs_command, spec: Path, tmp_path: Path):
     spec.write_text(SPEC.replace("scbf", "scfb"))
-    status, _, err = safe_envs_command("sweep", spec, "--out", "done")
+    status, _, err = safe_envs_command("sweep", spec, "--out done")
     assert status == 2
     assert (
         "sweep.yaml, cell filter = scfb, noise = 0.1, seed = 0: unknown filter 'scfb'; did you mean"
         " 'scbf'" in err
     )
     status, _, err = safe_envs_command(
-        "sweep",
-        spec,
-        "--out",
-        "done",
-        "--backend",
-        "dask",
-        "--address",
-        "tcp://127.0.0.1:1",
-        "--jobs",
-        2,
+        "sweep", spec, "--out done --backend dask --address tcp://127.0.0.1:1 --jobs 2"
     )
     assert status == 2
     assert "--jobs 2 is of this machine" in err
@@ -138,32 +125,21 @@ def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
     spec.write_text(
         "fixed: {env: Scalar-v0, episodes: 20, horizon: 0.2}\ngrid: {filter: [none, scbf]}"
     )
-    assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
+    assert safe_envs_command("sweep", spec, "--out done --jobs 1")[0] == 0
     for option in ("--x", "--lines"):
-        status, _, err = safe_envs_command("sweep-report", "done", option, "noise")
+        status, _, err = safe_envs_command("sweep-report done", option, "noise")
         assert status == 2
         assert f"{option} noise: it was not swept; allowed: filter" in err
-    status, _, err = safe_envs_command("sweep-report", "done", "--plot", "picture.txt")
+    status, _, err = safe_envs_command("sweep-report done --plot picture.txt")
     assert status == 2
     assert "unknown format" in err
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("jobs", "number"), [("2", signal.SIGINT), ("1", signal.SIGTERM)])
-def test_a_stop_keeps_what_is_done_and_leaves_no_process(
-    spec: Path, tmp_path: Path, jobs: str, number: signal.Signals
-):
+def test_a_stop_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path):
     spec.write_text(SPEC.replace("seed: [0, 1]", f"seed: {list(range(100))}"))
-    words = [
-        sys.executable,
-        "-m",
-        "safe_envs.scripts.sweep",
-        str(spec),
-        "--out",
-        str(tmp_path / "out"),
-        "--jobs",
-        jobs,
-    ]
+    words = [sys.executable, "-m", "safe_envs.scripts.sweep", str(spec), "--jobs", "2"]
+    words += ["--out", str(tmp_path / "out")]
     # A shell that runs the tests in the background has its processes ignore the signal.
     heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(
@@ -176,7 +152,7 @@ def test_a_stop_keeps_what_is_done_and_leaves_no_process(
         ):
             time.sleep(0.05)
         # As a terminal and a job manager send it: to all of them.
-        os.killpg(process.pid, number)
+        os.killpg(process.pid, signal.SIGINT)
         _, err = process.communicate(timeout=240)
         assert "Stopped. The same command goes on" in err
         assert process.returncode not in (0, 2)

@@ -12,16 +12,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import sympy as sp
 
+from safe_envs.arrays import numbers_in, real_array
 from safe_envs.dynamics.codegen import Flavour, compile_function
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import (
-    ConfigurationError,
-    SystemDefinitionError,
-    numbers_in,
-    real_array,
-    require_whole,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, require_whole, shown
 from safe_envs.problem.angle_jumps import angle_jumps, are_multiples, without_remainders, words_of
 from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.problem.problem import SafetyProblem

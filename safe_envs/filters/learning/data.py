@@ -10,10 +10,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from safe_envs import files
+from safe_envs import arrays as array_files
+from safe_envs.arrays import ArrayFile, reading, write_arrays
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shortened, shown
-from safe_envs.files import ArrayFile, reading, write_arrays
 from safe_envs.filters.learning.checks import require_kind, require_problem
 from safe_envs.lazy_attributes import package_version
 from safe_envs.problem.problem import SafetyProblem
@@ -235,7 +235,7 @@ def checksum(
         details: JSON-able.
         arrays: numbers by name.
     """
-    return files.checksum([kind, asdict(signature), details], arrays)
+    return array_files.checksum([kind, asdict(signature), details], arrays)
 
 
 def save(

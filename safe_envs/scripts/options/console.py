@@ -9,7 +9,6 @@ import inspect
 import io
 import json
 import os
-import re
 import signal
 import sys
 import threading
@@ -17,17 +16,16 @@ import typing
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
 from safe_envs.errors import SafeEnvsError, nearest, shortened, shown
 from safe_envs.files import require_writable, write_atomically, write_json
 from safe_envs.text import visible, whole_or_real
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.text import Text
 
     from safe_envs.agents.jobs.executor import Backend
@@ -103,7 +101,7 @@ Json = Annotated[
     typer.Option(
         "--json",
         metavar="FILE",
-        help="Write the results; - writes them to stdout, and nothing else.",
+        help="Write all that was found; - for stdout, and nothing else there.",
     ),
 ]
 
@@ -173,6 +171,8 @@ def with_signature(
 
 def stdout() -> Console:
     """Return the console for results, as wide as the terminal; without one, 80 characters."""
+    from safe_envs.scripts.options.terminal import result_console
+
     return result_console(_Terminal.quiet, _Terminal.silent)
 
 
@@ -184,7 +184,7 @@ def say(console: Console, text: str | Text, wrap: bool = True) -> None:
         text: to print; markup in a str is not interpreted.
         wrap: whether the lines may be wrapped; a command that is to be copied may not.
     """
-    from safe_envs.scripts.options.wrapping import visible_text, wrapped_for
+    from safe_envs.scripts.options.terminal import visible_text, wrapped_for
 
     text = visible_text(text)
     if wrap:
@@ -335,68 +335,7 @@ def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
         yield None
         return
 
-    with progress(what) as tell:
-        yield tell
-
-
-_LEAST_WIDTH = 40
-_PIPE_WIDTH = 80
-
-
-class _Tables(Console):
-    """A console that leaves out all but tables."""
-
-    def print(self, *objects: Any, **how: Any) -> None:
-        tables = [found for found in objects if isinstance(found, Table)]
-        if tables:
-            super().print(*tables, **how)
-
-
-class _Trimmed(io.TextIOBase):
-    """A stream without the blanks at the ends of the lines of a table."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The encoding, which decides on the characters that draw tables."""
-        return self._stream.encoding
-
-    def write(self, text: str, /) -> int:
-        """Write whole lines, as a console does."""
-        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
-
-    def flush(self) -> None:
-        """See `io.TextIOBase`."""
-        self._stream.flush()
-
-
-def result_console(quiet: bool, silent: bool) -> Console:
-    """Return the console for results, as wide as the terminal; without one, 80 characters.
-
-    Args:
-        quiet: print tables only.
-        silent: print nothing.
-    """
-    kind = _Tables if quiet else Console
-    if sys.stdout.isatty():
-        return kind(width=max(Console().width, _LEAST_WIDTH), quiet=silent)
-    trimmed: Any = _Trimmed(sys.stdout)
-    return kind(width=_PIPE_WIDTH, quiet=silent, file=trimmed)
-
-
-@contextmanager
-def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar on stderr.
-
-    Args:
-        what: its title.
-
-    Yields:
-        The function that takes the part that is done.
-    """
-    # Not imported before it is needed: results need no bar.
+    from rich.console import Console
     from rich.progress import (
         BarColumn,
         Progress,

@@ -134,7 +134,7 @@ def known_method(name: str) -> str:
     Raises:
         ConfigurationError: There is none.
     """
-    from safe_envs.scripts.options.method_settings import SETTINGS
+    from safe_envs.scripts.options.settings import SETTINGS
 
     if name not in SETTINGS:
         raise unknown("method", name, SETTINGS)

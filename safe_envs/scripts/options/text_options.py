@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -48,6 +48,11 @@ PLOT_FORMATS = ("png", "pdf", "svg", "eps", "jpg", "jpeg", "ps", "tif", "tiff", 
 among them are pgf, which needs a TeX installation, and svgz, which holds the time."""
 
 FORMATS = ".png, .pdf, .svg, .eps, .jpg, .tif or .webp."
+
+
+def plot_option(what: str) -> Any:
+    """Return the option for the file of a picture; `what` says what is drawn."""
+    return typer.Option(metavar="FILE", help=f"{what}: {FORMATS}")
 
 
 def require_outputs(

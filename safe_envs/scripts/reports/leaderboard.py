@@ -305,13 +305,13 @@ def study_markdown(rows: Sequence[AgentSummary], differences: bool = False) -> s
 
     One wide table would not fit a page. See `study_columns` for the arguments.
     """
-    filtered = _agent_markdown(
+    filtered = _markdown(
         ["agent", "filter", *map(_one_line, _FILTERED)],
         [[row.name, _code(row.filter), *_agent_cells(row, differences, _FILTERED)] for row in rows],
     )
     # With several filters an agent has several rows, which differ in the first table only.
     alone = {row.name: _agent_cells(row, differences, _ALONE) for row in rows}
-    unfiltered = _agent_markdown(
+    unfiltered = _markdown(
         ["agent", *(_one_line(name).removesuffix(", no filter") for name in _ALONE)],
         [[name, *cells] for name, cells in alone.items()],
     )
@@ -331,10 +331,6 @@ def study_notes(found: StudyResult) -> list[str]:
         which = variant if k is None else f"{variant}, training {k}"
         notes.append(f"{env_id}, {which}: {reason}.")
     return notes
-
-
-def _agent_markdown(titles: list[str], lines: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(line)} |" for line in (titles, ["---"] * len(titles), *lines))
 
 
 def _code(text: str) -> str:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from safe_envs.agents.evaluation.statistics import percent
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.text import Column, FittedTable, arranged, columns_of, wrapped
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from safe_envs.problem.problem import SafetyProblem
 
 _WIDEST = 1000
 
@@ -167,6 +169,8 @@ def size_text(count: int) -> str:
 def share_text(share: float | None) -> str:
     """Return a share in per cent, with two digits below 1 %, so that it does not read as 0."""
     if share is None or share == 0.0 or share >= 0.01:
+        from safe_envs.agents.evaluation.statistics import percent
+
         return percent(share)
     return f"{100 * share:.2g} %"
 

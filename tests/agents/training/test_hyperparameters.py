@@ -14,7 +14,7 @@ from safe_envs import ConfigurationError
 from safe_envs.agents.training.config import ALGORITHMS, CONSTRAINED, Training, whole_batches
 from safe_envs.agents.training.trainer import train
 from safe_envs.filters.learning.data import load
-from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
+from safe_envs.scripts.options.settings import read_hyperparameters
 from tests.agents.training.small import training
 
 pytestmark = pytest.mark.slow

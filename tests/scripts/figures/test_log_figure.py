@@ -8,7 +8,6 @@ from matplotlib.collections import PolyCollection
 
 from safe_envs import ConfigurationError, DecisionLog, plot_log
 from safe_envs.filters.decision_log import LogColumns
-from safe_envs.scripts.figures.log import LogColors
 
 COLUMNS = LogColumns.of(("x",), ("u", "rotor_speed"), ("wall",), units={"u": "m/s^2"})
 
@@ -134,33 +133,11 @@ def with_barriers(rows, names=None, bounds=(-1.0, 1.0), proposed=0.0):
     return log
 
 
-def test_the_legend_has_what_can_be_seen():
-    rows = [[0.1 * k, 1e6, 2e6] for k in range(3)]
-    figure = plot_log(with_barriers(rows, bounds=(-1e6, np.inf)))
-    assert [t for t in texts_of(figure) if t.strip()] == [
-        "executed input",
-        "$h$ b0, min 0",
-        "outside the panel: 2 more",
-    ]
-    figure = plot_log(with_barriers(rows, proposed=0.8))
-    assert {"nominal input", "input bounds"} <= set(texts_of(figure))
-    assert "intervention" not in texts_of(figure)
-
-
 def test_the_panel_says_where_it_is_cut_off():
     cut = plot_log(with_barriers([[1.0, 7.0], [2.0, 1e6]]))
     assert cut.axes[1].get_title("right") == "$h$ cut off at 2.1"
     whole = plot_log(with_barriers([[1.0, 1.0], [2.0, 2.0]]))
     assert whole.axes[1].get_title("right") == ""
-
-
-def test_lines_differ_as_long_as_they_can():
-    for colors, count in ((LogColors(), 32), (LogColors(barriers=("black",)), 8)):
-        styles = {str(sorted(colors.barrier(i).items())) for i in range(40)}
-        assert len(styles) == colors.distinct == count
-        assert len(colors.legend(dict.fromkeys(range(count), "h"))) == count
-        last = colors.legend(dict.fromkeys(range(count + 1), "h"))[-1]
-        assert last.get_label() == f"lines repeat after {count}"
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import matplotlib as mpl
 import pytest
 from matplotlib.figure import Figure
 
-from safe_envs import ConfigurationError, plot_log
+from safe_envs import plot_log
 from safe_envs.scripts import cli
 from safe_envs.scripts.figures import style, sweep
 from safe_envs.scripts.figures.style import COLORS, DASHES, MARKERS, STYLE, WARM, look
@@ -32,26 +32,22 @@ LEAST_DISTANCE = 10.0
 
 COMMANDS = {
     "evaluation": "evaluate CubicSDEDisk-v0 --filter none --filter scbf --episodes 20",
-    "evaluation of a line": "evaluate Scalar-v0 --filter none --filter rcbf --episodes 20",
     "evaluation of many inputs": (
         "evaluate QuadrotorLimits-v0 --horizon 2 --filter none --filter hocbf --episodes 3"
     ),
     "verification": "verify CubicSDEDisk-v0 --no-simulate",
     "verification of a line": "verify Scalar-v0 --no-simulate",
-    "verification of ACC": "verify ACCGap-v0 --no-simulate",
     "best": "best Pendulum-v0 --cells 20x16 --inputs 3 --episodes 0",
     "best over a line": "best Scalar-v0 --inputs 3 --episodes 0",
-    "best over an expression": "best StochasticDubins-v0 --cells 8x8 --inputs 3 --episodes 0",
     "frontier": "frontier Pendulum-v0 --episodes 10 --cells 20x16 --attained 2",
     "identification": "identify CubicSDE-v0 --method bayesian --set degree=3",
-    "identification of ACC": "identify ACC-v0 --method bayesian",
 }
 FUNCTIONS = {
-    "evaluate": "evaluation_figure:plot_evaluation",
-    "verify": "verify_figure:plot_verification",
-    "best": "best_figure:plot_attainable",
-    "frontier": "frontier_figure:plot_frontier",
-    "identify": "identify_figure:draw",
+    "evaluate": "evaluation:plot_evaluation",
+    "verify": "verify:plot_verification",
+    "best": "best:plot_attainable",
+    "frontier": "frontier:plot_frontier",
+    "identify": "identify:draw",
 }
 
 
@@ -105,14 +101,14 @@ def test_equal_figures_are_equal_files_with_truetype_fonts(tmp_path):
     formats = ("pdf", "ps", "eps", "svg", "png")
     script = (
         "import sys; from pathlib import Path; from matplotlib.figure import Figure\n"
-        "from safe_envs.scripts.figures import labels, saving, style; import matplotlib\n"
+        "from safe_envs.scripts.figures import style; import matplotlib\n"
         "with matplotlib.rc_context(style.STYLE):\n"
         "    figure = Figure(figsize=(3.5, 2)); axes = figure.subplots()\n"
         "    axes.plot([1, 2], [3, 4], label='a line')\n"
-        "    axes.set_xlabel(labels.quantity('sigma_1', 'm/s/sqrt(s)'))\n"
+        "    axes.set_xlabel(style.quantity('sigma_1', 'm/s/sqrt(s)'))\n"
         "    axes.set_ylabel('\\u2212\\u00b2\\u00b7\\u221a')\n"
         "    style.add_legend(figure, axes.get_legend_handles_labels()[0])\n"
-        "    for suffix in sys.argv[2:]: saving.save(figure, Path(f'{sys.argv[1]}.{suffix}'))\n"
+        "    for suffix in sys.argv[2:]: style.save(figure, Path(f'{sys.argv[1]}.{suffix}'))\n"
     )
     for seed, name in enumerate(("one", "another")):
         subprocess.run(
@@ -190,27 +186,3 @@ def test_colours_can_be_told_apart_whatever_the_vision():
 def test_lines_differ_in_more_than_their_colour():
     assert len({str(look(i)) for i in range(36)}) == 36
     assert len({str(look(i)["linestyle"]) for i in range(6)}) == len(DASHES) == len(set(MARKERS))
-
-
-@pytest.mark.parametrize("command", ["evaluate", "verify", "best", "frontier", "identify"])
-def test_an_unknown_size_is_refused(command, monkeypatch, capsys):
-    words = [command, "Scalar-v0", "--size", "singel", "--plot", "figure.pdf"]
-    words += ["--method", "bayesian", "--out", "out.npz"] if command == "identify" else []
-    monkeypatch.setattr(sys, "argv", ["safe-envs", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
-    assert "did you mean 'single'" in " ".join(capsys.readouterr().err.split())
-    with pytest.raises(ConfigurationError, match="single"):
-        plot_log(test_log_figure.log_of(test_log_figure.SAFE), size="singel")
-
-
-@pytest.mark.parametrize("command", ["evaluate", "verify", "best", "frontier", "identify"])
-def test_a_size_without_a_figure_is_refused(command, monkeypatch, capsys):
-    words = [command, "Scalar-v0", "--size", "single"]
-    words += ["--method", "bayesian", "--out", "out.npz"] if command == "identify" else []
-    monkeypatch.setattr(sys, "argv", ["safe-envs", *words])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert ended.value.code == 2
-    assert "give --plot FILE too" in " ".join(capsys.readouterr().err.split())

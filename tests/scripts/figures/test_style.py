@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from safe_envs.scripts.figures.style import STYLE, add_legend, look, mark_of
+from safe_envs.scripts.figures.style import STYLE, add_legend
 
 
 @pytest.mark.parametrize(
@@ -57,9 +57,3 @@ def test_a_tall_legend_makes_the_figure_taller_and_leaves_the_panel_its_height()
             figure.draw_without_rendering()
         heights.append(axes.get_position().height * figure.get_figheight())
     assert heights[1] == pytest.approx(heights[0], abs=0.15)
-
-
-def test_no_two_of_many_lines_look_alike():
-    looks = {(look(i)["color"], str(look(i)["linestyle"]), mark_of(i)) for i in range(36)}
-    assert len(looks) == 36
-    assert len({(look(i)["color"], mark_of(i)) for i in range(36)}) == 36

@@ -10,31 +10,11 @@ import typer
 
 import safe_envs
 from safe_envs.scripts import cli
-from safe_envs.scripts.options.app import EXAMPLES, PANELS, CommandEntry, make_app, panel_of
-
-
-def command() -> None:
-    """Say something.
-
-    This paragraph has a line that is
-    wrapped in the source.
-
-    This one has none.
-    """
+from safe_envs.scripts.options.app import EXAMPLES, PANELS, panel_of
 
 
 def commands_of(app):
     return typer.main.get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_paragraphs_of_the_help_are_one_line_each():
-    entry = CommandEntry("say", "Talk", f"{__name__}:command", "Say something.")
-    found = commands_of(make_app([entry]))["say"].help
-    assert found.split("\n\n") == [
-        "Say something.",
-        "This paragraph has a line that is wrapped in the source.",
-        "This one has none.",
-    ]
 
 
 def test_the_list_of_commands_says_what_they_say_themselves():

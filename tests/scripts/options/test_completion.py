@@ -8,7 +8,6 @@ from contextlib import redirect_stdout
 
 import pytest
 
-import safe_envs
 from safe_envs.agents.policies import registry
 from safe_envs.agents.policies.names import POLICIES
 from safe_envs.filters.conditions import LEARNED, Certified, names
@@ -54,11 +53,3 @@ def offered(monkeypatch, *words):
 )
 def test_what_may_follow_is_offered(monkeypatch, words, expected):
     assert offered(monkeypatch, *words) == expected
-
-
-def test_the_package_has_all_that_it_names():
-    assert set(safe_envs.__all__) <= set(dir(safe_envs))
-    for name in safe_envs.__all__:
-        assert getattr(safe_envs, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'SafeEnvironment'"):
-        safe_envs.SafeEnvironment  # noqa: B018

@@ -93,31 +93,15 @@ def test_a_system_of_ones_own_takes_the_place_of_an_id():
             read(*words).full_id  # noqa: B018
 
 
-def test_identify_has_no_episodes(safe_envs_command):
-    for option in ("--horizon", "--start"):
-        status, _, err = safe_envs_command(
-            "identify", "Scalar-v0", *COMMANDS["identify"], option, "1"
-        )
-        assert status == 2
-        assert f"unknown option '{option}'" in err
-
-
 @pytest.mark.parametrize(
     ("command", "option"),
-    [(command, "--json") for command in COMMANDS]
-    + [
-        ("evaluate", "--plot"),
-        ("verify", "--plot"),
-        ("best", "--plot"),
-        ("identify", "--plot"),
-        ("identify", "--out"),
-    ],
+    [*((command, "--json") for command in COMMANDS), ("verify", "--plot"), ("identify", "--out")],
 )
 def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, option):
     path = Path("own.py")
     path.write_text(SYSTEM)
     status, out, err = safe_envs_command(
-        command, "--system", "own.py:problem", *COMMANDS[command], option, "./own.py"
+        command, "--system own.py:problem", *COMMANDS[command], option, "./own.py"
     )
     assert (status, out) == (2, "")
     assert (
@@ -139,7 +123,7 @@ def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, opt
     ],
 )
 def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
-    status, out, err = safe_envs_command(*arguments, "--json", "own.py")
+    status, out, err = safe_envs_command(*arguments, "--json own.py")
     assert (status, out) == (2, "")
     assert f"--json own.py would overwrite the file of {file}" in " ".join(err.split())
     assert not Path("own.py").exists()
@@ -148,23 +132,14 @@ def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
 def test_bounds_are_of_the_horizon_that_is_simulated(safe_envs_command):
     """Which is 7 periods of .3 s where 2 s were asked for."""
     arguments = (
-        "Pendulum-v0",
-        "--start",
-        ".1,.1",
-        "--filter",
-        "szcbf:alphas=1",
-        "--dt",
-        ".3",
-        "--no-simulate",
-        "--json",
-        "found.json",
+        "Pendulum-v0 --start .1,.1 --filter szcbf:alphas=1 --dt .3 --no-simulate --json found.json"
     )
-    status, out, _ = safe_envs_command("verify", *arguments)
+    status, out, _ = safe_envs_command("verify", arguments)
     assert status == 0
     assert "dt = 0.3 s, horizon 2.1 s;" in out
     assert "T = 2.1 s" in out
     found = strictly("found.json")
     assert found["config"]["horizon"] == pytest.approx(2.1)
-    assert safe_envs_command("verify", *arguments, "--horizon", 2.1)[0] == 0
+    assert safe_envs_command("verify", arguments, "--horizon 2.1")[0] == 0
     assert strictly("found.json")["bounds"] == found["bounds"]
     assert any(bound["value"] and not bound["forever"] for bound in found["bounds"])

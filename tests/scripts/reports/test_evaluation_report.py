@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from rich.console import Console
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.results import Timing
 from safe_envs.agents.evaluation.statistics import touches
 from safe_envs.scripts.reports.evaluation import print_evaluation
 from tests.scripts.conftest import strictly
@@ -27,7 +25,7 @@ def evaluated(safe_envs_command):
     """Evaluates a system of `SYSTEM`."""
     Path("own.py").write_text(SYSTEM)
     return lambda name, *arguments: safe_envs_command(
-        "evaluate", "--system", f"own.py:{name}", "--episodes", 40, *arguments
+        "evaluate --system", f"own.py:{name}", "--episodes 40", *arguments
     )
 
 
@@ -36,7 +34,7 @@ def evaluated(safe_envs_command):
     [("problem", "noise sigma = 0.1,"), ("fixed", "fixed noise,"), ("still", "no noise,")],
 )
 def test_the_heading_has_the_noise_and_the_horizon_of_what_is_simulated(evaluated, name, noise):
-    status, out, err = evaluated(name, "--filter", "none")
+    status, out, err = evaluated(name, "--filter none")
     assert (status, err) == (0, "")
     # 33 whole periods.
     assert (
@@ -45,24 +43,8 @@ def test_the_heading_has_the_noise_and_the_horizon_of_what_is_simulated(evaluate
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "told"),
-    [
-        ("fixed", "write it as a parameter, so that it can be changed"),
-        ("still", "no noise channels\n"),
-    ],
-)
-def test_noise_that_is_no_parameter_cannot_be_set(evaluated, name, told):
-    status, _, err = evaluated(name, "--noise", 0.2)
-    assert status == 2
-    assert "cart has no noise channels" in err
-    assert told in err
-
-
 def test_starts_from_which_nothing_is_promised_are_told(evaluated):
-    status, out, _ = evaluated(
-        "falling", "--filter", "none", "--filter", "scbf", "--json", "out.json"
-    )
+    status, out, _ = evaluated("falling --filter none --filter scbf --json out.json")
     assert status == 0
     bare, scbf = strictly("out.json")["rows"]
     assert bare["outside_rate"] is None
@@ -72,7 +54,7 @@ def test_starts_from_which_nothing_is_promised_are_told(evaluated):
         "lie outside the sets C_j = {b_j >= 0}, j >= 1, that scbf keeps: no bound holds from there"
     )
     assert f"Note: {100 * scbf['outside_rate']:.3g} % of the starts {told}\n" in out
-    assert "no bound holds" not in evaluated("falling", "--filter", "scbf", "--start", "1,1")[1]
+    assert "no bound holds" not in evaluated("falling --filter scbf --start 1,1")[1]
 
 
 def printed(answer):
@@ -93,41 +75,6 @@ def moving(rate, barrier, *, start=0.0, horizon=4.0, nominal=0):
         "nominal": nominal,
     }
     return state_problem(system, [barrier], box=(-1, 1), **options)
-
-
-def test_an_early_end_is_noted_by_the_mean_length_of_all_episodes():
-    early = (
-        "with none the mean episode ends after 3.0 of 8 steps, at the goal or outside the workspace"
-    )
-    answer = evaluate(moving(0.5, 2 - X), filters=["none"], episodes=5, bounds=False)
-    # From 0 to 1.25, in steps of .25: five of eight.
-    assert early.replace("3.0", "5.0") in printed(answer)
-    assert "the mean episode" not in printed(
-        evaluate(moving(0.2, 2 - X), filters=["none"], episodes=5, bounds=False)
-    )
-    # Of three identifications the steps and the episodes are three times as many.
-    (row,), (speed,) = answer.rows, answer.timing.rows
-    thrice = replace(answer, rows=[replace(row, episodes=15)])
-
-    def taking(steps):
-        return replace(thrice, timing=Timing(1, [replace(speed, steps=steps)]))
-
-    assert early in printed(taking(45))
-    assert "the mean episode" not in printed(taking(120))
-
-
-def test_the_compiled_engine_is_named_by_the_speed():
-    answer = evaluate(moving(0.5, 2 - X), filters=["none", "cbf"], episodes=2, bounds=False)
-    assert "compiled" not in printed(answer)
-    first, second = answer.timing.rows
-
-    def said(*rows):
-        return printed(replace(answer, timing=Timing(1, list(rows))))
-
-    fast, faster = (replace(row, engine="compiled", jobs=2) for row in (first, second))
-    assert "the steps/s are those of the compiled engine, in 2 threads" in said(fast, faster)
-    assert "the steps/s of cbf are those of the compiled engine" in said(first, faster)
-    assert "in one thread" in said(replace(fast, jobs=1), second)
 
 
 def test_violations_that_are_no_more_than_rounding_are_told():

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 
 import pytest
-from rich.console import Console
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.training.leaderboard import entry_of, safety_over_envs
@@ -14,14 +12,11 @@ from safe_envs.scripts.reports.leaderboard import (
     BEGIN,
     END,
     LeaderboardReport,
-    _count,
     leaderboard_markdown,
     leaderboard_notes,
-    leaderboard_tables,
     link_from,
     put_into,
 )
-from safe_envs.scripts.reports.tables import print_columns
 from tests.agents.training.test_leaderboard import PENDULUM, SCALAR, result
 
 
@@ -46,34 +41,6 @@ def report(**changes):
         safety_over_envs(found),
         **given | changes,
     )
-
-
-def test_tables_fit_a_terminal_of_80_columns():
-    stream = io.StringIO()
-    headings = []
-    for heading, columns in leaderboard_tables(report()):
-        headings.append(heading)
-        print_columns(Console(file=stream, width=80), columns[:1], columns[1:])
-    assert headings == ["Scalar, filter scbf", "Pendulum, filter scbf", "All 2 envs"]
-    lines = stream.getvalue().splitlines()
-    assert max(len(line.rstrip()) for line in lines) <= 80
-    first, second, *_ = [line for line in lines if line.startswith("ppo + promise")]
-    cells = [*first.split()[4:], *second.split()[4:]]
-    assert cells == [
-        "100.0", "[100.0,", "100.0]", "100.0", "[98.5,", "100.0]",
-        "500.0", "[500.0,", "500.0]", "200", "2.00",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0, "0"), (1 / 3, "0.3"), (0.5, "0.5"), (2 / 3, "1"), (9999, "9,999"), (10_000, "10.0 k"),
-     (99_940, "99.9 k"), (99_990, "100 k"), (187_961, "188 k"),
-     (999_600, "1000 k"), (12_340_000, "12.3 M")],
-)  # fmt: skip
-def test_counts_are_short(value, text):
-    assert _count(value) == text
-    assert len(text) <= 6
 
 
 def test_a_variant_of_fewer_seeds_and_few_seeds_are_told():

@@ -30,22 +30,6 @@ def tables(markdown):
     return [[line.strip("| ").split(" | ") for line in lines] for lines in found]
 
 
-def test_tables_are_narrow_and_name_each_agent_without_a_filter_once():
-    filtered, alone = tables(study_markdown(ROWS))
-    for table in (filtered, alone):
-        assert len({len(line) for line in table}) == 1
-        assert len(table[0]) <= MOST_COLUMNS
-    assert filtered[0] == ["agent", "filter", "safe %", "return", "intervened %"]
-    assert [line[:3] for line in filtered[2:]] == [
-        ["PPO", "`scbf`", "90.0 [90.0, 90.0]"],
-        ["PPO", "`hocbf`", "80.0 [80.0, 80.0]"],
-        ["SAC", "`scbf`", "70.0 [70.0, 70.0]"],
-    ]
-    assert alone[0] == ["agent", "safe %", "return", "unsafe steps in training", "s"]
-    rest = ["12.5 [12.5, 12.5]", "60.0 [60.0, 60.0]", "34,139", "3"]
-    assert alone[2:] == [["PPO", *rest], ["SAC", *rest]]
-
-
 @pytest.mark.parametrize("which", [0, 1])
 def test_differences_have_a_sign(which):
     for line in tables(study_markdown(ROWS, differences=True))[which][2:]:
@@ -57,13 +41,6 @@ def printed(rows):
     columns = study_columns(rows)
     print_columns(console, columns[:2], columns[2:])
     return console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def test_names_are_printed_as_they_are():
-    rows = [summary("[/]", "promise:p=0.9:table=[red].npz", 0.5)]
-    assert {"[/]", "promise:p=0.9:table=[red].npz"} <= set(printed(rows).split())
-    filtered, _ = tables(study_markdown([summary("a", "promise:p=0.9:spec=a|b", 0.5)]))
-    assert filtered[2][1] == "`promise:p=0.9:spec=a\\|b`"
 
 
 def test_what_is_seldom_is_not_printed_as_never_nor_what_is_frequent_as_always():

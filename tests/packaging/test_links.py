@@ -1,4 +1,4 @@
-"""One import root: only `safe_envs` is installed; the links at the top level are short cuts."""
+"""Only `safe_envs` is installed; the links at the top level of a checkout are short cuts."""
 
 from __future__ import annotations
 
@@ -69,20 +69,18 @@ runpy.run_module("safe_envs", run_name="__main__")
 def test_links_give_the_same_objects_as_the_package(tmp_path: Path):
     code = """
 import importlib, inspect, pickle
-from wrappers import CBF, SafetyFilterWrapper
-from wrappers.conditions.cbf import CBF as of_submodule
-import wrappers.conditions, agents.evaluation.statistics, scripts.cli
+from wrappers import CBF, SafetyMonitor
+from wrappers.monitor import SafetyMonitor as of_submodule
+import wrappers.monitor, agents.evaluation.statistics, scripts.cli
 import safe_envs.wrappers, safe_envs.agents.evaluation.statistics, safe_envs.scripts.cli
 
-assert SafetyFilterWrapper is safe_envs.wrappers.SafetyFilterWrapper
-assert CBF is of_submodule is safe_envs.wrappers.CBF
+assert CBF is safe_envs.wrappers.CBF
+assert SafetyMonitor is of_submodule is safe_envs.wrappers.SafetyMonitor
 assert wrappers is safe_envs.wrappers
-assert wrappers.conditions is safe_envs.filters.conditions
 assert agents.evaluation.statistics is safe_envs.agents.evaluation.statistics
 assert scripts.cli is safe_envs.scripts.cli
 assert pickle.loads(pickle.dumps(CBF(2.0))) == CBF(2.0)
-assert b"safe_envs.wrappers" in pickle.dumps(CBF)
-for module in (wrappers, wrappers.conditions, agents.evaluation.statistics):
+for module in (wrappers, wrappers.monitor, agents.evaluation.statistics):
     name = module.__name__
     assert name.startswith("safe_envs.")
     assert module.__spec__.name == name

@@ -1,11 +1,19 @@
-"""Lines that fit a terminal, or a page of the documentation."""
+"""What is printed by rich: the console of results, and lines that fit a terminal or a page.
+
+Help and completion do without rich, which takes longer to import than all the rest of them.
+"""
 
 from __future__ import annotations
 
+import io
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any, TextIO
 
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from safe_envs.text import break_points, visible
@@ -77,3 +85,50 @@ def _wrapped(text: Text, width: int) -> list[Text]:
     for line in lines:
         line.rstrip()
     return lines
+
+
+_LEAST_WIDTH = 40
+_PIPE_WIDTH = 80
+
+
+class _Tables(Console):
+    """A console that leaves out all but tables."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        tables = [found for found in objects if isinstance(found, Table)]
+        if tables:
+            super().print(*tables, **how)
+
+
+class _Trimmed(io.TextIOBase):
+    """A stream without the blanks at the ends of the lines of a table."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The encoding, which decides on the characters that draw tables."""
+        return self._stream.encoding
+
+    def write(self, text: str, /) -> int:
+        """Write whole lines, as a console does."""
+        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
+
+    def flush(self) -> None:
+        """See `io.TextIOBase`."""
+        self._stream.flush()
+
+
+def result_console(quiet: bool, silent: bool) -> Console:
+    """Return the console for results, as wide as the terminal; without one, 80 characters.
+
+    Args:
+        quiet: print tables only.
+        silent: print nothing.
+    """
+    kind = _Tables if quiet else Console
+    if sys.stdout.isatty():
+        return kind(width=max(Console().width, _LEAST_WIDTH), quiet=silent)
+    trimmed: Any = _Trimmed(sys.stdout)
+    return kind(width=_PIPE_WIDTH, quiet=silent, file=trimmed)

@@ -24,10 +24,12 @@ def loaded(*names):
 from safe_envs.scripts import cli
 
 LIBRARIES = ("sympy", "scipy", "torch", "matplotlib", "pygame")
-assert not loaded(*LIBRARIES, "safe_envs.agents"), "the command line, for completion"
-for command in ("evaluate", "verify", "identify", "train", "render"):
+assert not loaded(*LIBRARIES, "numpy", "gymnasium", "rich", "safe_envs.agents"), "completion"
+cli.app(["--help"], standalone_mode=False)
+assert not loaded(*LIBRARIES, "numpy", "gymnasium", "rich", "safe_envs.agents"), "help"
+for command in ("evaluate", "verify", "identify", "train"):
     cli.app([command, "--help"], standalone_mode=False)
-assert not loaded("safe_envs.agents", "torch", "matplotlib", "pygame"), "help"
+assert not loaded("safe_envs.agents", "torch", "matplotlib", "pygame"), "help of a command"
 
 import safe_envs.agents
 
@@ -60,16 +62,47 @@ assert loaded("pygame")
 """
 
 
-def test_nothing_is_imported_before_it_is_needed():
+ORDERS = {
+    "the package first": "import safe_envs; import gymnasium as gym",
+    "Gymnasium first": "import gymnasium as gym; import safe_envs",
+    "only what needs Gymnasium": "from safe_envs import SafeEnv; import gymnasium as gym",
+    "the package, forgotten and imported again": (
+        "import sys, safe_envs, importlib.util; importlib.util.find_spec('gymnasium')\n"
+        "for n in [n for n in sys.modules if n.startswith('safe_envs')]: del sys.modules[n]\n"
+        "import safe_envs; import gymnasium as gym"
+    ),
+    "by Gymnasium itself": "import gymnasium as gym; gym.make('safe_envs:safe_envs/Scalar-v0')",
+}
+REGISTERED = """
+import sys
+ids = [name for name in gym.registry if name.startswith("safe_envs/")]
+assert len(ids) == {count}, ids  # One more than those of systems: that of any system.
+assert gym.make("safe_envs/Scalar-v0").reset(seed=0)
+assert type(gym.__loader__) is type(gym.spaces.__loader__)
+assert not [f for f in sys.meta_path if type(f).__module__.startswith("safe_envs")]
+"""
+
+
+def finished(code: str, *flags: str) -> str:
+    """Run a fresh process; return what it printed."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", STAGES],
+        [sys.executable, "-W", "error", *flags, "-c", code],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
         check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.count("Usage: ") == 5
+    return done.stdout
+
+
+def test_nothing_is_imported_before_it_is_needed():
+    assert finished(STAGES).count("Usage: ") == 5
+
+
+@pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS.keys())
+def test_every_id_is_there_in_every_order(order: str):
+    finished(order + REGISTERED.format(count=len(safe_envs.ENV_IDS) + 1))
 
 
 def test_what_a_package_has_can_be_used_as_its_attribute():
@@ -79,15 +112,25 @@ safe_envs.envs, safe_envs.agents, safe_envs.filters.conditions
 for name in ("no_such", "__wrapped__"):
     assert not hasattr(safe_envs, name)
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-
-
-def test_what_the_package_has_is_listed():
+    finished(code)
     assert {"__version__", "SafetyFilter", "ENV_IDS"} <= set(dir(safe_envs))
     assert all(hasattr(safe_envs, name) for name in dir(safe_envs))
 
 
-def test_the_package_works_from_a_zip_file(tmp_path):
+def test_a_folder_on_the_path_will_do_without_an_installation(tmp_path: Path):
+    # Without the packages of the environment and the checkout there is no metadata of this one.
+    (tmp_path / "safe_envs").symlink_to(Path(safe_envs.__file__).parent)
+    code = f"""
+import sys
+sys.path[:0] = [{str(tmp_path)!r}]
+import safe_envs
+assert safe_envs.__version__ == "0+unknown", safe_envs.__version__
+assert safe_envs.ENV_IDS
+"""
+    finished(code, "-I", "-S")
+
+
+def test_the_package_works_from_a_zip_file(tmp_path: Path):
     source = Path(safe_envs.__file__).parent
     with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
         for path in (*source.rglob("*.py"), *source.rglob("*.json")):
@@ -101,8 +144,4 @@ sys.argv = ["safe-envs", "list"]
 from safe_envs.scripts.cli import main
 main()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "safe_envs/Scalar-v0" in done.stdout
+    assert "safe_envs/Scalar-v0" in finished(code)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from safe_envs import InvalidInputError
-from safe_envs.errors import real_array
+from safe_envs.arrays import real_array
 from safe_envs.wrappers import (
     FilterSpec,
     SafetyFilter,
