@@ -10,8 +10,8 @@ from dataclasses import replace
 import pytest
 
 from safe_envs.filters.certificates.files import save_certificate
-from tests.scripts.conftest import strictly
 from tests.filters.certificates.examples import FALSE, TRUE, brownian, disk
+from tests.scripts.conftest import strictly
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from safe_envs.agents import make_problem
 from safe_envs.filters.certificates.files import save_certificate
 from safe_envs.filters.learning import learner_of
 from safe_envs.filters.learning.collection import collect
+from tests.filters.certificates.examples import disk
 from tests.scripts.own_system import SYSTEM
-from tests.wrappers.certificates.examples import disk
 
 ERRORS = """
 evalute | did you mean 'evaluate'

@@ -11,9 +11,9 @@ from safe_envs.agents.evaluation import safety_chain
 from safe_envs.proofs import guarantees
 from safe_envs.proofs.judge import Supremum
 from tests.agents.evaluation.made_up import attainable
+from tests.proofs.verified import verify_once
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
-from tests.proofs.verified import verify_once
 
 pytestmark = pytest.mark.slow
 

@@ -32,8 +32,8 @@ from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings, save_table
 from safe_envs.wrappers import SZCBF, Certified, parse_conditions
 from tests.conftest import problem_of
-from tests.wrappers.backup.carts import cart, cart_problem, v
-from tests.wrappers.certificates.held_examples import SCALAR, scalar_certificate, with_numbers
+from tests.filters.certificates.held_examples import SCALAR, scalar_certificate, with_numbers
+from tests.oracles.carts import cart, cart_problem, v
 
 
 def test_bounds_of_continuous_control_are_the_closed_forms_or_say_why_not():

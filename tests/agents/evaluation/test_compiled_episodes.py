@@ -16,7 +16,7 @@ from safe_envs.engine.program import Program
 from safe_envs.errors import NotCompilableError
 from safe_envs.problem.backup import BackupLaw
 from tests.conftest import problem_of
-from tests.wrappers.backup.carts import DT, STRONGEST, cart_problem, v, x
+from tests.oracles.carts import DT, STRONGEST, cart_problem, v, x
 
 WIDE = {"start": [(-0.5, 0.9), (0.0, 2.0)]}
 TWO = (1 - x, 1 + x)

@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.evaluate import refine, run_evaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import CBF, HOCBF, FilterSpec, spec_of
-from tests.wrappers.backup.carts import cart_problem
+from tests.oracles.carts import cart_problem
 
 SPEC = EvaluationSpec(
     "Scalar-v0",

@@ -14,6 +14,7 @@ from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events.estimate import estimate_rare
+from tests.oracles.carts import cart_problem
 from tests.oracles.laws import (
     X,
     brownian,
@@ -23,7 +24,6 @@ from tests.oracles.laws import (
     mean_reverting_passage,
     walk_passage,
 )
-from tests.wrappers.backup.carts import cart_problem
 
 pytestmark = pytest.mark.slow
 
