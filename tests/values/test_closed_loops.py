@@ -10,7 +10,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
-from safe_envs.files import VARIABLE, checksum, reading, write_arrays
+from safe_envs.arrays import checksum, reading, write_arrays
+from safe_envs.files import VARIABLE
 from safe_envs.filters.conditions.text import conditions_for
 from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.registry import make_problem

@@ -15,7 +15,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError
-from safe_envs.files import VARIABLE, checksum, locked, reading, write_arrays
+from safe_envs.arrays import checksum, reading, write_arrays
+from safe_envs.files import VARIABLE, locked
 from safe_envs.registry import make_problem
 from safe_envs.values import tables
 from safe_envs.values.look_ahead import LookAhead

@@ -25,7 +25,7 @@ from safe_envs.filters.learning import load_learned
 from safe_envs.filters.learning.data import LearnedFileError, Signature, load, save
 from safe_envs.wrappers import SafetyFilter, parse_conditions
 from tests.conftest import problem_of
-from tests.test_bounded_reading import damaged_by
+from tests.test_files import damaged_by
 
 DISK = problem_of("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)
