@@ -109,7 +109,14 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
         ("ACC-v0", "sup h over C <= 1000.01, proved|inside|proved, but empty"),
         ("StochasticDubins-v0", "c_0 <= 9.0|proved; c_1 <= 11.9|conditions on the future"),
         ("StochasticDubins-v0 --filter hocbf", "hocbf ignores the noise"),
-        ("DubinsDisk-v0 --start thesis", "the model differs from the plant in v|outside C_1"),
+        (
+            "DubinsDisk-v0",
+            "theta over a period of 2 pi|the model differs from the plant in v|has no effect",
+        ),
+        (
+            "DubinsDisk-v0 --start thesis --knowledge plant",
+            "the start is outside C_1: b_1 = -1.26",
+        ),
         pytest.param(
             "DubinsDisk-v0 --filter hocbf:p=1,1 --knowledge plant",
             "the best action violates it by 0.28",
