@@ -55,7 +55,7 @@ def obstacle_course(constraints: int, states: int) -> tuple[SafetyFilter, np.nda
         (Barrier(3 - x), HOCBF((1, 1))),
         (Barrier(1 - v**2 - w**2), CBF(1.0)),
     ]
-    safety_filter = SafetyFilter(point, barriers[:constraints], bounds=(-2.0, 2.0))
+    safety_filter = SafetyFilter(point, barriers[:constraints], input_bounds=(-2.0, 2.0))
     rng = np.random.default_rng(0)
     angle, radius = rng.uniform(0, 2 * np.pi, states), rng.uniform(1.1, 2.0, states)
     drawn = np.stack(
@@ -78,7 +78,7 @@ def flights_within_limits(
         The filter, the states (B, 12), and inputs (B, 4) anywhere within the bounds.
     """
     problem, rng = make_problem("safe_envs/QuadrotorLimits-v0"), np.random.default_rng(0)
-    low, high = np.transpose(problem.box)
+    low, high = np.transpose(problem.input_bounds)
     envs = SafeVectorEnv(problem, states)
     envs.reset(seed=0)
     drawn = envs.state + rng.normal(0.0, deviation, envs.state.shape)
@@ -172,7 +172,7 @@ def fused_loop() -> Case:
     """Return a step of the Dubins SCBF by a NumPy loop, without reward, info, reset and checks."""
     problem = gym.make(ENV_ID).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
     values = {parameter.name: value for parameter, value in problem.plant.parameters.items()}
-    v, dt, (low, high) = values["v"], problem.dt, problem.box[0]
+    v, dt, (low, high) = values["v"], problem.dt, problem.input_bounds[0]
     root = values["sigma_1"] * dt**0.5
     rng = np.random.default_rng(0)
     x, y, theta = rng.uniform(-1.0, 1.0, (3, NUM_ENVS))

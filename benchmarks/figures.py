@@ -215,7 +215,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
         safety_filter = SafetyFilter.for_problem(
             problem, conditions[method](learned[name], problem)
         )
-        low, high = np.transpose(problem.box)
+        low, high = np.transpose(problem.input_bounds)
         x, u = draw_states(problem, NUM_ENVS, rng), rng.uniform(low, high, (NUM_ENVS, len(low)))
         acting = np.flatnonzero(safety_filter.filter(x, u).active.any(axis=1))[0]
         cases[f"{name}, 1 state"] = Case(
@@ -235,7 +235,7 @@ def _vec_envs(engine: str) -> Figures:
     for name, text in (("unfiltered", None), ("filtered", "scbf")):
         measured = speeds(ENV_ID, filter=text, engine=engine)
         found[f"SB3 VecEnv of 64 / DummyVecEnv, {name}"] = (
-            measured["SafeVecEnv"] / measured["DummyVecEnv"]
+            measured["SB3VecEnv"] / measured["DummyVecEnv"]
         )
     return found
 

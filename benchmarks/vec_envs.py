@@ -22,7 +22,7 @@ def speeds(
     rounds: int = 6,
     engine: str = "numpy",
 ) -> dict[str, float]:
-    """Measure the speed of `SafeVecEnv` and of DummyVecEnv, reading infos as every algorithm does.
+    """Measure the speed of `SB3VecEnv` and of DummyVecEnv, reading infos as every algorithm does.
 
     Args:
         env_id: registered id.
@@ -30,7 +30,7 @@ def speeds(
         filter: text of a condition; None for the unfiltered env.
         steps: of a batch in a round.
         rounds: of which the fastest counts.
-        engine: of `SafeVecEnv`.
+        engine: of `SB3VecEnv`.
 
     Returns:
         Steps of single envs per second, by the name of the class.

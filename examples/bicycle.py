@@ -10,7 +10,7 @@ import math
 
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, define_problem
 
 s, y, psi, v, curvature, acceleration = sp.symbols("s y psi v tan_delta a", real=True)
 length = sp.Symbol("L", positive=True)
@@ -33,10 +33,10 @@ def problem(*, width: float = 3.5) -> SafetyProblem:
         width: Width of the lane in m.
     """
     course = 0.7 * width * sp.sin(s / 10)
-    return state_problem(
+    return define_problem(
         bicycle,
         [Barrier(width / 2 - y, "left"), Barrier(width / 2 + y, "right")],
-        box=[(-math.tan(0.5), math.tan(0.5)), (-3.0, 2.0)],
+        input_bounds=[(-math.tan(0.5), math.tan(0.5)), (-3.0, 2.0)],
         start=[0.0, (-0.5, 0.5), (-0.05, 0.05), (9.0, 11.0)],
         dt=0.02,
         horizon=10.0,

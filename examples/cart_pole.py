@@ -11,7 +11,7 @@ import math
 
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import ControlAffineSDE, SafetyProblem, define_problem
 
 x, v, theta, omega, force = sp.symbols("x v theta omega F", real=True)
 M, m, length = sp.symbols("M m l", positive=True)
@@ -37,10 +37,10 @@ def problem(*, limit: float = 15.0) -> SafetyProblem:
         limit: Largest angle of the pole in degrees.
     """
     widest = math.radians(limit)
-    return state_problem(
+    return define_problem(
         cart_pole,
         1 - (theta / widest) ** 2,
-        box=(-30.0, 30.0),
+        input_bounds=(-30.0, 30.0),
         start=[(-4.0, 4.0), 0.0, (-0.05, 0.05), 0.0],
         dt=0.02,
         horizon=10.0,

@@ -86,7 +86,7 @@ def move(state: np.ndarray, force: np.ndarray, weight: float) -> np.ndarray:
 def run(gains: str = "3,3", seconds: float = 11.0) -> tuple[DecisionLog, np.ndarray]:
     """Run the loop; return its log, and how long each decision took in s."""
     safety_filter = SafetyFilter(
-        robot, barriers, f"hocbf:p={gains}", bounds=(-20.0, 20.0), adjustable=("mass",)
+        robot, barriers, f"hocbf:alpha={gains}", input_bounds=(-20.0, 20.0), adjustable=("mass",)
     )
     log = DecisionLog.for_filter(safety_filter, UNITS)
     state, latency = np.zeros(5), []
@@ -99,10 +99,10 @@ def run(gains: str = "3,3", seconds: float = 11.0) -> tuple[DecisionLog, np.ndar
         proposed = propose(state)
         begun = time.perf_counter()
         decision = safety_filter.filter(
-            state, proposed, bounds=(-limit, limit), parameters=measured, t=t
+            state, proposed, input_bounds=(-limit, limit), parameters=measured, t=t
         )
         latency.append(time.perf_counter() - begun)
-        log.add(t, state, decision, bounds=(-limit, limit), parameters=measured)
+        log.add(t, state, decision, input_bounds=(-limit, limit), parameters=measured)
         state = move(state, decision.action, measured["mass"])  # yours: send it, sleep until t + dt
     gc.unfreeze()
     return log, np.array(latency)

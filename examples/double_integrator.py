@@ -5,7 +5,7 @@ safe-envs evaluate --system examples/double_integrator.py:problem --filter none 
 
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, define_problem
 
 x, y, v_x, v_y, a_x, a_y, sigma = sp.symbols("x y v_x v_y a_x a_y sigma", real=True)
 
@@ -27,10 +27,10 @@ def problem(*, radius: float = 1.0) -> SafetyProblem:
     """
     obstacle = Barrier(x**2 + y**2 - radius**2, "obstacle")
     to_goal = (x - 3) ** 2 + y**2
-    return state_problem(
+    return define_problem(
         point,
         obstacle,
-        box=(-2.0, 2.0),
+        input_bounds=(-2.0, 2.0),
         start=[(-4.0, -3.0), (-1.0, 1.0), 0.0, 0.0],
         dt=0.05,
         horizon=15.0,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from safe_envs.envs.vector_env import SafeVectorEnv
     from safe_envs.filters.decision_log import DecisionLog
     from safe_envs.filters.safety_filter import SafetyFilter
-    from safe_envs.problem.builder import state_problem
+    from safe_envs.problem.builder import define_problem
     from safe_envs.problem.clf import CLF
     from safe_envs.problem.problem import Barrier, SafetyProblem
     from safe_envs.scripts.figures.log import plot_log
@@ -50,9 +50,9 @@ __all__ = [
     "SafetyProblem",
     "SystemDefinitionError",
     "SystemDefinitionWarning",
+    "define_problem",
     "plot_log",
     "register",
-    "state_problem",
 ]
 
 _MODULES = {
@@ -66,7 +66,7 @@ _MODULES = {
     "SafetyProblem": "safe_envs.problem.problem",
     "plot_log": "safe_envs.scripts.figures.log",
     "register": "safe_envs.envs.registered",
-    "state_problem": "safe_envs.problem.builder",
+    "define_problem": "safe_envs.problem.builder",
 }
 
 

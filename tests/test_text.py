@@ -168,7 +168,7 @@ COMPARED = (
     "  promise:p=0.9 - scbf: +21.0 points [15.6, 27.2], McNemar p < 1e-10 (safe with one only:"
     " promise:p=0.9 42, scbf 0)"
 )
-LONG = "learned-hocbf:p=2:level=.95:file=/some/very/long/path/to/a/model.npz+cbf:alpha=1"
+LONG = "learned-hocbf:alpha=2:level=.95:file=/some/very/long/path/to/a/model.npz+cbf:alpha=1"
 
 
 @pytest.mark.parametrize("width", [24, 60, 101])
@@ -210,7 +210,11 @@ def test_what_controls_a_terminal_is_written_as_python_writes_it():
     assert visible("two\nlines", keep="") == r"two\nlines"
 
 
-NAMES = ("none", "scbf", "learned-hocbf:p=2:level=.95:file=/some/long/path/model.npz+cbf:alpha=1")
+NAMES = (
+    "none",
+    "scbf",
+    "learned-hocbf:alpha=2:level=.95:file=/some/long/path/model.npz+cbf:alpha=1",
+)
 
 
 def table(names=NAMES):

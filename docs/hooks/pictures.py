@@ -134,7 +134,9 @@ def _point() -> tuple[ControlAffineSDE, Barrier]:
 def _qp(layout: tuple[int, int]) -> Figure:
     """Draw the QP of a filter in the plane of two inputs, at a feasible and an infeasible state."""
     system, barrier = _point()
-    safety_filter = SafetyFilter(system, [(barrier, HOCBF((2.0, 2.0)))], bounds=[(-2.0, 2.0)] * 2)
+    safety_filter = SafetyFilter(
+        system, [(barrier, HOCBF((2.0, 2.0)))], input_bounds=[(-2.0, 2.0)] * 2
+    )
     constraint = safety_filter.constraints[0]
     compiled = compile_function(
         system.states, [*constraint.coefficient, constraint.offset], "floats"

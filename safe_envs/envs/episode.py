@@ -285,7 +285,7 @@ class Actuators:
     """
 
     def __init__(self, problem: SafetyProblem, num_envs: int | None = None) -> None:
-        rest = resting_input(problem.box)
+        rest = resting_input(problem.input_bounds)
         self._line = DelayLine(problem.delay, rest, num_envs)
         self._steps: Limits = tuple(
             (problem.dt * low, problem.dt * high) for low, high in problem.slew_limit

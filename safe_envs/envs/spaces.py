@@ -69,8 +69,8 @@ def action_box(problem: SafetyProblem) -> gym.spaces.Box:
 
 def center_and_half_width(problem: SafetyProblem) -> tuple[list[float], list[float]]:
     """Return c and w of each input: physical input = c + w * action, for an action in [-1, 1]."""
-    center = [0.5 * (low + high) for low, high in problem.box]
-    half = [0.5 * (high - low) for low, high in problem.box]
+    center = [0.5 * (low + high) for low, high in problem.input_bounds]
+    half = [0.5 * (high - low) for low, high in problem.input_bounds]
     return center, half
 
 

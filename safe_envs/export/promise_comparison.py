@@ -279,7 +279,7 @@ class _Tally:
     """
 
     def __init__(self, promise_filter: PromiseFilter) -> None:
-        self._low, self._high = np.array(promise_filter.problem.box, dtype=float).T
+        self._low, self._high = np.array(promise_filter.problem.input_bounds, dtype=float).T
         self.found: dict[str, Any] = dict.fromkeys(
             ("replaced", "infeasible", "flags_different", "beyond", "out_of_bounds"), 0
         )

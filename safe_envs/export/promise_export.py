@@ -483,7 +483,7 @@ def random_cases(
     """
     problem, steps = promise_filter.problem, promise_filter.look_ahead.steps
     ends = np.array(list(region) or [_DEFAULT] * problem.plant.n, dtype=float)
-    low, high = np.array(problem.box, dtype=float).T
+    low, high = np.array(problem.input_bounds, dtype=float).T
     instants = rng.integers(0, steps + 2, count)
     instants[rng.random(count) < 0.1] = 0
     states = rng.uniform(ends[:, 0], ends[:, 1], (count, len(ends)))
@@ -544,7 +544,7 @@ def clipped(promise_filter: PromiseFilter, proposed: np.ndarray) -> np.ndarray:
         promise_filter: the filter.
         proposed: shape (N, m).
     """
-    low, high = np.array(promise_filter.problem.box, dtype=float).T
+    low, high = np.array(promise_filter.problem.input_bounds, dtype=float).T
     return np.clip(proposed, low, high)
 
 
@@ -593,7 +593,7 @@ class PromiseEpisodes:
 
     def propose(self) -> np.ndarray:
         """Return proposed inputs, shape (N, m), that push to one side for a while."""
-        low, high = np.array(self._filter.problem.box, dtype=float).T
+        low, high = np.array(self._filter.problem.input_bounds, dtype=float).T
         size = len(self.x[0])
         pushed = self._rng.random((size, len(low))) ** 0.2
         side = np.arange(size)[:, None] % 2
@@ -762,7 +762,7 @@ def promise_sources(
     require_name(options.name)
     program = promise_program(promise_filter, LARGEST_TABLES)
     problem, units = promise_filter.problem, options.units
-    low, high = zip(*problem.box, strict=True)
+    low, high = zip(*problem.input_bounds, strict=True)
     interface = Interface(
         options.name,
         comment(f"{replace(promise_filter.settings, table=None).text} for {problem.name}"),

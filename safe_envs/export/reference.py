@@ -166,7 +166,7 @@ def _asked(safety_filter: SafetyFilter, cases: Cases) -> Any:
     return safety_filter.filter(
         cases.states,
         cases.proposed,
-        bounds=None if own else np.stack([cases.low, cases.high], axis=-1),
+        input_bounds=None if own else np.stack([cases.low, cases.high], axis=-1),
         parameters=values if named else None,
         t=cases.runtime[:, -1] if TIME in qp.runtime else None,
     )

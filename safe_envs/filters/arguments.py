@@ -38,7 +38,7 @@ from safe_envs.problem.signals import TIME
 from safe_envs.text import finite_number
 
 _FORMS = (
-    "give a Condition, one for each barrier, or their text, such as 'szcbf', 'hocbf:p=2,8' or"
+    "give a Condition, one for each barrier, or their text, such as 'szcbf', 'hocbf:alpha=2,8' or"
     " 'hocbf+scbf'"
 )
 

@@ -384,7 +384,7 @@ class DecisionLog(IndependentCopies):
         x: Any,
         decision: FilterDecision,
         *,
-        bounds: Any = None,
+        input_bounds: Any = None,
         parameters: Mapping[Any, float] | None = None,
     ) -> None:
         """Add the decision of one period.
@@ -393,7 +393,7 @@ class DecisionLog(IndependentCopies):
             t: time in s, of a clock that never goes back, such as `time.monotonic`.
             x: state, shape (n,); `safety_filter.measured.mean` after a measurement.
             decision: what the filter returned for that one state.
-            bounds: as given to the filter; those of its construction by default.
+            input_bounds: as given to the filter; those of its construction by default.
             parameters: as given to the filter.
 
         Raises:
@@ -406,8 +406,10 @@ class DecisionLog(IndependentCopies):
             action, proposed = decision.action.tolist(), decision.proposed.tolist()
             intervened = decision.cause >= 0 and action != proposed
             low, high = self._bounds
-            if bounds is not None:
-                low, high = np.broadcast_to(np.asarray(bounds, float), (len(action), 2)).T.tolist()
+            if input_bounds is not None:
+                low, high = np.broadcast_to(
+                    np.asarray(input_bounds, float), (len(action), 2)
+                ).T.tolist()
             known = self._defaults
             values = array(
                 "d",

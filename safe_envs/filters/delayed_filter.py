@@ -198,7 +198,7 @@ class DelayedFilter:
         x: Any,
         u_nominal: Any,
         *,
-        bounds: Any = None,
+        input_bounds: Any = None,
         parameters: Mapping[Any, Any] | None = None,
         t: Any = None,
     ) -> FilterDecision:
@@ -209,7 +209,7 @@ class DelayedFilter:
                 until `reset`.
             u_nominal: proposed inputs in physical units, shape (m,) or (..., m): for the period in
                 which they are executed.
-            bounds: of the input that is to be sent; see `SafetyFilter.filter`.
+            input_bounds: of the input that is to be sent; see `SafetyFilter.filter`.
             parameters: values now of signals and adjustable parameters; see there.
             t: the time now in s; see there.
 
@@ -234,7 +234,7 @@ class DelayedFilter:
         later: dict[str, Any] = {"parameters": parameters, "t": t}
         if self.delay:
             state, later = self._predicted(state, line, parameters, t)
-        decision = self.safety_filter.filter(state, u, bounds=bounds, **later)
+        decision = self.safety_filter.filter(state, u, input_bounds=input_bounds, **later)
         line.exchange(components_of(decision.action))
         self._batch, self._line, self._unknown = state.shape[:-1], line, 0
         return decision

@@ -86,7 +86,7 @@ class MeasurementFilter:
         y: Any,
         u_nominal: Any,
         *,
-        bounds: Any = None,
+        input_bounds: Any = None,
         parameters: Mapping[Any, Any] | None = None,
         t: Any = None,
     ) -> FilterDecision:
@@ -96,7 +96,7 @@ class MeasurementFilter:
             y: measured values, shape (k,) or (..., k), of the same plants at every call until
                 `reset`; NaN where a value was lost.
             u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
-            bounds: see `SafetyFilter.filter`.
+            input_bounds: see `SafetyFilter.filter`.
             parameters: see there; those of the belief are not given.
             t: see there.
 
@@ -122,7 +122,9 @@ class MeasurementFilter:
         if self._believed:
             found = self._known.believed(components_of(u))
             given |= {name: np.reshape(found[at], batch) for name, at in self._believed.items()}
-        decision = self._filter.filter(self.mean, u, bounds=bounds, parameters=given or None, t=t)
+        decision = self._filter.filter(
+            self.mean, u, input_bounds=input_bounds, parameters=given or None, t=t
+        )
         self._sent, self._waiting = components_of(decision.action), False
         return decision
 

@@ -76,10 +76,10 @@ class SafetyFilter:
         system: that the filter knows.
         barriers: h, safe where h >= 0: a `Barrier` or an expression of states, signals and
             `safe_envs.problem.signals.TIME`; several of them; or (barrier, condition) pairs.
-        conditions: a `Condition` for all barriers, one for each, or their text, like "hocbf:p=2,8"
+        filters: a `Condition` for all barriers, one for each, or their text, like "hocbf:alpha=2,8"
             or "szcbf+hocbf"; see `parse_condition`. "szcbf" with noise and "hocbf" without by
             default. None with pairs.
-        bounds: (low, high) of all inputs in physical units, or one such pair for each. An end may
+        input_bounds: (low, high) of all inputs in physical units, or one such pair for each. An end may
             be infinite unless the filter has a goal, a reciprocal condition or certificate, or an
             uncertain constraint: these go as far as they can.
         weights: diagonal of W, one positive number for each input; ones by default.
@@ -110,8 +110,8 @@ class SafetyFilter:
         self,
         system: ControlAffineSDE,
         barriers: Any,
-        conditions: Conditions | Sequence[Condition | str] | None = None,
-        bounds: Any = None,
+        filters: Conditions | Sequence[Condition | str] | None = None,
+        input_bounds: Any = None,
         weights: Sequence[float] | None = None,
         *,
         priorities: Sequence[float] | None = None,
@@ -126,7 +126,7 @@ class SafetyFilter:
         arguments.refuse_unknown(unknown, SafetyFilter.__init__)
         self.model = arguments.require_system(system)
         known = arguments.with_adjustable(system, adjustable)
-        self.pairs = arguments.read_pairs(known, barriers, conditions)
+        self.pairs = arguments.read_pairs(known, barriers, filters)
         arguments.require_goal(clf, weights)
         settings = EstimateSettings(dt, instants, region, certain_states(estimator))
         owners, self.parts = parts_of(self.pairs)
@@ -140,7 +140,7 @@ class SafetyFilter:
         qp = FilterQP(
             known,
             self.constraints,
-            *arguments.read_bounds(known.inputs, bounds, endless),
+            *arguments.read_bounds(known.inputs, input_bounds, endless),
             arguments.positive_weights("weights", weights, known.m),
             [weights_of[i] for i in owners],
             arguments.control_period(self.constraints, dt),
@@ -160,7 +160,7 @@ class SafetyFilter:
     def for_problem(
         cls,
         problem: SafetyProblem,
-        conditions: Conditions,
+        filters: Conditions,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -171,7 +171,7 @@ class SafetyFilter:
 
         Args:
             problem: problem whose model, barriers and box are taken.
-            conditions: one for every barrier, one for all, or their text; see
+            filters: one for every barrier, one for all, or their text; see
                 `SafetyFilterWrapper`.
             knowledge: "model" for what the designer believes, "plant" for the true system.
                 Conditions that correct the model start from it in any case.
@@ -187,12 +187,12 @@ class SafetyFilter:
                 made for another problem, one corrects the model and another knows the plant, or the
                 problem has no clf.
         """
-        known, each, clf = known_for_problem(problem, conditions, knowledge, objective)
+        known, each, clf = known_for_problem(problem, filters, knowledge, objective)
         return cls(
             known,
             problem.barriers,
             each,
-            bounds=problem.box,
+            input_bounds=problem.input_bounds,
             priorities=priorities,
             dt=problem.dt,
             clf=clf,
@@ -213,7 +213,7 @@ class SafetyFilter:
         x: Any,
         u_nominal: Any,
         *,
-        bounds: Any = None,
+        input_bounds: Any = None,
         parameters: Mapping[Any, Any] | None = None,
         t: Any = None,
     ) -> FilterDecision:
@@ -222,7 +222,7 @@ class SafetyFilter:
         Args:
             x: states, shape (n,) or (..., n).
             u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
-            bounds: input bounds in place of the filter's own: (low, high) for all inputs, one such
+            input_bounds: input bounds in place of the filter's own: (low, high) for all inputs, one such
                 pair for each, (m, 2), or for each input of each state, (..., m, 2). An input whose
                 bounds are equal is held there.
             parameters: values by name or symbol: of all signals of the system, and of adjustable
@@ -241,7 +241,7 @@ class SafetyFilter:
         """
         x, u = doubles("state", x), doubles("nominal input", u_nominal)
         if x.shape == self._state_shape and u.shape == self._input_shape:
-            return self._filter_one(x, u, bounds, parameters, t)
+            return self._filter_one(x, u, input_bounds, parameters, t)
         n, m = self.model.n, self.model.m
         if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
             raise InvalidInputError(
@@ -249,7 +249,7 @@ class SafetyFilter:
                 " with the same leading axes"
             )
         batch = x.shape[:-1]
-        own = None if bounds is None else self._given.bounds(bounds, batch)
+        own = None if input_bounds is None else self._given.bounds(input_bounds, batch)
         values = self._given.values(parameters, t, batch)
         states, inputs = (
             tuple(np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T)) for part in (x, u)

@@ -318,14 +318,14 @@ class TorchFilter(torch.nn.Module):
     def for_problem(
         cls,
         problem: SafetyProblem,
-        conditions: Conditions,
+        filters: Conditions,
         knowledge: str = "model",
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
         """Return the filter for the barriers of a problem; see `SafetyFilter.for_problem`."""
-        if isinstance(conditions, str) and name_by_itself(conditions):
-            raise _not_differentiable(conditions)
-        return cls(SafetyFilter.for_problem(problem, conditions, knowledge, priorities=priorities))
+        if isinstance(filters, str) and name_by_itself(filters):
+            raise _not_differentiable(filters)
+        return cls(SafetyFilter.for_problem(problem, filters, knowledge, priorities=priorities))
 
     def forward(self, x: torch.Tensor, u: torch.Tensor, return_result: bool = False) -> Any:
         """Decide for a batch.

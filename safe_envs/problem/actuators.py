@@ -46,7 +46,7 @@ from safe_envs.problem.frame import Frame
 from safe_envs.problem.measurement import Channel
 from safe_envs.problem.option_errors import LONGEST_DELAY
 from safe_envs.problem.options import ProblemOptions
-from safe_envs.problem.signals import Feature, Variable, input_bounds
+from safe_envs.problem.signals import Feature, Variable, bound_pairs
 from safe_envs.problem.starts import SamplingDomain, Start
 
 Limits = tuple[tuple[float, float], ...]
@@ -92,13 +92,13 @@ def rate_limits(name: str, given: Any, count: int) -> Limits:
     return found
 
 
-def resting_input(box: Sequence[tuple[float, float]]) -> list[float]:
+def resting_input(input_bounds: Sequence[tuple[float, float]]) -> list[float]:
     """Return the input that is executed before any arrives: within its bounds, nearest to 0.
 
     Args:
-        box: (low, high) of each input.
+        input_bounds: (low, high) of each input.
     """
-    return [min(max(0.0, low), high) for low, high in box]
+    return [min(max(0.0, low), high) for low, high in input_bounds]
 
 
 def why_not_direct(problem: Any, what: str) -> str:
@@ -176,7 +176,7 @@ def with_rates(problem: Any, limits: Limits) -> dict[str, Any]:
     sensors = [
         Channel(v.symbol.name, v.symbol, _INPUT_NOISE * (v.high - v.low)) for v in problem.inputs
     ]
-    rest = tuple(sp.Float(u, 17) for u in resting_input(problem.box))
+    rest = tuple(sp.Float(u, 17) for u in resting_input(problem.input_bounds))
     seen = tuple(Feature(v.symbol.name, v.symbol, v.low, v.high) for v in problem.inputs)
     laws = zip(problem.nominal, problem.inputs, limits, seen, strict=True)
     suitable = "szcbf" if problem.model.noisy else "hocbf"
@@ -211,7 +211,7 @@ def with_resting_inputs(start: Any, problem: Any) -> Any:
     """
     if start is None or isinstance(start, str) or numbers_in(start).shape != (len(problem.states),):
         return start
-    return [*numbers_in(start).tolist(), *resting_input(problem.box)]
+    return [*numbers_in(start).tolist(), *resting_input(problem.input_bounds)]
 
 
 def input_ranges(problem: Any) -> dict[sp.Symbol, tuple[float, float]]:
@@ -234,14 +234,18 @@ def require_apart(given: ProblemOptions, problem: Any) -> None:
     Raises:
         ConfigurationError: They do not.
     """
-    boxes = (None, list(problem.box))
-    box = None if given.box is None else input_bounds(given.box, len(problem.inputs))
-    changed = ["dt"] * (given.dt not in (None, problem.dt)) + ["box"] * (box not in boxes)
+    boxes = (None, list(problem.input_bounds))
+    input_bounds = (
+        None if given.input_bounds is None else bound_pairs(given.input_bounds, len(problem.inputs))
+    )
+    changed = ["dt"] * (given.dt not in (None, problem.dt)) + ["input_bounds"] * (
+        input_bounds not in boxes
+    )
     changed += ["rate_limit"] * (given.rate_limit is not None)
     if changed:
         raise ConfigurationError(
             f"{', '.join(changed)}: the inputs of this problem have limited rates, which were"
-            " derived with its own dt and box; give dt, box and rate_limit together, to the problem"
+            " derived with its own dt and input_bounds; give dt, input_bounds and rate_limit together, to the problem"
             " without limits"
         )
 

@@ -14,7 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.dynamics.symbols import formula
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 from safe_envs.problem.problem import Barrier, SafetyProblem
-from safe_envs.problem.signals import Variable, input_bounds
+from safe_envs.problem.signals import Variable, bound_pairs
 from safe_envs.problem.starts import Start
 from safe_envs.problem.validation import degree_of, require_sound
 from safe_envs.text import finite_number
@@ -41,11 +41,11 @@ _STATED = (
 Range = tuple[float, float]
 
 
-def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
+def define_problem(  # noqa: PLR0913  (what a user states, by keyword)
     system: ControlAffineSDE,
     barriers: Any,
     *,
-    box: Any,
+    input_bounds: Any,
     start: Any,
     dt: float,
     horizon: float,
@@ -63,7 +63,7 @@ def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
         system: what is simulated.
         barriers: h, safe where h >= 0: an expression of the states or a `Barrier`, or several of
             them.
-        box: physical bounds (low, high) of every input, or one such pair for each.
+        input_bounds: physical bounds (low, high) of every input, or one such pair for each.
         start: of each state a number, or (low, high) to draw it from, uniformly, where every
             barrier is positive; always one entry for each state.
         dt: control period in s.
@@ -113,7 +113,7 @@ def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
         states=states,
         inputs=tuple(
             Variable(u, *ends, unit.get(u, ""))
-            for u, ends in zip(system.inputs, input_bounds(box, system.m), strict=True)
+            for u, ends in zip(system.inputs, bound_pairs(input_bounds, system.m), strict=True)
         ),
         reward=formula("reward", reward),
         nominal=tuple(

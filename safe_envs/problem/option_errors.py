@@ -28,8 +28,8 @@ def require_bounds(name: str, low: float, high: float) -> None:
     """
     if not -_WIDEST <= low < high <= _WIDEST:
         raise ConfigurationError(
-            f"box of input {name} is [{low}, {high}]; it needs bounds within {_WIDEST:g}, the lower"
-            " one below the upper. Unbounded control is a wide box"
+            f"input_bounds of input {name} is [{low}, {high}]; it needs bounds within {_WIDEST:g}, the lower"
+            " one below the upper. Unbounded control is a wide input_bounds"
         )
 
 
@@ -80,12 +80,12 @@ def wrong_start(count: int, states: Sequence[str]) -> ConfigurationError:
     )
 
 
-def refused_box(box: Any, count: int) -> ConfigurationError:
+def refused_box(input_bounds: Any, count: int) -> ConfigurationError:
     """Return the error of input bounds that are no pair, and not one for each input.
 
     Args:
-        box: what was given.
+        input_bounds: what was given.
         count: of inputs.
     """
     pairs = "" if count == 1 else f", or one such pair for each of the {count} inputs"
-    return ConfigurationError(f"box = {shown(box)}; give (low, high){pairs}")
+    return ConfigurationError(f"input_bounds = {shown(input_bounds)}; give (low, high){pairs}")

@@ -82,7 +82,7 @@ class ProblemOptions:
         dt: control period in s.
         substeps: integration steps in a control period.
         horizon: length of an episode in s.
-        box: physical bounds (low, high) of every input, or one such pair for each.
+        input_bounds: physical bounds (low, high) of every input, or one such pair for each.
         start: name of an initial distribution, or a fixed initial state.
         delay: whole control periods after which the plant executes an input that is sent.
         model_delay: the delay that filters believe, by default that of the plant; 0 for filters
@@ -113,7 +113,7 @@ class ProblemOptions:
     dt: float | None = _option("Control period in s.")
     substeps: int | None = _option("Integration steps in a control period.", least=1)
     horizon: float | None = _option("Length of an episode in s.")
-    box: Sequence[Any] | None = _option(
+    input_bounds: Sequence[Any] | None = _option(
         "Physical bounds of all inputs, or once for each.", _read_box, "LO,HI", True
     )
     start: str | Sequence[float] | None = _option(

@@ -28,7 +28,7 @@ from safe_envs.problem.measurement import Channel, Measurement, measurement_of, 
 from safe_envs.problem.option_errors import require_bounds, require_period, unknown_start
 from safe_envs.problem.options import ProblemOptions, noise_levels
 from safe_envs.problem.regions import sound_regions
-from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
+from safe_envs.problem.signals import TIME, Feature, Variable, bound_pairs, excess
 from safe_envs.problem.starts import SamplingDomain, Start
 
 
@@ -67,7 +67,7 @@ class SafetyProblem:
         model: what the designer believes; filters and nominal controllers see this one.
         barriers: what is safe.
         states: range and unit of each state of the plant, in order.
-        inputs: box and unit of each input, in order.
+        inputs: input_bounds and unit of each input, in order.
         reward: of a step, an expression of the state that it reaches, of the executed input and of
             `TIME`.
         nominal: the nominal controller, an expression for each input of the features' symbols and
@@ -137,7 +137,7 @@ class SafetyProblem:
     backup: BackupSource | None = None
     sensors: tuple[Channel, ...] = ()
     measurement: Measurement | None = None
-    box: tuple[tuple[float, float], ...] = field(init=False)
+    input_bounds: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
         plant, model = self.plant, self.model
@@ -145,7 +145,7 @@ class SafetyProblem:
             features = tuple(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in self.states)
             object.__setattr__(self, "features", features)
         object.__setattr__(self, "start", self.start or next(iter(self.starts)))
-        object.__setattr__(self, "box", tuple((i.low, i.high) for i in self.inputs))
+        object.__setattr__(self, "input_bounds", tuple((i.low, i.high) for i in self.inputs))
         for which, system in (("plant", plant), ("model", model)):
             require_autonomous(which, system)
         if (plant.states, plant.inputs) != (model.states, model.inputs):
@@ -207,7 +207,7 @@ class SafetyProblem:
         Raises:
             SystemDefinitionError: a state without a finite range has none in `sampling` either.
         """
-        return self.sampling.completed(self.states, self.box)
+        return self.sampling.completed(self.states, self.input_bounds)
 
     def _check_feature_names(self) -> None:
         """Check that a symbol of the nominal controller means one thing."""
@@ -293,8 +293,8 @@ class SafetyProblem:
         for name in ("dt", "substeps", "horizon", "delay", "model_delay"):
             if getattr(given, name) is not None:
                 changes[name] = getattr(given, name)
-        if given.box is not None:
-            pairs = input_bounds(given.box, len(self.inputs))
+        if given.input_bounds is not None:
+            pairs = bound_pairs(given.input_bounds, len(self.inputs))
             changes["inputs"] = tuple(
                 replace(i, low=low, high=high)
                 for i, (low, high) in zip(self.inputs, pairs, strict=True)

@@ -67,18 +67,18 @@ def excess(variables: tuple[Variable, ...]) -> sp.Expr:
     return sp.Max(*found) if found else sp.Integer(-1)
 
 
-def input_bounds(box: Any, count: int) -> list[tuple[float, float]]:
+def bound_pairs(input_bounds: Any, count: int) -> list[tuple[float, float]]:
     """Return the bounds of each input.
 
     Args:
-        box: (low, high) for all inputs, or one such pair for each.
+        input_bounds: (low, high) for all inputs, or one such pair for each.
         count: number of inputs.
 
     Raises:
         ConfigurationError: They are neither.
     """
-    pairs = numbers_in(box)
+    pairs = numbers_in(input_bounds)
     pairs = np.broadcast_to(pairs, (count, 2)) if pairs.shape == (2,) else pairs
     if pairs.shape != (count, 2):
-        raise refused_box(box, count)
+        raise refused_box(input_bounds, count)
     return [(float(low), float(high)) for low, high in pairs]

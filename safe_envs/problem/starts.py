@@ -165,7 +165,7 @@ class SamplingDomain:
     coordinates: tuple[sp.Expr, ...] = ()
 
     def completed(
-        self, states: Sequence[Variable], box: Sequence[tuple[float, float]]
+        self, states: Sequence[Variable], input_bounds: Sequence[tuple[float, float]]
     ) -> SamplingDomain:
         """Fill what is empty.
 
@@ -173,7 +173,7 @@ class SamplingDomain:
 
         Args:
             states: with their ranges, possibly infinite.
-            box: (low, high) of each input.
+            input_bounds: (low, high) of each input.
 
         Returns:
             The domain without empty parts.
@@ -196,18 +196,20 @@ class SamplingDomain:
                     f"cannot explore {state.symbol} in [{low}, {high}]; give"
                     " SamplingDomain(region=...) finite ranges, or the problem a workspace"
                 )
-        if any(len(u) != len(box) or not all(map(math.isfinite, u)) for u in self.inputs):
+        if any(len(u) != len(input_bounds) or not all(map(math.isfinite, u)) for u in self.inputs):
             raise SystemDefinitionError(
-                f"an input of a sampling domain needs {len(box)} finite numbers; given"
+                f"an input of a sampling domain needs {len(input_bounds)} finite numbers; given"
                 f" {self.inputs}"
             )
         clipped = tuple(
-            tuple(min(max(v, low), high) for v, (low, high) in zip(u, box, strict=True))
+            tuple(min(max(v, low), high) for v, (low, high) in zip(u, input_bounds, strict=True))
             for u in self.inputs
         )
-        # Inputs that a narrow box makes one and the same would tell nothing of the input's effect.
+        # Inputs that a narrow input_bounds makes one and the same would tell nothing of the input's effect.
         inputs = (
-            clipped if clipped and len(set(clipped)) == len(set(self.inputs)) else _halfway(box)
+            clipped
+            if clipped and len(set(clipped)) == len(set(self.inputs))
+            else _halfway(input_bounds)
         )
         coordinates = self.coordinates or tuple(
             e
@@ -217,12 +219,12 @@ class SamplingDomain:
         return SamplingDomain(region, inputs, coordinates)
 
 
-def _halfway(box: Sequence[tuple[float, float]]) -> tuple[tuple[float, ...], ...]:
+def _halfway(input_bounds: Sequence[tuple[float, float]]) -> tuple[tuple[float, ...], ...]:
     """Return, for each input, the points halfway from its centre to its bounds, others centred."""
-    center = [0.5 * (low + high) for low, high in box]
-    reach = [0.25 * (high - low) for low, high in box]
+    center = [0.5 * (low + high) for low, high in input_bounds]
+    reach = [0.25 * (high - low) for low, high in input_bounds]
     return tuple(
         tuple(c + sign * reach[j] * (i == j) for i, c in enumerate(center))
-        for j in range(len(box))
+        for j in range(len(input_bounds))
         for sign in (-1.0, 1.0)
     )

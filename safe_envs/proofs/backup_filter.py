@@ -160,7 +160,7 @@ def _none_stated(problem: SafetyProblem) -> str:
         )
     return (
         f"{problem.name} states no backup: a law that brings the system to a set which it never"
-        " leaves. Give one, state_problem(..., backup=Backup((BackupLaw(name, law, terminal),),"
+        " leaves. Give one, define_problem(..., backup=Backup((BackupLaw(name, law, terminal),),"
         " horizon)), dataclasses.replace(problem, backup=...), or FilterSpec(..., backup=...) for a"
         " third-party env, from safe_envs.problem.backup; or take another filter, such as"
         f" {problem.filter}"
@@ -298,7 +298,7 @@ class BackupFilter:
         assert given is not None
         assert backup is not None
         timing = problem.dt, problem.substeps
-        made = cls(system, problem.barriers, backup, problem.box, *timing, settings)
+        made = cls(system, problem.barriers, backup, problem.input_bounds, *timing, settings)
         stated = [j for j, law in enumerate(given.laws) if law.terminal is not None]
         made.stated = tuple(given.laws[j].name for j in stated)
         require_kept(made.plans, stated, sampled_states(problem), settings.margin)
@@ -384,7 +384,7 @@ class BackupFilter:
         for what, fits in (
             ("system", ours.system in (problem.model, problem.plant)),
             ("barriers", ours.barriers == problem.barriers),
-            ("input bounds", ours.bounds == problem.box),
+            ("input bounds", ours.bounds == problem.input_bounds),
             ("control period", (ours.dt, ours.substeps) == (problem.dt, problem.substeps)),
         ):
             if not fits:

@@ -703,7 +703,7 @@ def derived_sets(
         tuple(b.expression - sp.Float(margin, 17) for b in problem.barriers)
         if margin
         else tuple(b.expression for b in problem.barriers),
-        problem.box,
+        problem.input_bounds,
         (problem.dt / problem.substeps, problem.substeps),
     )
 

@@ -757,7 +757,7 @@ def nominal_laws(problem: SafetyProblem) -> tuple[sp.Expr, ...]:
     """
     features: Any = {f.symbol: f.expression for f in problem.features}
     found = []
-    for law, (low, high) in zip(problem.nominal, problem.box, strict=True):
+    for law, (low, high) in zip(problem.nominal, problem.input_bounds, strict=True):
         of_states = problem.model.exact(law.subs(features, simultaneous=True))
         if TIME in of_states.free_symbols:
             return ()

@@ -180,7 +180,7 @@ class Verification:
 
 def verify(
     problem: SafetyProblem,
-    conditions: Sequence[Condition],
+    filters: Sequence[Condition],
     knowledge: str = "model",
     samples: int = SAMPLES,
     seed: int = 0,
@@ -189,7 +189,7 @@ def verify(
 
     Args:
         problem: whose barriers, input bounds, ranges and system are taken.
-        conditions: one for each barrier.
+        filters: one for each barrier.
         knowledge: what they know, "model" or "plant".
         samples: number of states in C at which the drawing ends.
         seed: of all randomness.
@@ -204,7 +204,7 @@ def verify(
     require_whole("samples", samples, 1)
     require_whole("seed", seed, 0)
     require_direct(problem, "proofs of a filter")
-    formulas = Formulas(problem, conditions, knowledge)
+    formulas = Formulas(problem, filters, knowledge)
     analysis = SafeSetAnalysis(formulas, samples, seed)
     points = analysis.invariant_set
     share = float((formulas.invariant_level(analysis.safe.points) >= 0.0).mean())

@@ -932,12 +932,12 @@ class ChainProof:
 
     def _best(self, row: AffineConstraint) -> Any:
         """Return a u + b for the best input within the bounds."""
-        bounds = [tuple(map(exact_number, ends)) for ends in self._formulas.problem.box]
+        bounds = [tuple(map(exact_number, ends)) for ends in self._formulas.problem.input_bounds]
         return self._offset(row) + largest_input_term(self._coefficients(row), bounds)
 
     def _common_input(self, x: np.ndarray) -> np.ndarray:
         """Return the inputs that the filter chooses at states, shape (B, m)."""
-        rest = np.clip(0.0, *np.array(self._formulas.problem.box).T)
+        rest = np.clip(0.0, *np.array(self._formulas.problem.input_bounds).T)
         with np.errstate(all="ignore"):
             found = self._formulas.safety_filter.filter(
                 x, np.broadcast_to(rest, (len(x), len(rest)))

@@ -119,7 +119,7 @@ def proved_numbers_of(
     rate: Any = sum(a * u for a, u in zip(row.coefficient, inputs, strict=True)) + row.offset
     numeric = robust.model.numeric
     missed = numeric(sp.sqrt(sp.Max(spread, 0)) - rate)
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     rest = (low + high) / 2.0
 
     def witness(x: np.ndarray) -> np.ndarray:
@@ -321,7 +321,7 @@ def posterior_guarantee(
     def level(x: np.ndarray) -> np.ndarray:
         return barrier(x)[:, 0]
 
-    rest = np.mean(problem.box, axis=1)
+    rest = np.mean(problem.input_bounds, axis=1)
 
     def shortfall_at(x: np.ndarray) -> np.ndarray:
         return np.where(level(x) >= 0.0, decision_at(robust, x, rest).slack[:, 0], -np.inf)
@@ -337,7 +337,7 @@ def posterior_guarantee(
     proved = proved_numbers_of(problem, robust, expression, (highest, missed))
     supremum, shortfall = Extremum(highest, proved.supremum), Extremum(missed, proved.shortfall)
     numbers = {"supremum": supremum, "shortfall": shortfall}
-    bias = rate_bias(posterior, expression, np.array(problem.box), points)
+    bias = rate_bias(posterior, expression, np.array(problem.input_bounds), points)
     remarks = [f"no action meets the robust condition somewhere, {amount(shortfall)}"] * bool(
         missed
     )

@@ -526,7 +526,7 @@ class Formulas:
         self.safety_filter = filter_of_formulas(self.problem, self.conditions, knowledge)
         self.system = self.safety_filter.model
         self._constraints = self.safety_filter.constraints
-        self._low, self._high = np.array(problem.box).T
+        self._low, self._high = np.array(problem.input_bounds).T
         self._rest = np.clip(0.0, self._low, self._high)
         ends = np.cumsum([len(c.chain) for c in self._constraints]).tolist()
         self.stages = tuple(

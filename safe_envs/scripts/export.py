@@ -37,7 +37,7 @@ def export(
             metavar="NAME",
             callback=early_checks.known_filter,
             autocompletion=completion.filters,
-            help="As for evaluate: hocbf:p=2,8, promise:p=0.99, ... By default the env's own.",
+            help="As for evaluate: hocbf:alpha=2,8, promise:p=0.99, ... By default the env's own.",
         ),
     ] = None,
     knowledge: text_options.Knowledge = "model",

@@ -65,7 +65,7 @@ def identify(
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
-    The plant is only stepped, or not at all with --data: then --dt, --substeps, --box and settings
+    The plant is only stepped, or not at all with --data: then --dt, --substeps, --input-bounds and settings
     of what is collected are refused. The truth, with which the estimates are compared at fresh
     states of the sampling domain, is that of the plant, with its --noise.
     """

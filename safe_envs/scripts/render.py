@@ -41,7 +41,7 @@ def render(
             "--filter",
             metavar="NAME",
             callback=early_checks.known_filter,
-            help="As for evaluate: none, scbf, hocbf:p=2,8, ... By default the env's own.",
+            help="As for evaluate: none, scbf, hocbf:alpha=2,8, ... By default the env's own.",
         ),
     ] = None,
     compare: Annotated[
@@ -51,7 +51,7 @@ def render(
             help=(
                 "In place of --filter: several, with commas between, side by side from the same"
                 " start with the same noise: "
-                "none,hocbf:p=2,8,scbf. A comma that no filter's name follows belongs to the filter"
+                "none,hocbf:alpha=2,8,scbf. A comma that no filter's name follows belongs to the filter"
                 " before it."
             ),
         ),

@@ -24,7 +24,7 @@ def verify(
             metavar="NAME",
             callback=early_checks.known_filter,
             autocompletion=completion.filters,
-            help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own.",
+            help="As for evaluate: scbf, hocbf:alpha=2,8, ... By default the env's own.",
         ),
     ] = None,
     knowledge: text_options.Knowledge = "model",

@@ -119,7 +119,7 @@ def braking_backup(
     """
     for system in (problem.plant, problem.model):
         _require_assumptions(problem, system, drag, mass)
-    force = -problem.box[0][0]
+    force = -problem.input_bounds[0][0]
     if force <= 0.0:
         return Backup((BackupLaw("brake", (sp.Integer(0),), sp.Integer(-1)),), _BRAKING_HORIZON)
     most = (force + drag(lead)) / mass
@@ -151,7 +151,7 @@ def _require_assumptions(
     """Raise ConfigurationError where the proof does not hold for the numbers of a system."""
     speed = sp.Dummy("v", nonnegative=True)
     *rising, at_rest = sp.Poly(system.numeric(drag(speed)), speed).all_coeffs()
-    low, high = problem.box[0]
+    low, high = problem.input_bounds[0]
     for fits, what in (
         (float(system.numeric(mass)) > 0.0, "a positive mass"),
         (all(c >= 0.0 for c in rising), "a drag without terms that fall with the speed"),
@@ -219,7 +219,7 @@ def levelling_backup(problem: Any, middle: float, reach: float, tilt: float) -> 
         reach: from there to its ends, in m.
         tilt: largest safe angle, in rad.
     """
-    low, high = max(b[0] for b in problem.box), min(b[1] for b in problem.box)
+    low, high = max(b[0] for b in problem.input_bounds), min(b[1] for b in problem.input_bounds)
     slower = slowed(problem.dt)
     most, most_yaw = (share * (high - low) for share in _SHARES)
 
@@ -288,7 +288,7 @@ def turning_backup(problem: Any, speed: sp.Symbol, radius: float) -> Backup:
     x, y, theta = problem.plant.states
     step = problem.dt / problem.substeps
     laws = []
-    for name, rate in zip(("right", "left"), problem.box[0], strict=True):
+    for name, rate in zip(("right", "left"), problem.input_bounds[0], strict=True):
         side = 1 if name == "left" else -1
         if not 0.0 < side * rate < math.pi / step:
             continue

@@ -86,10 +86,14 @@ class SystemSummary:
                 math.isfinite(level) and level >= 0 for level in levels
             ):
                 raise refused_noise(given.noise, list(self.noise))
-        if given.box is not None:
-            pairs = given.box if isinstance(given.box[0], list) else [given.box] * len(self.inputs)
+        if given.input_bounds is not None:
+            pairs = (
+                given.input_bounds
+                if isinstance(given.input_bounds[0], list)
+                else [given.input_bounds] * len(self.inputs)
+            )
             if len(pairs) != len(self.inputs):
-                raise refused_box(given.box, len(self.inputs))
+                raise refused_box(given.input_bounds, len(self.inputs))
             for name, (low, high) in zip(self.inputs, pairs, strict=True):
                 require_bounds(name, low, high)
         if given.dt is not None:

@@ -78,7 +78,7 @@ def check_condition(
         raise AssertionError(f"derived: {error}") from error
     rng = np.random.default_rng(seed)
     x = _states(problem, samples, rng, seed)
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     u = rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (samples, len(low)))
     constraints = zip(safety_filter.parts, safety_filter.constraints, strict=True)
     for (barrier, one), given in constraints:
@@ -92,7 +92,7 @@ def check_condition(
     for share in (1.0, _TIGHT):
         bounds = np.stack([middle - share * half, middle + share * half])
         tight = SafetyFilter(
-            safety_filter.model, safety_filter.pairs, bounds=bounds.T.tolist(), dt=problem.dt
+            safety_filter.model, safety_filter.pairs, input_bounds=bounds.T.tolist(), dt=problem.dt
         )
         _check_decisions(tight, x, u, *bounds)
 

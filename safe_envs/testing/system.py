@@ -98,7 +98,7 @@ def _check_round_trip(problem: SafetyProblem) -> None:
         "dt": problem.dt,
         "substeps": problem.substeps,
         "horizon": problem.horizon,
-        "box": problem.box,
+        "input_bounds": problem.input_bounds,
         "start": problem.start,
         **({"noise": [levels[name] for name in problem.noise]} if problem.noise else {}),
     }
@@ -142,7 +142,7 @@ def _require_within(problem: SafetyProblem, env: SafeEnv, found: tuple[Any, ...]
         terminated or env.observation_space.contains(observation),
         f"the observation {observation} at {env.components} is outside {env.observation_space}",
     )
-    for u, (low, high) in zip(env.executed, problem.box, strict=True):
+    for u, (low, high) in zip(env.executed, problem.input_bounds, strict=True):
         _require("bounds", low <= u <= high, f"the input {u} is outside [{low}, {high}]")
 
 

@@ -88,7 +88,7 @@ class ExecutedInputs:
         if policy not in POLICIES:
             raise ConfigurationError(f"policy = {policy!r}; allowed: {', '.join(POLICIES)}")
         require_one_input(problem)
-        self._low, self._high = map(float, problem.box[0])
+        self._low, self._high = map(float, problem.input_bounds[0])
         states = problem.plant.states
         self._law = self._features = self._constraint = None
         law, features, constraint = [], [], []

@@ -292,7 +292,7 @@ class _Pairs:
         return np.array([functions[list(p)].prod(axis=0) @ weights for p in self._products])
 
     def _inputs(self) -> Iterator[tuple[float, ...]]:
-        box = np.array(self._problem.box).T
+        box = np.array(self._problem.input_bounds).T
         for share in (0.5, 0.0, 1.0):
             yield tuple((box[0] + share * (box[1] - box[0])).tolist())
         yield tuple(self._random.uniform(*box).tolist())

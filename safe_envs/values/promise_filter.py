@@ -250,7 +250,17 @@ _COARSE = 8
 _TINY = 1e-300
 """A distance that can divide."""
 
-_OF_CHAIN = ("plant", "model", "barriers", "states", "box", "goal", "dt", "substeps", "steps")
+_OF_CHAIN = (
+    "plant",
+    "model",
+    "barriers",
+    "states",
+    "input_bounds",
+    "goal",
+    "dt",
+    "substeps",
+    "steps",
+)
 
 
 class PromiseChoice(NamedTuple):
@@ -311,7 +321,7 @@ class PromiseFilter:
             )
         self.settings, self.problem, self.look_ahead = settings, problem, look_ahead
         self.text = settings.text
-        self._low, self._high = np.array(problem.box, dtype=float).T
+        self._low, self._high = np.array(problem.input_bounds, dtype=float).T
         self._barriers: Any = compile_function(
             problem.plant.states,
             [problem.plant.numeric(barrier.expression) for barrier in problem.barriers],

@@ -75,7 +75,7 @@ def promise_program(promise_filter: PromiseFilter, most_bytes: int) -> PromisePr
             " promise of staying safe"
         )
     parts = ahead.parts
-    if len(promise_filter.problem.box) > _MOST_INPUTS:
+    if len(promise_filter.problem.input_bounds) > _MOST_INPUTS:
         raise NotCompilableError(
             f"{promise_filter.problem.name} has more than {_MOST_INPUTS} inputs, for which a"
             " promise has no form in C"
@@ -133,7 +133,7 @@ class _Writer:
             layout.AT_WEIGHTS: parts.step.noise.weights,
             layout.AT_SCANNED_INPUTS: self._ahead.inputs.ravel(),
             layout.AT_COARSE_INPUTS: coarse.ravel(),
-            layout.AT_BOUNDS: np.array(self._filter.problem.box).ravel(),
+            layout.AT_BOUNDS: np.array(self._filter.problem.input_bounds).ravel(),
         }
         numbers = {
             layout.AT_COORDINATES: self._n,

@@ -642,7 +642,7 @@ def reduced(
         outside=chain.outside,
         steps=problem.steps,
         substeps=problem.substeps,
-        box=problem.box,
+        box=problem.input_bounds,
         specification=specification,
         automaton=automaton,
         regions=chain.regions,

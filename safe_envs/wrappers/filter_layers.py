@@ -130,7 +130,7 @@ class DelayMemory(EpisodeFilter):
     ) -> None:
         super().__init__(safety_filter)
         self._prediction = Prediction(safety_filter.model, problem.dt, problem.substeps)
-        rest = resting_input(problem.box)
+        rest = resting_input(problem.input_bounds)
         self._one, self._batch = DelayLine(delay, rest), DelayLine(delay, rest, num_envs)
 
     def begin(self, x: Sequence[Any], envs: np.ndarray | None = None, instants: Any = 0) -> None:
@@ -329,7 +329,7 @@ def input_bounds(space: Any, inner: Any) -> np.ndarray:
     """
     if isinstance(inner, MonitorLayer):
         return _line(space, inner, 2)[1].T.copy()
-    return np.array(inner.problem.box, dtype=np.float64)
+    return np.array(inner.problem.input_bounds, dtype=np.float64)
 
 
 def _line(space: Any, inner: MonitorLayer, points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -405,7 +405,7 @@ class FilterLayer(IndependentCopies):
             inner.viewer.caption = text
         self._inner = inner
         # Inputs that pass through an env's numbers are rounded, by float32 at worst.
-        self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
+        self._tolerance = [1e-6 * (high - low) for low, high in problem.input_bounds]
         return text
 
     def know_bounds(
@@ -574,8 +574,8 @@ def third_party_spec(
 def rest_info(problem: SafetyProblem) -> Info:
     """Return what a filter reports at reset."""
     return filter_info(
-        nominal_action=np.array(resting_input(problem.box)),
-        safe_action=np.array(resting_input(problem.box)),
+        nominal_action=np.array(resting_input(problem.input_bounds)),
+        safe_action=np.array(resting_input(problem.input_bounds)),
         intervention=False,
         filter_active=False,
         feasible=True,

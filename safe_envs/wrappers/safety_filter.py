@@ -43,8 +43,8 @@ class SafetyFilterWrapper(
 
     Args:
         env: one of this project's envs, possibly wrapped; or any env with a Box action space.
-        condition: a `Condition` for every barrier, one for each, or their text, like "scbf",
-            "hocbf:p=2,8" or "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's. Or
+        filter: a `Condition` for every barrier, one for each, or their text, like "scbf",
+            "hocbf:alpha=2,8" or "hocbf:alpha=2,8+cbf:alpha=1"; without parameters it takes the env's. Or
             the promise filter, like "promise:p=0.99".
         knowledge: "model" (what the designer believes) or "plant" (the true system).
         objective: "nearest" to the policy's action; or "clf" for the joint QP with the env's
@@ -72,7 +72,7 @@ class SafetyFilterWrapper(
     def __init__(
         self,
         env: gym.Env[np.ndarray, np.ndarray],
-        condition: FilterChoice,
+        filter: FilterChoice,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -86,14 +86,12 @@ class SafetyFilterWrapper(
         if estimator is not None:
             env = StateEstimatorWrapper(env, estimator, "measurement", knowledge)
         inner = state_layer(env, (SafeEnv, SafetyMonitor, StateEstimatorWrapper), vector=False)
-        text = self.attach(
-            inner, condition, knowledge, objective, priorities, observe_promise, delay
-        )
+        text = self.attach(inner, filter, knowledge, objective, priorities, observe_promise, delay)
         self.watch_states(inner.episode)
         # The monitor records the view: an env that is made again from its spec has one already.
         gym.utils.RecordConstructorArgs.__init__(
             self,
-            condition=text,
+            filter=text,
             knowledge=knowledge,
             objective=objective,
             priorities=priorities,
@@ -192,7 +190,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        condition: FilterChoice,
+        filter: FilterChoice,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -209,7 +207,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         kinds = (SafeVectorEnv, SafetyMonitorVector, StateEstimatorVectorWrapper)
         inner = state_layer(env, kinds, vector=True)
         self.attach(
-            inner, condition, knowledge, objective, priorities, observe_promise, delay, env.num_envs
+            inner, filter, knowledge, objective, priorities, observe_promise, delay, env.num_envs
         )
         self.watch_states(inner.episodes)
         gym.vector.VectorWrapper.__init__(self, env)

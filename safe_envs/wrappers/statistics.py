@@ -306,7 +306,7 @@ def make_vec_with_cost(
         env = gym.make_vec(name, num_envs, native, autoreset_mode=mode.value, **options)
         return CostReturnWrapper(env if filter is None else SafetyFilterVectorWrapper(env, filter))
     around: list[Callable[..., Any]] = (
-        [] if filter is None else [partial(SafetyFilterWrapper, condition=filter)]
+        [] if filter is None else [partial(SafetyFilterWrapper, filter=filter)]
     )
     return CostReturnWrapper(
         gym.make_vec(

@@ -273,7 +273,7 @@ def test_pages_have_no_colours_of_terminals(
 
 def test_wide_commands_and_outputs_fit_a_page(hook: Any):
     runs = hook("runs")
-    options = " ".join(f"--filter hocbf:p={k}" for k in range(8))
+    options = " ".join(f"--filter hocbf:alpha={k}" for k in range(8))
     page = f"```console run fails\n$ safe-envs evaluate safe_envs/Nothing-v0 {options}\n```\n"
     shown = runs.with_output(page)
     command = shown.split("```")[1].removeprefix("console\n$ ")

@@ -10,7 +10,7 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs import ControlAffineSDE, RelativeDegreeError, state_problem
+from safe_envs import ControlAffineSDE, RelativeDegreeError, define_problem
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.lie import relative_degree, vanishes
@@ -102,9 +102,9 @@ def test_noise_in_a_part_of_the_workspace_reaches_a_barrier():
         sp.Piecewise((0, x < 50), (sigma, True)),
         sigma * sp.Heaviside(-x - 1),
     ):
-        bridge = BrownianBridge(state_problem(noisy(diffusion), [5 - x, 5 - y], **start))
+        bridge = BrownianBridge(define_problem(noisy(diffusion), [5 - x, 5 - y], **start))
         assert bridge.reached == (True, False)
-    bridge = BrownianBridge(state_problem(noisy(sp.Max(x - 2, 0)), 5 - x, **start))
+    bridge = BrownianBridge(define_problem(noisy(sp.Max(x - 2, 0)), 5 - x, **start))
     states, ends = (np.array([1.0, 3.0]), np.zeros(2)), np.array([[0.2], [0.2]])
     # With h = 0.2 at both ends and E = 1 the smallest h is (0.4 - sqrt(2 s^2 dt))/2, s = max(x - 2,
     # 0).

@@ -17,7 +17,7 @@ from safe_envs import (
     ControlAffineSDE,
     SystemDefinitionError,
     SystemDefinitionWarning,
-    state_problem,
+    define_problem,
 )
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.dynamics.symbols import TIME
@@ -224,7 +224,7 @@ def test_signals_and_parameters_are_dicts(make, name):
 )
 def test_an_env_simulates_what_moves(system, barrier, message):
     with pytest.raises(SystemDefinitionError, match=message):
-        state_problem(system, barrier, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)
+        define_problem(system, barrier, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)
 
 
 def test_sums_and_products_over_an_index_are_written_out():
@@ -244,7 +244,7 @@ def test_sums_and_products_over_an_index_are_written_out():
             Barrier(1 - sp.Sum(x**i, wrong))
     system = ControlAffineSDE.from_rate((x,), (u,), [u])
     made, other = (
-        SafetyFilter(system, 2 - h, "cbf:alpha=1", bounds=(-1, 1)).filter([0.4], [1.0])
+        SafetyFilter(system, 2 - h, "cbf:alpha=1", input_bounds=(-1, 1)).filter([0.4], [1.0])
         for h in (total, written)
     )
     np.testing.assert_allclose(made.action, other.action, atol=1e-15)

@@ -65,7 +65,7 @@ def random_rows(rng, k, size, kind):
 def filter_of(k, m, bounds, priorities=None) -> SafetyFilter:
     """A filter whose states are, for each constraint, a, b, and the entries of its form."""
     system, pairs = system_of(k, m, (m + 1) * (m + 2) // 2)
-    return SafetyFilter(system, pairs, bounds=bounds, priorities=priorities)
+    return SafetyFilter(system, pairs, input_bounds=bounds, priorities=priorities)
 
 
 def states_of(a, b, q) -> np.ndarray:

@@ -13,7 +13,7 @@ import sympy as sp
 from gymnasium.utils.env_checker import check_env
 
 import safe_envs
-from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
+from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, define_problem
 from safe_envs.envs.registered import Custom
 from safe_envs.plugins import load_object
 from safe_envs.problem.factory import load_system
@@ -22,14 +22,14 @@ from safe_envs.systems import CUSTOM_ID
 
 STATEMENT = """
 import sympy as sp
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 
 x, u, s = sp.symbols("x u s", real=True)
 
 def problem(*, edge: float = 1.0):
     system = ControlAffineSDE((x,), (u,), [x], [1], [s], {s: 0.1})
     given = dict(box=(-5, 5), start=[(-0.5, 0.5)], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
-    return state_problem(system, SIGN * (edge - x), **given)
+    return define_problem(system, SIGN * (edge - x), **given)
 
 ready = problem()
 number = 3
@@ -47,8 +47,14 @@ def place(folder: Path, name: str = "problem", statement: str = STATEMENT) -> st
 def stated_here(*, edge: float = 1.0) -> SafetyProblem:
     x, u = sp.symbols("x u", real=True)
     system = safe_envs.ControlAffineSDE((x,), (u,), [x], [1], [0])
-    return state_problem(
-        system, edge - x, box=(-5, 5), start=[0.2], dt=0.05, horizon=1.0, workspace={x: (-5, 5)}
+    return define_problem(
+        system,
+        edge - x,
+        input_bounds=(-5, 5),
+        start=[0.2],
+        dt=0.05,
+        horizon=1.0,
+        workspace={x: (-5, 5)},
     )
 
 

@@ -38,7 +38,7 @@ def test_no_delay_is_the_env_without_the_option():
 
 
 def test_the_resting_input_is_within_the_bounds_nearest_to_zero():
-    env = SafeEnv(problem_of(PENDULUM, box=(1.0, 4.0), delay=2))
+    env = SafeEnv(problem_of(PENDULUM, input_bounds=(1.0, 4.0), delay=2))
     _, info = env.reset(seed=0)
     assert (info["sent_action"], info["executed_action"]) == ([1.0], [1.0])
     executed = [env.step([1.0])[4]["executed_action"].item() for _ in range(4)]
@@ -50,7 +50,7 @@ def test_inputs_and_rates_stay_within_their_bounds(num_envs):
     """And go as far as the rate allows."""
     problem = problem_of(PENDULUM, delay=2, slew_limit=(-30.0, 70.0))
     env = SafeEnv(problem) if num_envs is None else SafeVectorEnv(problem, num_envs)
-    (low, high), rng = problem.box[0], np.random.default_rng(0)
+    (low, high), rng = problem.input_bounds[0], np.random.default_rng(0)
     down, up = -30.0 * problem.dt, 70.0 * problem.dt
     for seed in range(5):
         env.reset(seed=seed)

@@ -129,7 +129,7 @@ def test_the_plant_moves_and_the_model_does_not():
 
 
 def test_actions_are_scaled_to_the_box_and_clipped():
-    env = gym.make(SCALAR, box=[-2.0, 6.0], noise=0.0).unwrapped
+    env = gym.make(SCALAR, input_bounds=[-2.0, 6.0], noise=0.0).unwrapped
     for action, physical in ((-1.0, -2.0), (0.5, 4.0), (9.0, 6.0), (-1e200, -2.0)):
         assert env.physical_action(np.array([action])) == [physical]
     np.testing.assert_allclose(env.normalized_action(env.physical_action(np.array([0.3]))), [0.3])
@@ -171,8 +171,11 @@ def test_actions_that_are_none_are_errors(action):
         ({"horizon": 0.01}, "horizon = 0.01"),
         ({"substeps": 0}, "substeps = 0"),
         ({"substeps": 1.5}, "substeps = 1.5"),
-        *(({"box": box}, "box of input omega") for box in ([1, 1], [-math.inf, math.inf], [2, 1])),
-        ({"box": [[0.0, 1.0], [0.0, 1.0]]}, "box = "),
+        *(
+            ({"input_bounds": box}, "box of input omega")
+            for box in ([1, 1], [-math.inf, math.inf], [2, 1])
+        ),
+        ({"input_bounds": [[0.0, 1.0], [0.0, 1.0]]}, "box = "),
         ({"start": [0.0, 0.0]}, "start has 2"),
         ({"start": 0.5}, "start has 1"),
         ({"start": [0.0, math.nan, 0.0]}, "start of y"),

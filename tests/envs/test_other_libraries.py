@@ -52,7 +52,7 @@ def filtered_batch(env_id: str, **unknown):
 
 def filter_alone(env_id: str, **unknown):
     problem = problem_of(env_id)
-    return SafetyFilter(problem.model, problem.barriers, "cbf", problem.box, **unknown)
+    return SafetyFilter(problem.model, problem.barriers, "cbf", problem.input_bounds, **unknown)
 
 
 @pytest.mark.parametrize(

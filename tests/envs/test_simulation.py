@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, NumericalError, SafeEnv, SafeVectorEnv, state_problem
+from safe_envs import ControlAffineSDE, NumericalError, SafeEnv, SafeVectorEnv, define_problem
 from safe_envs.dynamics.noise import NOISE, StreamReader, key_of, standard_normals
 from safe_envs.problem.signals import Feature
 
@@ -37,8 +37,14 @@ def act(env, action):
 def walker(**changes):
     """x' = u, which moves by exactly .5 in a step of the largest action."""
     system = ControlAffineSDE((x,), (u,), [0], [1], [0])
-    numbers: dict[str, Any] = {"box": (-1, 1), "start": [0.5], "dt": 0.5, "horizon": 2.0, **changes}
-    return state_problem(system, 1 - x, **numbers)
+    numbers: dict[str, Any] = {
+        "input_bounds": (-1, 1),
+        "start": [0.5],
+        "dt": 0.5,
+        "horizon": 2.0,
+        **changes,
+    }
+    return define_problem(system, 1 - x, **numbers)
 
 
 @both
@@ -78,7 +84,7 @@ def test_actions_beyond_the_box_are_clipped_to_it(make):
         (7.0, -5.0, -4.0),
         (1.0 + 1e-9, 0.0, 1.0),
     ):
-        env = make(walker(box=(low, high), horizon=5.0))
+        env = make(walker(input_bounds=(low, high), horizon=5.0))
         env.reset(seed=0)
         act(env, action)
         bound = high if action > 0 else low
@@ -91,8 +97,14 @@ def swinging(noise: float, substeps: int):
     system = ControlAffineSDE(
         (x, v), (u,), [v, -30 * sp.sin(x)], [0, 1 + x**2], [[noise * v, noise], [noise, noise * x]]
     )
-    return state_problem(
-        system, 9 - x, box=(-2, 2), start=[0.4, -0.3], dt=0.2, horizon=2.0, substeps=substeps
+    return define_problem(
+        system,
+        9 - x,
+        input_bounds=(-2, 2),
+        start=[0.4, -0.3],
+        dt=0.2,
+        horizon=2.0,
+        substeps=substeps,
     )
 
 
@@ -143,7 +155,9 @@ def test_envs_take_the_substeps_of_their_problem_with_noise(make, substeps):
 def forgetful():
     """x + dt x' is 0, without x in it, and v + dt v' the input alone."""
     system = ControlAffineSDE((x, v), (u,), [-4 * x, -4 * v], [0, 4], [0, sp.Float(1e-30)])
-    return state_problem(system, 9 - v, box=(-2, 2), start=[0.4, -0.3], dt=0.25, horizon=2.0)
+    return define_problem(
+        system, 9 - v, input_bounds=(-2, 2), start=[0.4, -0.3], dt=0.25, horizon=2.0
+    )
 
 
 @both
@@ -163,13 +177,13 @@ def diverging(**changes):
     """x' = u beside v' = v^3, which is infinite after .5 s."""
     system = ControlAffineSDE((x, v), (u,), [0, v**3], [1, 0], [0, 0])
     numbers: dict[str, Any] = {
-        "box": (-1, 1),
+        "input_bounds": (-1, 1),
         "start": [0.0, 1.0],
         "dt": 0.25,
         "horizon": 100.0,
         **changes,
     }
-    return state_problem(system, 1000 - x, **numbers)
+    return define_problem(system, 1000 - x, **numbers)
 
 
 @both

@@ -56,7 +56,7 @@ def cart(**options: Any) -> SafetyFilter:
         signals={p: rate, rate: 0, mass: 0},
     )
     barriers = [p - x, 4 + TIME / 10 - x]
-    return SafetyFilter(system, barriers, "hocbf:p=2,8", **{"bounds": (-5, 5), **options})
+    return SafetyFilter(system, barriers, "hocbf:alpha=2,8", **{"bounds": (-5, 5), **options})
 
 
 def run_selftest(directory: Path, *flags: str, compiler: Sequence[str] = COMPILER or ()) -> str:
@@ -96,7 +96,7 @@ def test_what_a_filter_may_have(name: str, tmp_path: Path) -> None:
 @NEEDS_COMPILER
 @pytest.mark.parametrize("bounds", [(-5, 5), (-5, math.inf)])
 def test_signals_parameters_time_and_bounds_at_run_time(bounds: Any, tmp_path: Path) -> None:
-    safety_filter = cart(adjustable=["drag"], bounds=bounds)
+    safety_filter = cart(adjustable=["drag"], input_bounds=bounds)
     interface = export_filter(safety_filter, tmp_path)
     assert [q.name for q in interface.runtime] == ["p", "rate", "mass", "drag", "t"]
     assert_equal(compare(tmp_path, safety_filter, states=3000))
@@ -110,10 +110,10 @@ def test_signals_parameters_time_and_bounds_at_run_time(bounds: Any, tmp_path: P
 def test_files_state_the_whole_filter(tmp_path: Path) -> None:
     system = ControlAffineSDE.from_rate((x, y), (u,), [y, u - y], signals={p: 0})
     barriers = [Barrier(sp.Float(0.1) - x + sp.Abs(p), "wall"), Barrier(4 - y, "speed | limit")]
-    conditions = "hocbf:p=2,8:sampling_margin=0.5+cbf:alpha=3"
+    conditions = "hocbf:alpha=2,8:sampling_margin=0.5+cbf:alpha=3"
     goal = CLF(x**2 + y**2, rate=1.0)
     export_filter(SafetyFilter(system, barriers, conditions, (-5, 5), clf=goal), tmp_path)
-    title = "hocbf:p=2.0,8.0:sampling_margin=0.5 for wall; cbf:alpha=3.0 for speed | limit"
+    title = "hocbf:alpha=2.0,8.0:sampling_margin=0.5 for wall; cbf:alpha=3.0 for speed | limit"
     for name in ("filter.h", "filter.c"):
         head = " ".join((tmp_path / name).read_text().split("*/")[0].split())
         for line in (f"{title};", "goal V = x**2 + y**2", "* wall = -x + Abs(p) + 0.1 *"):

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, SafetyProblem, define_problem
 from safe_envs.errors import NotCompilableError
 from safe_envs.export import ExportOptions, PromiseComparison, compare_promise, export_promise
 from safe_envs.values.look_ahead import LookAhead
@@ -31,10 +31,10 @@ def planar(noise: float = 0.2) -> SafetyProblem:
         diffusion=[[s * (1 + y**2)], [0]],
         parameters={s: noise},
     )
-    return state_problem(
+    return define_problem(
         system,
         1 - x**2 - y**2,
-        box=[(-1.0, 1.0), (-0.5, 0.75)],
+        input_bounds=[(-1.0, 1.0), (-0.5, 0.75)],
         start=(0.1, 0.2),
         dt=0.1,
         horizon=0.6,

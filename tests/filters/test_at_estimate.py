@@ -101,9 +101,9 @@ def test_a_belief_without_uncertainty_is_the_true_state(env, condition):
     assert known.pairs[0][1].belief == 0.1
     nothing = dict.fromkeys([s.name for s in known.qp.runtime], 0.0)
     for state in problem.starts[problem.start].proposals(5):
-        proposed = np.array([0.9 * high for _, high in problem.box])
+        proposed = np.array([0.9 * high for _, high in problem.input_bounds])
         one, two = plain.filter(state, proposed), known.filter(state, proposed, parameters=nothing)
-        scale = max(high - low for low, high in problem.box)
+        scale = max(high - low for low, high in problem.input_bounds)
         np.testing.assert_allclose(two.action, one.action, atol=1e-5 * scale)
         np.testing.assert_allclose(two.barrier, one.barrier, rtol=1e-5, atol=1e-6)
 
@@ -137,9 +137,9 @@ def test_bounded_errors_are_met_at_every_state_within_them():
     )
     eps, region = (0.05, 0.03), [(-1.5, 1.5), (-1.5, 1.5)]
     for h in (1 - x**2 - y**2, 1 - y - x * y / 2):
-        plain = SafetyFilter(system, h, CBF(2.0), bounds=(-50, 50))
+        plain = SafetyFilter(system, h, CBF(2.0), input_bounds=(-50, 50))
         known = SafetyFilter(
-            system, h, CBF(2.0, measurement_error=eps), bounds=(-50, 50), region=region
+            system, h, CBF(2.0, measurement_error=eps), input_bounds=(-50, 50), region=region
         )
         met = 0
         for _ in range(60):
@@ -159,7 +159,7 @@ def test_one_input_loses_nothing_where_the_constraint_is_affine():
     # a u + b with b = -2 x and a = -1: the worst x is at a corner.
     system = ControlAffineSDE.from_rate((x,), (u,), [x + u])
     known = SafetyFilter(
-        system, 1 - x, CBF(1.0, measurement_error=0.1), bounds=(-9, 9), region=[(-2, 2)]
+        system, 1 - x, CBF(1.0, measurement_error=0.1), input_bounds=(-9, 9), region=[(-2, 2)]
     )
     decision = known.filter(np.array([0.5]), np.array([5.0]))
     # -(x + u) + (1 - x) >= 0 at x = .6
@@ -172,7 +172,7 @@ def test_the_errors_of_all_states_add_up():
         PLANE,
         1 - x - 2 * y,
         CBF(1.0, measurement_error=(0.1, 0.2)),
-        bounds=(-9, 9),
+        input_bounds=(-9, 9),
         region=[(-1, 1), (-1, 1)],
     )
     decision = known.filter(np.array([0.2, 0.1]), np.array([5.0]))
@@ -180,8 +180,10 @@ def test_the_errors_of_all_states_add_up():
 
 
 def test_no_error_is_the_plain_constraint():
-    found = SafetyFilter(LINE, 1 - x, SCBF(measurement_error=0.0), bounds=(-9, 9), region=[(-2, 2)])
-    plain = SafetyFilter(LINE, 1 - x, SCBF(), bounds=(-9, 9))
+    found = SafetyFilter(
+        LINE, 1 - x, SCBF(measurement_error=0.0), input_bounds=(-9, 9), region=[(-2, 2)]
+    )
+    plain = SafetyFilter(LINE, 1 - x, SCBF(), input_bounds=(-9, 9))
     state, proposed = np.array([0.4]), np.array([3.0])
     assert found.filter(state, proposed).action == pytest.approx(
         plain.filter(state, proposed).action
@@ -203,7 +205,7 @@ def test_a_bounded_error_keeps_a_vehicle_that_certainty_equivalence_loses():
     problem = make_problem("DubinsDisk-v0", model={"v": 0.8}, dt=0.005, horizon=6.0, start="valid")
     eps = 0.03
     lowest = []
-    for text in ("hocbf:p=2,4", f"hocbf:p=2,4:measurement_error={eps},{eps},0"):
+    for text in ("hocbf:alpha=2,4", f"hocbf:alpha=2,4:measurement_error={eps},{eps},0"):
         safety_filter, env = SafetyFilter.for_problem(problem, text), SafeEnv(problem)
         env.reset(seed=0)
         h = []
@@ -221,7 +223,11 @@ def test_a_bounded_error_keeps_a_vehicle_that_certainty_equivalence_loses():
 
 @pytest.mark.parametrize(
     "text",
-    ["scbf:belief=0.05", "hocbf:p=2.0,8.0:belief=0.1", "cbf:alpha=1.0:measurement_error=0.1,0.2"],
+    [
+        "scbf:belief=0.05",
+        "hocbf:alpha=2.0,8.0:belief=0.1",
+        "cbf:alpha=1.0:measurement_error=0.1,0.2",
+    ],
 )
 def test_texts_come_back(text):
     condition = parse_condition(text, (1.0, 1.0))
@@ -236,14 +242,16 @@ def test_texts_come_back(text):
         (lambda: SCBF(belief="much"), "probability"),
         (lambda: SCBF(measurement_error=-1.0), "number >= 0"),
         (lambda: SCBF(belief=0.1, measurement_error=0.1), "give one"),
-        (lambda: SafetyFilter(LINE, 1 - x, SCBF(belief=0.1), bounds=(-1, 1)), "instants="),
+        (lambda: SafetyFilter(LINE, 1 - x, SCBF(belief=0.1), input_bounds=(-1, 1)), "instants="),
         (
-            lambda: SafetyFilter(LINE, 1 - x**2, CBF(1.0, measurement_error=0.1), bounds=(-1, 1)),
+            lambda: SafetyFilter(
+                LINE, 1 - x**2, CBF(1.0, measurement_error=0.1), input_bounds=(-1, 1)
+            ),
             "region=",
         ),
         (
             lambda: SafetyFilter(
-                LINE, 1 - x, CBF(1.0, measurement_error=(0.1, 0.2)), bounds=(-1, 1)
+                LINE, 1 - x, CBF(1.0, measurement_error=(0.1, 0.2)), input_bounds=(-1, 1)
             ),
             "one for each of the 1 states",
         ),
@@ -253,7 +261,7 @@ def test_texts_come_back(text):
                 replace(LINE, signals={y: 0}),
                 1 - (x - y) ** 2,
                 CBF(1.0, measurement_error=0.1),
-                bounds=(-1, 1),
+                input_bounds=(-1, 1),
                 region=[(-1, 1)],
             ),
             "changes with x depends on y, whose values come in at each call",

@@ -19,7 +19,7 @@ from safe_envs import (
     NumericalError,
     SafeEnv,
     SafeVectorEnv,
-    state_problem,
+    define_problem,
 )
 from safe_envs.agents import evaluate
 from safe_envs.agents.rare_events.estimate import estimate_rare
@@ -41,11 +41,11 @@ LOST, KEPT, EDGE = [1.3, 0.2], [-1.0, 0.3], [1.0, 0.4]
 
 def stop(h=None, **changes):
     """A vehicle before a wall at p = 1, whose barrier is the speed that it may have there."""
-    return state_problem(
+    return define_problem(
         ControlAffineSDE.from_rate((p, v), (a,), [v, a], diffusion=[0, sp.Rational(1, 20)]),
         sp.sqrt(2 * (1 - p)) - v if h is None else h,
         **{
-            "box": (-1.0, 1.0),
+            "input_bounds": (-1.0, 1.0),
             "start": [(-1.0, 1.3), (0.0, 1.5)],
             "dt": 0.1,
             "horizon": 1.0,
@@ -111,7 +111,7 @@ def test_a_filter_executes_the_clipped_proposal_and_is_not_feasible(condition, h
 def test_the_other_barriers_are_kept():
     system = ControlAffineSDE.from_rate((p, v), (a,), [v, a])
     barriers = [Barrier(sp.log(1 - p), "wall"), Barrier(2 - v, "speed")]
-    safety_filter = SafetyFilter(system, barriers, ["hocbf:p=1,1", "cbf"], (-9, 9))
+    safety_filter = SafetyFilter(system, barriers, ["hocbf:alpha=1,1", "cbf"], (-9, 9))
     for state, proposal in (([1.5, 1.5], [5.0]), ([[1.5, 1.5]], [[5.0]])):
         found = safety_filter.filter(state, proposal)
         assert np.ravel(found.action) == pytest.approx([0.5])
@@ -123,13 +123,13 @@ def test_an_error_names_the_barrier_and_the_state():
     system = ControlAffineSDE.from_rate((p, v), (a,), [v, a])
     pole = ControlAffineSDE((p, v), (a,), [v, 1 / p], [0, 1], [0, 0])
     barriers = [Barrier(4 - v, "speed"), Barrier(9 - p, "place")]
-    safety_filter = SafetyFilter(pole, barriers, ["cbf", "hocbf:p=1,1"], (-9, 9))
+    safety_filter = SafetyFilter(pole, barriers, ["cbf", "hocbf:alpha=1,1"], (-9, 9))
     for state in ([0.0, 1.0], [[1.0, 1.0], [0.0, 1.0]]):
         with pytest.raises(NumericalError) as error:
             safety_filter.filter(state, np.zeros((*np.shape(state)[:-1], 1)))
         assert "on speed, place has no finite value at p = 0, v = 1" in str(error.value)
     overflowing = SafetyFilter(
-        system, [barriers[0], Barrier(9 - p**3 / 1e9, "cube")], ["cbf", "hocbf:p=1,1"], (-9, 9)
+        system, [barriers[0], Barrier(9 - p**3 / 1e9, "cube")], ["cbf", "hocbf:alpha=1,1"], (-9, 9)
     )
     with pytest.raises(NumericalError, match=r"on cube has no finite value at p = 1e\+120"):
         overflowing.filter([1e120, 0.0], [0.0])

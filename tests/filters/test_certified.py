@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE, state_problem
+from safe_envs import Barrier, ControlAffineSDE, define_problem
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError
@@ -87,10 +87,10 @@ def correlated():
         [[1, x_2], [0, 2]],
         [[0.3, 0.2 * x_1], [0.1, -0.4]],
     )
-    return state_problem(
+    return define_problem(
         system,
         1 - x_1**2,
-        box=(-5.0, 5.0),
+        input_bounds=(-5.0, 5.0),
         start=(0.0, 0.0),
         dt=0.01,
         horizon=1.0,
@@ -242,7 +242,7 @@ def test_several_barriers_get_the_same_constraint():
     safety_filter = SafetyFilter.for_problem(both, condition)
     first, second = safety_filter.constraints
     assert (second.coefficient, second.offset) == (first.coefficient, first.offset)
-    alone = SafetyFilter(both.model, [(both.barriers[0], condition)], bounds=both.box)
+    alone = SafetyFilter(both.model, [(both.barriers[0], condition)], input_bounds=both.box)
     x, u = states_of(DISK, 40, reach=0.3), np.random.default_rng(1).uniform(-15.0, 15.0, (40, 1))
     found, expected = safety_filter.filter(x, u), alone.filter(x, u)
     np.testing.assert_array_equal(found.feasible, expected.feasible)
@@ -322,7 +322,7 @@ def test_a_torch_layer_refuses_it():
     [
         ({"noise": 0.3}, "the noise"),
         ({"plant": {"a": 0.61}, "model": {"a": 0.61}}, "the drift"),
-        ({"box": (-9.0, 10.0)}, "the bounds of u"),
+        ({"input_bounds": (-9.0, 10.0)}, "the bounds of u"),
         ({"barrier": {"radius": 1.1}}, "the workspace of x_1, the workspace of x_2, the barriers"),
     ],
 )
@@ -349,7 +349,9 @@ def test_a_certificate_of_the_plant_needs_a_filter_that_knows_it():
 def test_a_barrier_that_it_is_not_of_is_refused():
     with pytest.raises(ConfigurationError, match="not of the barrier"):
         SafetyFilter(
-            DISK.model, [(Barrier(2 - x_1), Certified(certificate_of(DISK, H)))], bounds=DISK.box
+            DISK.model,
+            [(Barrier(2 - x_1), Certified(certificate_of(DISK, H)))],
+            input_bounds=DISK.input_bounds,
         )
 
 

@@ -195,9 +195,9 @@ def test_any_text_is_a_filter_or_refused(text):
         ("x" * 10**5, "unknown filter"),
         ("cbf:" + "x" * 10**5, "no parameter"),
         ("+".join(["cbf"] * 10**4), "has 10000 conditions"),
-        ("hocbf:p=" + ",".join(["1"] * 10**4), "p takes at most 12 values; 10000 were given"),
+        ("hocbf:alpha=" + ",".join(["1"] * 10**4), "p takes at most 12 values; 10000 were given"),
         ("ecbf:k=" + ",".join(f"1e{300 - 50 * i}" for i in range(12)), "poles"),
-        ("szcbf:alphas=1_0", "alphas = 1_0; give positive numbers"),
+        ("szcbf:alpha=1_0", "alphas = 1_0; give positive numbers"),
         ("cbf:sampling_margin=٣", "sampling_margin = '٣'"),
         ("ecbf:poles=-1_0", "poles"),
         ("ddscbf:file=" + "x" * 300, "cannot be read: File name too long"),
@@ -218,7 +218,7 @@ def test_texts_are_never_run(tmp_path):
         "ecbf:poles={}",
         "ecbf:k={}",
         "cbf:alpha={}",
-        "hocbf:p={}",
+        "hocbf:alpha={}",
         "rcbf:gamma={}",
         "rcbf:form={}",
         "scbf:sampling_margin={}",
@@ -236,7 +236,7 @@ def test_several_barriers_take_one_text_or_one_each():
     same = parse_conditions("scbf", problem)
     assert same == (SCBF(),) * 3
     assert spec_of(same) == "scbf"
-    each = parse_conditions("hocbf:p=1,2+ecbf:poles=-1,-2+hocbf:p=s+s**3,2", problem)
+    each = parse_conditions("hocbf:alpha=1,2+ecbf:poles=-1,-2+hocbf:alpha=s+s**3,2", problem)
     assert [c.name for c in each] == ["hocbf", "ecbf", "hocbf"]
     assert parse_conditions(spec_of(each), problem) == each
     by_gains = parse_conditions("hocbf", problem)
@@ -254,11 +254,11 @@ def test_several_barriers_take_one_text_or_one_each():
         "cbf:alpha=0.3",
         "cbf:alpha=2*s**3",
         "ecbf:k=2.0,3.0",
-        "hocbf:p=2.0,8.0",
-        "hocbf:p=2.0,tanh(s)",
+        "hocbf:alpha=2.0,8.0",
+        "hocbf:alpha=2.0,tanh(s)",
         "rcbf:gamma=0.5:form=log",
         "srcbf:gamma=0.1:form=inverse",
-        "szcbf:alphas=1.0,0.5",
+        "szcbf:alpha=1.0,0.5",
         "scbf",
         "scbf:sampling_margin=first-order",
         "cbf:alpha=1.0:sampling_margin=0.25",
@@ -284,14 +284,14 @@ def test_parameters_default_to_the_gains():
     [
         ("scfb", "scfb"),
         ("hocbf:q=1", "'q'"),
-        ("hocbf:p=1,x", "'x'"),
-        ("hocbf:p=", "expression of s"),
-        ("hocbf:p=1,-2", "positive"),
-        ("hocbf:p=nan", "positive"),
+        ("hocbf:alpha=1,x", "'x'"),
+        ("hocbf:alpha=", "expression of s"),
+        ("hocbf:alpha=1,-2", "positive"),
+        ("hocbf:alpha=nan", "positive"),
         ("cbf:alpha=1,2", "alpha"),
         ("scbf:alpha=1", "alpha"),
-        ("hocbf:p=2,8:p=3,3", "'p'"),
-        ("szcbf:alphas=s", "alphas = s"),
+        ("hocbf:alpha=2,8:p=3,3", "'p'"),
+        ("szcbf:alpha=s", "alphas = s"),
         ("srcbf:gamma=0", "gamma = 0.0"),
         ("rcbf:form=exp", "exp"),
         (

@@ -161,7 +161,7 @@ def test_several_barriers_take_conditions_of_files_as_well(tmp_path, monkeypatch
     monkeypatch.chdir(folder)
     limits = problem_of("safe_envs/QuadrotorLimits-v0")
     for text in (
-        "my_filter.py:Alike:alpha=s+s**3+hocbf:p=1,2+my_filter.py:Eager",
+        "my_filter.py:Alike:alpha=s+s**3+hocbf:alpha=1,2+my_filter.py:Eager",
         f"hocbf+{folder}/my_filter.py:Alike+{folder}/my_filter.py:Eager:powers=1,3",
     ):
         conditions = parse_conditions(text, limits)

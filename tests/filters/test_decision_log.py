@@ -33,7 +33,7 @@ def safety_filter():
     """Two integrators below walls at x = 1 and y = 2, in a room where |x| stays below 3."""
     plane = ControlAffineSDE((x, y), (u, w), [0, 0], [[1, 0], [0, 1]], [0, 0])
     walls = [Barrier(1 - x, "wall"), Barrier(2 - y, "wall"), Barrier(9 - x**2, "room")]
-    return SafetyFilter(plane, walls, CBF(2.0), bounds=(-3.0, 3.0))
+    return SafetyFilter(plane, walls, CBF(2.0), input_bounds=(-3.0, 3.0))
 
 
 @pytest.fixture
@@ -196,8 +196,8 @@ def test_what_is_added_later_changes_nothing_before(log, safety_filter):
 
 def test_bounds_of_a_period(log, safety_filter):
     decision = safety_filter.filter(np.zeros(2), np.zeros(2))
-    log.add(0.3, [0.0, 0.0], decision, bounds=[(-1.0, 1.0), (-2.0, 0.5)])
-    log.add(0.4, (0.0, 0.0), decision, bounds=(-1.0, 4.0))
+    log.add(0.3, [0.0, 0.0], decision, input_bounds=[(-1.0, 1.0), (-2.0, 0.5)])
+    log.add(0.4, (0.0, 0.0), decision, input_bounds=(-1.0, 4.0))
     np.testing.assert_array_equal(log.section("low")[3:], [[-1.0, -2.0], [-1.0, -1.0]])
     np.testing.assert_array_equal(log.section("high")[3:], [[1.0, 0.5], [4.0, 4.0]])
 
@@ -206,7 +206,7 @@ def test_what_comes_in_at_run_time():
     p, m = sp.symbols("p m", real=True)
     system = ControlAffineSDE((x,), (u,), [0], [m], [0], {m: 2.0}, {p: 0})
     safety_filter = SafetyFilter(
-        system, [p - x + TIME], "cbf:alpha=1", bounds=(-np.inf, 3.0), adjustable=("m",)
+        system, [p - x + TIME], "cbf:alpha=1", input_bounds=(-np.inf, 3.0), adjustable=("m",)
     )
     log = DecisionLog.for_filter(safety_filter, {p: "m"})
     for t, parameters in ((0.0, {"p": 1.0}), (0.5, {p: 0.5, "m": 4.0})):

@@ -71,7 +71,7 @@ def test_decisions_on_the_way_of_a_filtered_quadrotor() -> None:
     env: Any = SafetyFilterVectorWrapper(gym.make_vec(env_id, num_envs=10, noise=0.1), "hocbf")
     env.reset(seed=0)
     rng, states, inputs = np.random.default_rng(0), [], []
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     for _ in range(40):
         actions = np.clip(rng.normal(0.1, 0.7, env.action_space.shape), -1.0, 1.0)
         states.append(np.array(env.unwrapped.state))

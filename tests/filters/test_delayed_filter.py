@@ -29,7 +29,7 @@ REST = (0.0, 0.5)
 
 
 def plain_filter(model=LINEAR):
-    return SafetyFilter(model, [(Barrier(1 - x**2), HOCBF((2.0, 4.0)))], bounds=BOX)
+    return SafetyFilter(model, [(Barrier(1 - x**2), HOCBF((2.0, 4.0)))], input_bounds=BOX)
 
 
 def proposals(steps=60):
@@ -102,7 +102,9 @@ def test_signals_parameters_and_the_time_are_predicted_with_their_rates():
         (x, y), (u,), [y, 0], [0, 1 / mass], [0, 0], {mass: 1.0}, signals={p: q, q: 0}
     )
     wall = p - x - sp.sin(TIME) / 5
-    prompt = SafetyFilter(cart, wall, "hocbf:p=2,8", bounds=(-5.0, 5.0), adjustable=("mass",))
+    prompt = SafetyFilter(
+        cart, wall, "hocbf:alpha=2,8", input_bounds=(-5.0, 5.0), adjustable=("mass",)
+    )
     late = DelayedFilter(prompt, 3, DT)
     many = DelayedFilter(prompt, 3, DT)
     heavy = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1 / mass], [0, 0], {mass: 2.0})
@@ -113,14 +115,14 @@ def test_signals_parameters_and_the_time_are_predicted_with_their_rates():
         if k >= 3:
             # What was decided three periods ago is what would be decided now.
             given = {"p": 1.0 - 0.3 * t, "q": -0.3, "mass": 2.0}
-            now = prompt.filter(state, [2.0], bounds=(-4.0, 3.0), parameters=given, t=t)
+            now = prompt.filter(state, [2.0], input_bounds=(-4.0, 3.0), parameters=given, t=t)
             np.testing.assert_allclose(due.pop(0), now.action, rtol=1e-9, atol=1e-9)
             binding += bool(now.active.any())
         given = {p: 1.0 - 0.3 * t, q: -0.3, mass: 2.0}
-        decision = late.filter(state, [2.0], bounds=(-4.0, 3.0), parameters=given, t=t)
+        decision = late.filter(state, [2.0], input_bounds=(-4.0, 3.0), parameters=given, t=t)
         batch = {key: np.full(2, value) for key, value in given.items()}
         both = many.filter(
-            np.tile(state, (2, 1)), [[2.0]] * 2, bounds=(-4.0, 3.0), parameters=batch, t=t
+            np.tile(state, (2, 1)), [[2.0]] * 2, input_bounds=(-4.0, 3.0), parameters=batch, t=t
         )
         np.testing.assert_allclose(both.action, [decision.action] * 2, rtol=1e-12, atol=1e-12)
         due.append(decision.action)

@@ -45,11 +45,11 @@ def conditions_of(barriers: Any, conditions: Any, noise: float = 0.0) -> list[An
 
 def test_barriers_and_conditions_come_in_every_form():
     two = HOCBF((2.0, 8.0))
-    assert conditions_of(H, "hocbf:p=2,8") == [two]
+    assert conditions_of(H, "hocbf:alpha=2,8") == [two]
     assert conditions_of(Barrier(H), two) == [two]
     assert conditions_of([H, H], two) == [two, two]
-    assert conditions_of((H, 1 - v), "hocbf:p=2,8+cbf:alpha=3") == [two, CBF(3.0)]
-    assert conditions_of([H, 1 - v], ["hocbf:p=2,8", CBF(3.0)]) == [two, CBF(3.0)]
+    assert conditions_of((H, 1 - v), "hocbf:alpha=2,8+cbf:alpha=3") == [two, CBF(3.0)]
+    assert conditions_of([H, 1 - v], ["hocbf:alpha=2,8", CBF(3.0)]) == [two, CBF(3.0)]
     assert conditions_of([(H, two), (Barrier(1 - v), "cbf:alpha=3")], None) == [two, CBF(3.0)]
     assert conditions_of((H, two), None) == [two]
 
@@ -122,10 +122,10 @@ ENDLESS = (-math.inf, 1.0)
             {"barriers": [(H, HOCBF())], "conditions": [(-5, 5)]},
             "bounds=",
         ),
-        ({"box": (-5, 5)}, "'box'"),
+        ({"input_bounds": (-5, 5)}, "'box'"),
         ({"weight": [1.0]}, "'weights'"),
         ({"conditions": "hocbff"}, "did you mean 'hocbf'"),
-        ({"conditions": "hocbf:p=1,2,3"}, "degree 2"),
+        ({"conditions": "hocbf:alpha=1,2,3"}, "degree 2"),
         ({"conditions": "hocbf+hocbf"}, "2 conditions"),
         ({"conditions": "promise"}, "promise"),
         ({"conditions": "certified"}, "SafetyFilter.for_problem"),

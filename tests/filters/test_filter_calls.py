@@ -78,11 +78,13 @@ BARRIERS = ((x - p) ** 2 + y**2 - 1 + 0.1 * TIME, 3 - x - 0.2 * p)
 def test_decisions_are_those_of_a_system_where_what_is_given_stands(conditions, settings):
     barriers = BARRIERS if isinstance(conditions, tuple) else BARRIERS[:1]
     moving = SafetyFilter(chased(), barriers, conditions, (-2, 2), adjustable=("gain",), **settings)
-    batch = moving.filter(STATES, PROPOSALS, bounds=BOUNDS, parameters=MOVING, t=NOW)
+    batch = moving.filter(STATES, PROPOSALS, input_bounds=BOUNDS, parameters=MOVING, t=NOW)
     clock = {TIME: sp.Symbol("clock", real=True)}
     for i in range(0, 30, 3):
         values = {key: array[i] for key, array in MOVING.items()}
-        one = moving.filter(STATES[i], PROPOSALS[i], bounds=BOUNDS[i], parameters=values, t=NOW[i])
+        one = moving.filter(
+            STATES[i], PROPOSALS[i], input_bounds=BOUNDS[i], parameters=values, t=NOW[i]
+        )
         there = SafetyFilter(
             fixed(i), [h.subs(clock) for h in barriers], conditions, BOUNDS[i], **settings
         )
@@ -109,15 +111,15 @@ def test_bounds_at_a_call_are_those_of_an_uncertain_constraint(m):
     h = [1 - x, x + 3] if m == 1 else [1 - x - y**2, x + y + 3]
     given = SafetyFilter(system, h, condition, (-9, 9))
     limits = BOUNDS[:, :m]
-    batch = given.filter(STATES, PROPOSALS[:, :m], bounds=limits)
+    batch = given.filter(STATES, PROPOSALS[:, :m], input_bounds=limits)
     for i in range(0, 30, 3):
         made = SafetyFilter(system, h, condition, limits[i])
         expected = made.filter(STATES[i], PROPOSALS[i, :m])
-        one = given.filter(STATES[i], PROPOSALS[i, :m], bounds=limits[i])
+        one = given.filter(STATES[i], PROPOSALS[i, :m], input_bounds=limits[i])
         np.testing.assert_allclose(one.action, expected.action, atol=1e-12)
         np.testing.assert_allclose(batch.action[i], expected.action, atol=1e-9)
         assert one.feasible == batch.feasible[i] == expected.feasible
-    held = given.filter(STATES[0], PROPOSALS[0, :m], bounds=(0.25, 0.25))
+    held = given.filter(STATES[0], PROPOSALS[0, :m], input_bounds=(0.25, 0.25))
     assert held.action.tolist() == [0.25] * m
 
 
@@ -141,7 +143,7 @@ def test_a_filter_for_a_problem_takes_its_models_parameters():
         problem.model.with_parameters(**{name: 1.3 * value}),
         problem.barriers,
         HOCBF(problem.gains_of(0)),
-        problem.box,
+        problem.input_bounds,
     )
     states = np.random.default_rng(0).normal(size=(20, problem.model.n))
     inputs = np.random.default_rng(1).normal(size=(20, problem.model.m))
@@ -161,11 +163,11 @@ def test_the_shape_of_bounds():
         ([(-1, 1), (-1, 2)], [1.0, 2.0]),
         (np.array([[-1, 1], [-1, math.inf]]), [1.0, 8.0]),
     ):
-        assert (plain.filter(states, proposals, bounds=bounds).action == expected).all()
-        assert plain.filter(states[0, 0], [8, 8], bounds=bounds).action.tolist() == expected
+        assert (plain.filter(states, proposals, input_bounds=bounds).action == expected).all()
+        assert plain.filter(states[0, 0], [8, 8], input_bounds=bounds).action.tolist() == expected
     each = np.zeros((2, 3, 2, 2))
     each[..., 1] = np.arange(12.0).reshape(2, 3, 2)
-    found = plain.filter(states, proposals, bounds=each).action
+    found = plain.filter(states, proposals, input_bounds=each).action
     np.testing.assert_array_equal(found, np.minimum(each[..., 1], 8.0))
 
 
@@ -221,7 +223,7 @@ def test_arrays_have_the_shape_of_the_batch():
         with pytest.raises(InvalidInputError, match=r"an array \(2, 3\), one for each state"):
             moving.filter(states, states, parameters={"p": values, "q": 0.0}, t=0.0)
     with pytest.raises(InvalidInputError, match=r"\(2, 3, 2, 2\) for each state"):
-        moving.filter(states, states, bounds=np.zeros((6, 2, 2)), parameters=POINT, t=0.0)
+        moving.filter(states, states, input_bounds=np.zeros((6, 2, 2)), parameters=POINT, t=0.0)
     found = moving.filter(states, states, parameters={"p": np.zeros((2, 3)), "q": 0}, t=1.0)
     assert found.action.shape == (2, 3, 2)
 
@@ -229,7 +231,7 @@ def test_arrays_have_the_shape_of_the_batch():
 def test_bounds_are_finite_where_the_filter_may_go_to_their_ends():
     goal = SafetyFilter(chased(), 1 - x, "cbf", (-2, 2), clf=CLF(x**2))
     with pytest.raises(ConfigurationError, match="needs finite ones"):
-        goal.filter([0, 0], [0, 0], bounds=(-math.inf, 1), parameters=POINT)
+        goal.filter([0, 0], [0, 0], input_bounds=(-math.inf, 1), parameters=POINT)
 
 
 def test_constraints_without_a_value_are_told_with_what_was_given():

@@ -177,7 +177,7 @@ def test_states_beyond_the_squares_of_floats_are_errors_that_name_them(size):
 def test_a_barrier_that_overflows_where_its_row_does_not_is_an_error():
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE((x,), (u,), [0], [1 / x], [0])
-    safety_filter = SafetyFilter(system, [(Barrier(x**2), SCBF())], bounds=[(-1.0, 1.0)])
+    safety_filter = SafetyFilter(system, [(Barrier(x**2), SCBF())], input_bounds=[(-1.0, 1.0)])
     for state in ([1e160], [[1.0], [1e160]]):
         with pytest.raises(
             NumericalError, match=r"the barrier on .* has no finite value at x = 1e\+160"
@@ -189,7 +189,7 @@ def test_what_overflows_on_the_way_to_a_number_is_that_number_for_one_state_too(
     # Plain floats raise at exp(800); its inverse is 0.
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE((x,), (u,), [1 / (1 + sp.exp(x))], [1], [0])
-    safety_filter = SafetyFilter(system, [(Barrier(x), CBF(1.0))], bounds=[(-1.0, 1.0)])
+    safety_filter = SafetyFilter(system, [(Barrier(x), CBF(1.0))], input_bounds=[(-1.0, 1.0)])
     one, batch = safety_filter.filter([800.0], [0.5]), safety_filter.filter([[800.0]], [[0.5]])
     assert one.barrier.tolist() == batch.barrier[0].tolist() == [800.0]
     assert (one.action.tolist(), one.feasible) == ([0.5], True)
@@ -200,7 +200,7 @@ def test_a_root_of_a_negative_number_is_not_safe_and_not_complex():
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE((x,), (u,), [0], [1], [0])
     safety_filter = SafetyFilter(
-        system, [(Barrier((x + 1) ** sp.Rational(4, 3)), CBF(1.0))], bounds=[(-1.0, 1.0)]
+        system, [(Barrier((x + 1) ** sp.Rational(4, 3)), CBF(1.0))], input_bounds=[(-1.0, 1.0)]
     )
     for state in ([-2.0], [[-2.0]]):
         found = safety_filter.filter(state, np.zeros_like(state))
@@ -213,6 +213,8 @@ def test_two_conditions_without_meaning_and_gains_that_nearly_cancel():
     x, y, u, w = sp.symbols("x y u w", real=True)
     system = ControlAffineSDE((x, y), (u, w), [0, 0], [[1, 0], [0, 1]], [0, 0])
     rows = [(Barrier(x - 5), RCBF()), (Barrier(-x - 5 + sp.Float(1e-160) * y), RCBF())]
-    found = SafetyFilter(system, rows, bounds=[(-3.0, 3.0)] * 2).filter([0.0, 0.0], [1.0, 0.5])
+    found = SafetyFilter(system, rows, input_bounds=[(-3.0, 3.0)] * 2).filter(
+        [0.0, 0.0], [1.0, 0.5]
+    )
     assert np.isfinite(found.action).all()
     assert not found.feasible

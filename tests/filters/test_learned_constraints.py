@@ -56,7 +56,7 @@ EARLY = {"sampling_margin": "first-order"}
         (
             "disk",
             "residual",
-            lambda m: LearnedHOCBF(m, p=(1.0, 2.0), **EARLY),
+            lambda m: LearnedHOCBF(m, alpha=(1.0, 2.0), **EARLY),
             ConfigurationError,
             "first order",
         ),
@@ -65,7 +65,7 @@ EARLY = {"sampling_margin": "first-order"}
             (
                 "disk",
                 "residual",
-                lambda m, p=p: LearnedHOCBF(m, p=p),
+                lambda m, p=p: LearnedHOCBF(m, alpha=p),
                 RelativeDegreeError,
                 f"{len(p)} given",
             )
@@ -144,7 +144,7 @@ def test_what_does_not_suit_a_learned_model_is_refused(
 
 def test_barriers_that_nothing_was_learned_for_are_refused(disk, residual, top, network):
     for problem, condition in (
-        (disk, LearnedHOCBF(residual, p=(1.0, 2.0))),
+        (disk, LearnedHOCBF(residual, alpha=(1.0, 2.0))),
         (top, DDSCBF(network)),
     ):
         with pytest.raises(ConfigurationError, match="smaller"):
@@ -166,21 +166,23 @@ def test_barriers_that_nothing_was_learned_for_are_refused(disk, residual, top, 
 def test_exact_residuals_make_the_filter_of_the_plant(name):
     problem = problem_of(f"safe_envs/{name}-v0")
     rates = problem.gains_of(0)
-    ours = SafetyFilter.for_problem(problem, LearnedHOCBF(residual_of(problem), p=rates, eps=0.0))
+    ours = SafetyFilter.for_problem(
+        problem, LearnedHOCBF(residual_of(problem), alpha=rates, eps=0.0)
+    )
     assert_same_decisions(problem, ours, SafetyFilter.for_problem(problem, HOCBF(rates), "plant"))
     if name != "DubinsObstacle":
         other = SafetyFilter.for_problem(problem, HOCBF(rates))
         x, u = situations(problem, 300)
         assert (
             abs(ours.filter(x, u).action - other.filter(x, u).action)
-            > 1e-3 * np.ptp(problem.box, axis=1)
+            > 1e-3 * np.ptp(problem.input_bounds, axis=1)
         ).any()
 
 
 def test_the_margin_is_what_the_errors_can_do_to_one_input(disk):
     x, u = situations(disk, 2000)
     for errors, eps in (([0.1, 0.3, 0.5], None), ([0.2, 0.2, 0.2], 0.2)):
-        condition = LearnedHOCBF(residual_of(disk, errors), p=disk.gains_of(0), eps=eps)
+        condition = LearnedHOCBF(residual_of(disk, errors), alpha=disk.gains_of(0), eps=eps)
         found = SafetyFilter.for_problem(disk, condition).filter(x, u)
         assert found.feasible.mean() > 0.1
         # For one input nothing is given away.
@@ -194,7 +196,7 @@ def test_the_margin_is_what_the_errors_can_do_to_one_input(disk):
 def test_the_margin_covers_what_the_errors_can_do_to_several_inputs(rotors):
     x, u = situations(rotors, 1000)
     errors = [0.05, 0.2, 1e-6, 2e-6, 3e-6, 1e-6]
-    condition = LearnedHOCBF(residual_of(rotors, errors), p=rotors.gains_of(0))
+    condition = LearnedHOCBF(residual_of(rotors, errors), alpha=rotors.gains_of(0))
     found = SafetyFilter.for_problem(rotors, condition).filter(x, u)
     worst = worst_row(rotors, x, found.action, errors)
     size = abs(worst).max()
@@ -203,11 +205,11 @@ def test_the_margin_covers_what_the_errors_can_do_to_several_inputs(rotors):
     assert worst[found.feasible].min() >= -1e-12 * size
     # sqrt(m) |(e_j u_j)| is at most sqrt(m) times, and the plane above it at the far corner no more
     # than, sum e_j |u_j|.
-    reach = np.array(errors[2:]) @ np.array(rotors.box)[:, 1]
+    reach = np.array(errors[2:]) @ np.array(rotors.input_bounds)[:, 1]
     assert (found.margin[:, 0] <= worst + 1e-12 * size).all()
     assert (found.margin[:, 0] >= worst - 2.0 * reach - 1e-12 * size).all()
     plain = SafetyFilter.for_problem(
-        rotors, LearnedHOCBF(residual_of(rotors, errors), p=rotors.gains_of(0), eps=0.0)
+        rotors, LearnedHOCBF(residual_of(rotors, errors), alpha=rotors.gains_of(0), eps=0.0)
     ).filter(x, u)
     assert worst_row(rotors, x, plain.action, errors)[plain.feasible].min() < -1e-3
 
@@ -215,7 +217,7 @@ def test_the_margin_covers_what_the_errors_can_do_to_several_inputs(rotors):
 def test_the_level_chooses_the_quantile_of_the_held_out_errors(disk, residual):
     rows = []
     for level in (0.05, 0.95):
-        condition = LearnedHOCBF(residual, p=disk.gains_of(0), level=level)
+        condition = LearnedHOCBF(residual, alpha=disk.gains_of(0), level=level)
         rows.append(condition.constraint(disk.model, disk.barriers[0]))
         q: Any = rows[-1].uncertainty
         assert [float(e) for e in q] == pytest.approx(
@@ -226,7 +228,7 @@ def test_the_level_chooses_the_quantile_of_the_held_out_errors(disk, residual):
     assert float(rows[0].offset - rows[1].offset) == pytest.approx(
         (p_1 + p_2) * (high - low)[0] + (high - low)[1]
     )
-    exact = LearnedHOCBF(residual, p=disk.gains_of(0), eps=0.0).constraint(
+    exact = LearnedHOCBF(residual, alpha=disk.gains_of(0), eps=0.0).constraint(
         disk.model, disk.barriers[0]
     )
     assert exact.uncertainty is None
@@ -267,7 +269,10 @@ def test_the_direct_way_is_the_learned_noise(gap, diffusion, margin):
             else DDSCBF(diffusion, margin=margin)
         )
         known = SafetyFilter(
-            found, [(gap.barriers[0], SCBF(sampling_margin=sampled))], bounds=gap.box, dt=gap.dt
+            found,
+            [(gap.barriers[0], SCBF(sampling_margin=sampled))],
+            input_bounds=gap.input_bounds,
+            dt=gap.dt,
         )
         assert_same_decisions(gap, SafetyFilter.for_problem(gap, ours), known, tolerance=1e-12)
 
@@ -300,7 +305,7 @@ def with_two_barriers(disk):
 def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
     both = with_two_barriers(disk)
     learned, plain = (
-        LearnedHOCBF(residual_of(both, errors), p=both.gains_of(0)),
+        LearnedHOCBF(residual_of(both, errors), alpha=both.gains_of(0)),
         HOCBF(both.gains_of(1)),
     )
     x, u = situations(both, 40)
@@ -369,7 +374,9 @@ def test_a_goal_stands_beside_a_learned_row():
 def test_a_network_without_a_value_is_told_with_the_state(disk, which, eps):
     exact = residual_of(disk)
     undefined = replace(exact, parts=(Undefined(exact.parts[0], which, 0.4),))
-    safety_filter = SafetyFilter.for_problem(disk, LearnedHOCBF(undefined, p=(1.0, 2.0), eps=eps))
+    safety_filter = SafetyFilter.for_problem(
+        disk, LearnedHOCBF(undefined, alpha=(1.0, 2.0), eps=eps)
+    )
     x, u = np.array([[0.3, 0.1, 0.2], [0.41, 0.1, 0.2], [0.2, 0.1, 0.2]]), np.zeros((3, 1))
     for state in (x[0], x[2]):
         assert np.isfinite(safety_filter.filter(state, u[0]).action).all()
@@ -407,7 +414,7 @@ def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name)
         known = SafetyFilter(
             learned.system,
             [(problem.barriers[0], SCBF(sampling_margin=margin))],
-            bounds=problem.box,
+            input_bounds=problem.input_bounds,
         )
         assert_same_decisions(problem, ours, known, tolerance=1e-12)
     if name == "cubic":
@@ -417,7 +424,7 @@ def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name)
         known = SafetyFilter(
             learned.system,
             [(problem.barriers[0], SCBF(sampling_margin="first-order"))],
-            bounds=problem.box,
+            input_bounds=problem.input_bounds,
             dt=problem.dt,
         )
         assert_same_decisions(problem, ours, known, tolerance=1e-12)
@@ -499,7 +506,7 @@ def test_the_robust_row_is_mean_less_deviations(cubic, posterior, which):
         np.testing.assert_allclose(found.margin[:, 0], expected, atol=1e-6)
         assert found.feasible.any()
         assert found.active.any()
-        for tried in np.linspace(*problem.box[0], 21):
+        for tried in np.linspace(*problem.input_bounds[0], 21):
             row = robust_row(posterior, law, barrier, x, np.full_like(u, tried), z) + rest
             # Nothing in the box meets or misses it by less where it cannot be met, or is met and
             # nearer where it can.

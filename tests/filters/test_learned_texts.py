@@ -45,8 +45,8 @@ def kept(request, tmp_path):
         "residual": lambda: (
             of("disk"),
             of("residual"),
-            lambda m: LearnedHOCBF(m, p=(1.0, 2.0), eps=0.0),
-            "learned-hocbf:file={}:p=1,2:eps=0",
+            lambda m: LearnedHOCBF(m, alpha=(1.0, 2.0), eps=0.0),
+            "learned-hocbf:file={}:alpha=1,2:eps=0",
         ),
         "network": lambda: (
             of("top"),
@@ -140,8 +140,8 @@ def test_what_was_learned_of_another_system_is_refused(
     believed = problem_of("safe_envs/DubinsDisk-v0", model={"v": 0.4})
     moved = replace(disk, barriers=(Barrier(disk.barriers[0].expression - 1, "smaller"),))
     for problem, condition, message in (
-        (believed, LearnedHOCBF(residual, p=(1.0, 2.0)), "model"),
-        (moved, LearnedHOCBF(residual, p=(1.0, 2.0)), "learned for the barriers"),
+        (believed, LearnedHOCBF(residual, alpha=(1.0, 2.0)), "model"),
+        (moved, LearnedHOCBF(residual, alpha=(1.0, 2.0)), "learned for the barriers"),
         (gap, DDSCBF(network), "Pendulum"),
         (top, BayesianSCBF(posterior), "CubicSDEDisk"),
         (cubic, DDSCBF(posterior), "ddscbf.*bayesian"),
@@ -152,7 +152,7 @@ def test_what_was_learned_of_another_system_is_refused(
 
 
 def test_what_corrects_the_model_starts_from_it_whatever_is_known(disk, residual, cubic, posterior):
-    condition = LearnedHOCBF(residual, p=(1.0, 2.0))
+    condition = LearnedHOCBF(residual, alpha=(1.0, 2.0))
     known = [
         SafetyFilter.for_problem(disk, condition, knowledge) for knowledge in ("model", "plant")
     ]

@@ -34,7 +34,7 @@ def test_a_loop_decides_as_the_wrapper_of_an_env_does(text, batch):
             np.stack(inner.measured.received, -1), np.stack(inner.measured.values, -1), np.nan
         )
         decision = safety_filter.filter_measurement(y[rows], proposed[rows])
-        *_, info = env.step(proposed / problem.box[0][1])
+        *_, info = env.step(proposed / problem.input_bounds[0][1])
         np.testing.assert_allclose(decision.action, info["safe_action"][rows], atol=1e-6)
         assert np.all(decision.feasible == info["feasible"][rows])
     session = safety_filter.measured
@@ -152,12 +152,13 @@ def follower(**changed):
 
 
 @pytest.mark.parametrize("batch", [False, True])
-@pytest.mark.parametrize("condition", ["hocbf:p=1,2", "szcbf:alphas=2,2"])
+@pytest.mark.parametrize("condition", ["hocbf:alpha=1,2", "szcbf:alpha=2,2"])
 def test_what_moves_is_part_of_barriers_at_an_estimate(condition, batch):
     car, estimator = follower()
     h = (LEAD - X) ** 2 - 1 - TIME / 10
     measured, exact = (
-        SafetyFilter(car, h, condition, bounds=(-90, 90), estimator=e) for e in (estimator, None)
+        SafetyFilter(car, h, condition, input_bounds=(-90, 90), estimator=e)
+        for e in (estimator, None)
     )
     for k in range(4):
         given = {"parameters": {"lead": 2.0 + k, "lead_speed": -1.0, "belief_gust": 0.3}, "t": k}
@@ -204,12 +205,16 @@ def test_parameters_of_the_prediction_are_not_adjustable():
     car, estimator = follower()
     given = {"bounds": (-9, 9), "estimator": estimator, "adjustable": ("mass",)}
     with pytest.raises(ConfigurationError, match="mass"):
-        SafetyFilter(car, LEAD - X, "hocbf:p=1,2", **given)
+        SafetyFilter(car, LEAD - X, "hocbf:alpha=1,2", **given)
     weighed = replace(car, parameters={}, signals={**car.signals, MASS: 0})
     with pytest.raises(ConfigurationError, match="mass"):
-        SafetyFilter(weighed, LEAD - X, "hocbf:p=1,2", bounds=(-9, 9), estimator=estimator)
+        SafetyFilter(
+            weighed, LEAD - X, "hocbf:alpha=1,2", input_bounds=(-9, 9), estimator=estimator
+        )
     car, estimator = follower(rate=[V, U])
-    found = SafetyFilter(car, LEAD - X - MASS, "hocbf:p=1,2", **{**given, "estimator": estimator})
+    found = SafetyFilter(
+        car, LEAD - X - MASS, "hocbf:alpha=1,2", **{**given, "estimator": estimator}
+    )
     runtime = {"lead": 2.0, "lead_speed": -1.0, "belief_gust": 0.0, "mass": 0.5}
     decision = found.filter_measurement([0.2], [0.0], parameters=runtime)
     assert decision.barrier[0] == pytest.approx(2.0 - 0.5 - found.measured.mean[0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, SafeEnv, state_problem
+from safe_envs import ControlAffineSDE, SafeEnv, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.proofs.posterior import guarantee_of
@@ -33,7 +33,7 @@ def disk(center: float) -> sp.Expr:
 
 KEPT: dict[str, Any] = {
     "ridge": sp.Min(1 - x - y, 1 - x + y),
-    "box": 1 - sp.Max(x, y),
+    "input_bounds": 1 - sp.Max(x, y),
     "wedge": 1 - x - sp.Abs(y),
     "strip": 1 - sp.Abs(x),
     "diamond": 1 - sp.Abs(x) - sp.Abs(y) / 2,
@@ -112,7 +112,7 @@ def test_one_function_of_a_maximum_is_enough():
 
 def test_pieces_of_relative_degree_two():
     for h, pieces in ((1 - sp.Abs(x), 2), (sp.Min(1 - x, x + 1, 5), 2), (disk(0.0).subs(y, 0), 1)):
-        safety_filter = SafetyFilter(CART, h, "hocbf:p=2,2", (-5, 5))
+        safety_filter = SafetyFilter(CART, h, "hocbf:alpha=2,2", (-5, 5))
         assert len(safety_filter.constraints) == pieces
         state, least = np.array([0.0, 0.5]), np.inf
         for _ in range(800):
@@ -125,7 +125,7 @@ def test_pieces_of_relative_degree_two():
 def test_pieces_that_meet_smoothly_keep_their_chain_across_the_edge():
     """The second derivative of h jumps where x = 0, which states only pass."""
     h = 1 - x - sp.Max(x, 0) ** 2
-    safety_filter = SafetyFilter(CART, h, "hocbf:p=2,2", (-5, 5))
+    safety_filter = SafetyFilter(CART, h, "hocbf:alpha=2,2", (-5, 5))
     first_of_chain = sp.lambdify((x, v), safety_filter.constraints[0].chain[1])
     for dt in (0.01, 0.001):
         state, least = np.array([-0.3, 0.0]), np.inf
@@ -140,10 +140,10 @@ def test_pieces_that_meet_smoothly_keep_their_chain_across_the_edge():
 
 @pytest.mark.parametrize("engine", ["numpy", pytest.param("compiled", marks=pytest.mark.oracle)])
 def test_envs_report_a_barrier_that_is_a_minimum_as_one(engine):
-    problem = state_problem(
+    problem = define_problem(
         PLANE,
         [1 - x - sp.Abs(y), 2 + x],
-        box=BOUNDS,
+        input_bounds=BOUNDS,
         start=[(-0.2, 0.2), (-0.2, 0.2)],
         dt=0.05,
         horizon=2.0,
@@ -166,13 +166,13 @@ def test_envs_report_a_barrier_that_is_a_minimum_as_one(engine):
 
 
 def test_bounds_are_those_of_the_pieces():
-    numbers: dict[str, Any] = {"box": BOUNDS, "start": [(0, 0.5), (0, 0.5)], "dt": 0.1}
+    numbers: dict[str, Any] = {"input_bounds": BOUNDS, "start": [(0, 0.5), (0, 0.5)], "dt": 0.1}
     numbers |= {"horizon": 2.0, "nominal": [3, 3], "workspace": {x: (-3, 3), y: (-3, 3)}}
     (row,) = evaluate(
-        state_problem(PLANE, 1 - sp.Max(x, y), **numbers), filters=["cbf:alpha=2"], episodes=20
+        define_problem(PLANE, 1 - sp.Max(x, y), **numbers), filters=["cbf:alpha=2"], episodes=20
     ).rows
     assert (row.safety_rate, row.continuous_bound, row.continuous_word) == (1.0, 1.0, "proved")
-    problem = state_problem(PLANE, sp.Max(1 - x, 1 - y), **numbers)
+    problem = define_problem(PLANE, sp.Max(1 - x, 1 - y), **numbers)
     (row,) = evaluate(problem, filters=["cbf:alpha=2"], episodes=20).rows
     assert (row.safety_rate, row.continuous_bound) == (1.0, None)
     assert "h is a maximum" in row.continuous_note
@@ -183,7 +183,7 @@ def test_the_bound_of_a_minimum_under_noise_is_that_of_the_list():
     system = ControlAffineSDE((x,), (u,), [0], [1], [0.3])
     found = []
     for h in (1 - sp.Abs(x), [1 - x, 1 + x]):
-        problem = state_problem(system, h, box=(-3, 3), start=[0.0], dt=0.05, horizon=0.5)
-        bound = guarantee_of(problem, parse_conditions("szcbf:alphas=1", problem))
+        problem = define_problem(system, h, input_bounds=(-3, 3), start=[0.0], dt=0.05, horizon=0.5)
+        bound = guarantee_of(problem, parse_conditions("szcbf:alpha=1", problem))
         found.append((bound.note, bound.at(np.array([[0.0], [0.3]]), 0.5).tolist()))
     assert found[0] == found[1]

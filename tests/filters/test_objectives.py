@@ -35,11 +35,11 @@ EACH = [(), (1,)]
 
 
 def on_line(*rows, half=9.0, **more):
-    return SafetyFilter(LINE, list(rows), bounds=[(-half, half)], **more)
+    return SafetyFilter(LINE, list(rows), input_bounds=[(-half, half)], **more)
 
 
 def on_plane(*rows, half=9.0, **more):
-    return SafetyFilter(PLANE, list(rows), bounds=[(-half, half)] * 2, **more)
+    return SafetyFilter(PLANE, list(rows), input_bounds=[(-half, half)] * 2, **more)
 
 
 def decided(safety_filter, state, nominal):
@@ -76,7 +76,7 @@ def test_change_of_a_row_is_its_slope_along_the_held_input(name):
     rng = np.random.default_rng(0)
     for _ in range(5):
         state = rng.uniform(0.1, 0.9, model.n).tolist()
-        held = [rng.uniform(low, high) for low, high in problem.box]
+        held = [rng.uniform(low, high) for low, high in problem.input_bounds]
 
         def value(at, held=held):
             *a, b = row(*at)
@@ -97,12 +97,12 @@ def test_a_stochastic_condition_takes_the_generator_of_its_row():
 @pytest.mark.parametrize(
     ("env_id", "filters", "bound", "policy"),
     [
-        ("safe_envs/DubinsDisk-v0", "hocbf:p=30,30", 20.0, "nominal"),
+        ("safe_envs/DubinsDisk-v0", "hocbf:alpha=30,30", 20.0, "nominal"),
         pytest.param(
-            "safe_envs/DubinsDisk-v0", "hocbf:p=20,20", 20.0, "zero", marks=pytest.mark.oracle
+            "safe_envs/DubinsDisk-v0", "hocbf:alpha=20,20", 20.0, "zero", marks=pytest.mark.oracle
         ),
-        ("safe_envs/DubinsObstacle-v0", "hocbf:p=12,12", 20.0, "nominal"),
-        ("safe_envs/QuadrotorAltitude-v0", "hocbf:p=18,18", 50.0, "nominal"),
+        ("safe_envs/DubinsObstacle-v0", "hocbf:alpha=12,12", 20.0, "nominal"),
+        ("safe_envs/QuadrotorAltitude-v0", "hocbf:alpha=18,18", 50.0, "nominal"),
     ],
 )
 def test_margin_of_first_order_keeps_stiff_conditions_at_the_period_of_the_thesis(
@@ -110,7 +110,7 @@ def test_margin_of_first_order_keeps_stiff_conditions_at_the_period_of_the_thesi
 ):
     # Noise-free, with the true model, dt = .05: the continuous condition keeps h >= 0, the sampled
     # one does not.
-    options = {"box": [-bound, bound], "horizon": 10.0}
+    options = {"input_bounds": [-bound, bound], "horizon": 10.0}
     names = (filters, f"{filters}:sampling_margin=first-order")
     given = {"options": options, "episodes": 30, "knowledge": "plant", "bounds": False}
     plain, with_margin = evaluate(env_id, policy, names, engine="numpy", **given).rows
@@ -172,7 +172,7 @@ def test_joint_program_of_one_input_is_the_filter_over_the_goals_controller(name
     nearest = SafetyFilter.for_problem(problem, SCBF())
     both = SafetyFilter.for_problem(problem, SCBF(), objective="clf")
     actions, _ = CLFController(problem).predict(states)
-    high = problem.box[0][1]
+    high = problem.input_bounds[0][1]
     expected = nearest.filter(states, actions * high)
     found = both.filter(states, np.zeros((200, 1)))
     np.testing.assert_allclose(found.action, expected.action, rtol=1e-6, atol=1e-6 * high)
@@ -221,7 +221,7 @@ CORNER = (Barrier(1 - x), UNIT), (Barrier(0.5 - y), UNIT)
 FLAT = SafetyFilter(
     ControlAffineSDE((x, y), (u,), [-1, 0], [0, 1], [0, 0]),
     [(Barrier(y + 0.5), UNIT), (Barrier(1 - y), UNIT)],
-    bounds=[(-9.0, 9.0)],
+    input_bounds=[(-9.0, 9.0)],
 )
 
 
@@ -294,7 +294,7 @@ def test_a_condition_without_meaning_does_not_harm_another_barrier(half):
     # y is beyond its edge, x is not: y is to fall as fast as x allows, however wide the box.
     both = ControlAffineSDE((x, y), (u,), [0, 0], [1, 1], [0, 0])
     rows = [(Barrier(x), UNIT), (Barrier(-y), RCBF())]
-    result = decided(SafetyFilter(both, rows, bounds=[(-half, half)]), [0.1, 1.0], [0.0])
+    result = decided(SafetyFilter(both, rows, input_bounds=[(-half, half)]), [0.1, 1.0], [0.0])
     np.testing.assert_allclose(result.action, [-0.1], atol=1e-9)
     assert result.slack[0] == pytest.approx(0.0, abs=1e-9)
     assert (result.cause, result.feasible) == (1, False)

@@ -18,7 +18,9 @@ def scalar(sigma):
 
 def upper_limits(condition, sigma, states, box=1e4):
     """Largest input that the filter allows on h = 1 - x, where the thesis has closed forms."""
-    safety_filter = SafetyFilter(scalar(sigma), [(Barrier(1 - x), condition)], bounds=[(-box, box)])
+    safety_filter = SafetyFilter(
+        scalar(sigma), [(Barrier(1 - x), condition)], input_bounds=[(-box, box)]
+    )
     return safety_filter.filter(states[:, None], np.full((len(states), 1), box)).action[:, 0]
 
 
@@ -56,9 +58,11 @@ def test_the_logarithmic_form():
 
 def test_control_of_the_stochastic_one_is_unbounded_near_the_edge_and_a_box_breaks_it():
     near = 1 - np.array([1e-3, 1e-4, 1e-6])
-    asked = upper_limits(SRCBF(), 0.4, near, box=1e9)
+    asked = upper_limits(SRCBF(), 0.4, near, input_bounds=1e9)
     np.testing.assert_allclose(asked * (1 - near), -0.16, rtol=1e-2)
-    safety_filter = SafetyFilter(scalar(0.4), [(Barrier(1 - x), SRCBF())], bounds=[(-10.0, 10.0)])
+    safety_filter = SafetyFilter(
+        scalar(0.4), [(Barrier(1 - x), SRCBF())], input_bounds=[(-10.0, 10.0)]
+    )
     result = safety_filter.filter(near[:, None], np.zeros((3, 1)))
     assert result.feasible.tolist() == [False] * 3
     np.testing.assert_allclose(result.action, -10.0)
@@ -68,7 +72,9 @@ def test_control_of_the_stochastic_one_is_unbounded_near_the_edge_and_a_box_brea
 @pytest.mark.parametrize("condition", [RCBF(), SRCBF(), RCBF(form="log"), SRCBF(0.1, "log")])
 @pytest.mark.parametrize("state", [1.0, 1.0 + 1e-13, 1.5, 40.0])
 def test_outside_the_action_raises_h_most_and_is_flagged(condition, state):
-    safety_filter = SafetyFilter(scalar(0.4), [(Barrier(1 - x), condition)], bounds=[(-3.0, 4.0)])
+    safety_filter = SafetyFilter(
+        scalar(0.4), [(Barrier(1 - x), condition)], input_bounds=[(-3.0, 4.0)]
+    )
     for result in (
         safety_filter.filter([state], [2.0]),
         safety_filter.filter([[state], [0.0]], [[2.0], [0.1]]),
@@ -88,7 +94,7 @@ def test_outside_the_action_raises_h_most_and_is_flagged(condition, state):
 def test_outside_with_several_inputs_and_flat_ones():
     plane = ControlAffineSDE((x, y), (u, w), [0, 0], [[1, 0], [0, 0]], [sp.Rational(1, 5), 0])
     safety_filter = SafetyFilter(
-        plane, [(Barrier(1 - x), SRCBF())], bounds=[(-3.0, 4.0), (-2.0, 2.0)]
+        plane, [(Barrier(1 - x), SRCBF())], input_bounds=[(-3.0, 4.0), (-2.0, 2.0)]
     )
     for state, nominal in (([1.2, 0.0], [1.0, 0.7]), ([[1.2, 0.0]], [[1.0, 0.7]])):
         result = safety_filter.filter(np.array(state), np.array(nominal))
@@ -100,7 +106,7 @@ def test_beside_another_barrier():
     # Outside the first, which asks for all it can get; the second one still has its say, by least
     # squares.
     rows = [(Barrier(1 - x), RCBF()), (Barrier(x + 3), CBF(1.0))]
-    safety_filter = SafetyFilter(scalar(0.0), rows, bounds=[(-3.0, 3.0)])
+    safety_filter = SafetyFilter(scalar(0.0), rows, input_bounds=[(-3.0, 3.0)])
     inside = safety_filter.filter([0.5], [3.0])
     np.testing.assert_allclose(inside.action, [0.125 - 0.5], atol=1e-9)
     assert inside.feasible

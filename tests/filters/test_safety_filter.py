@@ -28,7 +28,7 @@ CHAIN = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
 
 def wall(alpha=1.0, half=3.0, **more):
     """x' = u before a wall at 1: u <= alpha (1 - x)."""
-    return SafetyFilter(LINE, [(Barrier(1 - x), CBF(alpha))], bounds=[(-half, half)], **more)
+    return SafetyFilter(LINE, [(Barrier(1 - x), CBF(alpha))], input_bounds=[(-half, half)], **more)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_four_inputs_by_a_search():
     safety_filter = SafetyFilter.for_problem(problem, HOCBF(problem.gains))
     rng, state = np.random.default_rng(0), np.zeros(12)
     state[[2, 5, 6, 7]] = [6.5, 1.3, 0.2, -0.1]
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     nominal = rng.uniform(low, high)
     result = safety_filter.filter(state, nominal)
     assert result.active.all()
@@ -83,7 +83,7 @@ def test_four_inputs_by_a_search():
 def test_batches_equal_single_states(name):
     problem = problem_of(f"safe_envs/{name}-v0")
     safety_filter = SafetyFilter.for_problem(problem, SCBF())
-    rng, (low, high) = np.random.default_rng(1), np.array(problem.box).T
+    rng, (low, high) = np.random.default_rng(1), np.array(problem.input_bounds).T
     states = rng.uniform(0.2, 1.5, (4, 3, problem.plant.n))
     inputs = rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (4, 3, problem.plant.m))
     batch = safety_filter.filter(states, inputs)
@@ -97,7 +97,7 @@ def test_batches_equal_single_states(name):
 @pytest.mark.parametrize(("weights", "action"), [(None, [0.5, 0.5]), ([1.0, 9.0], [0.1, 0.9])])
 def test_weights_decide_which_input_gives_way(weights, action):
     row = [(Barrier(1 - x - y), CBF(1.0))]
-    found = SafetyFilter(PLANE, row, bounds=[(-5.0, 5.0)] * 2, weights=weights)
+    found = SafetyFilter(PLANE, row, input_bounds=[(-5.0, 5.0)] * 2, weights=weights)
     np.testing.assert_allclose(found.filter(np.zeros(2), np.ones(2)).action, action)
 
 
@@ -115,7 +115,7 @@ def test_several_barriers_with_conditions_of_their_own(state, action, active, sl
         (Barrier(1 - x, "position"), HOCBF((1.0, 1.0))),
         (Barrier(2 - y, "speed"), CBF(1.0)),
     ]
-    safety_filter = SafetyFilter(CHAIN, rows, bounds=[(-4.0, 4.0)])
+    safety_filter = SafetyFilter(CHAIN, rows, input_bounds=[(-4.0, 4.0)])
     for shape in ((), (1,)):
         found = safety_filter.filter(np.reshape(state, (*shape, 2)), np.full((*shape, 1), 3.0))
         np.testing.assert_allclose(np.ravel(found.action), [action], atol=1e-7)
@@ -147,7 +147,7 @@ def test_inputs_that_are_none_are_errors(state, nominal):
 
 @pytest.mark.parametrize("h", [sp.log(x), 1 / x, sp.sqrt(x) + 1])
 def test_states_where_the_barrier_or_its_rate_has_no_value_are_not_safe(h):
-    safety_filter = SafetyFilter(LINE, [(Barrier(h), CBF(1.0))], bounds=[(-1.0, 1.0)])
+    safety_filter = SafetyFilter(LINE, [(Barrier(h), CBF(1.0))], input_bounds=[(-1.0, 1.0)])
     found = safety_filter.filter([0.0], [3.0])
     assert (found.feasible, found.slack, found.action.tolist()) == (False, [np.inf], [1.0])
     assert safety_filter.filter([[1.0], [0.0]], np.zeros((2, 1))).feasible.tolist() == [True, False]
@@ -156,7 +156,7 @@ def test_states_where_the_barrier_or_its_rate_has_no_value_are_not_safe(h):
 @pytest.mark.parametrize("state", [[0.0], [[1.0], [0.0]]])
 def test_states_where_the_dynamics_have_no_value_are_errors(state):
     system = ControlAffineSDE((x,), (u,), [sp.log(x)], [1])
-    safety_filter = SafetyFilter(system, [(Barrier(1 - x), CBF(1.0))], bounds=[(-1.0, 1.0)])
+    safety_filter = SafetyFilter(system, [(Barrier(1 - x), CBF(1.0))], input_bounds=[(-1.0, 1.0)])
     with pytest.raises(NumericalError, match="x = 0"):
         safety_filter.filter(state, np.zeros_like(state))
 
@@ -168,16 +168,20 @@ ROW = [(Barrier(1 - x), CBF(1.0))]
     ("call", "error", "fragment"),
     [
         *(
-            (lambda box=box: SafetyFilter(LINE, ROW, bounds=box), ConfigurationError, "bounds")
+            (
+                lambda box=box: SafetyFilter(LINE, ROW, input_bounds=box),
+                ConfigurationError,
+                "bounds",
+            )
             for box in ([(1, 1)], [(np.inf, np.inf)], [(np.nan, 1)], [(2, 1)], [(0, 1)] * 2)
         ),
         *(
             (lambda given=given: wall(weights=given), ConfigurationError, "weights")
             for given in ([0.0], [-1.0], [np.nan], [1.0, 1.0])
         ),
-        (lambda: SafetyFilter(LINE, [], bounds=[(-1, 1)]), SystemDefinitionError, "barriers"),
+        (lambda: SafetyFilter(LINE, [], input_bounds=[(-1, 1)]), SystemDefinitionError, "barriers"),
         (
-            lambda: SafetyFilter(LINE, [(Barrier(1 - y), CBF(1.0))], bounds=[(-1, 1)]),
+            lambda: SafetyFilter(LINE, [(Barrier(1 - y), CBF(1.0))], input_bounds=[(-1, 1)]),
             SystemDefinitionError,
             "symbol y",
         ),

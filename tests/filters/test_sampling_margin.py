@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.wrappers import SafetyFilter
@@ -51,7 +51,7 @@ def random_barriers(rng, states, count):
 def test_a_harmless_input_stays_harmless():
     # psi = .6975 - .1 u and psi' = -.055 - 1.1 u - 2 u^2: at the proposed input psi would fall by
     # 2.1, so that no input but one far off has such a reserve at its own psi.
-    safety_filter = SafetyFilter(CART, 1 - x**2 - v**2, MARGIN, bounds=(-20, 20), dt=DT)
+    safety_filter = SafetyFilter(CART, 1 - x**2 - v**2, MARGIN, input_bounds=(-20, 20), dt=DT)
     state, nominal = np.array([0.5, 0.05]), np.array([3.0])
     root = (-0.21 + (0.21**2 + 4 * 0.2 * 0.692) ** 0.5) / 0.4
     one, batch = safety_filter.filter(state, nominal), safety_filter.filter([state], [nominal])
@@ -70,7 +70,7 @@ def test_a_harmless_input_stays_harmless():
 def test_one_input_is_the_nearest_at_which_all_constraints_hold(seed):
     rng = np.random.default_rng(seed)
     barriers = list(random_barriers(rng, (x, v), 1 + seed % 2))
-    safety_filter = SafetyFilter(CART, barriers, MARGIN, bounds=(-6, 6), dt=DT)
+    safety_filter = SafetyFilter(CART, barriers, MARGIN, input_bounds=(-6, 6), dt=DT)
     states, nominal = rng.normal(0.0, 0.6, (150, 2)), rng.uniform(-7, 7, (150, 1))
     found = safety_filter.filter(states, nominal)
     grid = np.linspace(-6, 6, 12001)
@@ -92,7 +92,7 @@ def test_one_input_is_the_nearest_at_which_all_constraints_hold(seed):
 def test_several_inputs_end_at_one_that_has_been_checked(seed):
     rng = np.random.default_rng(seed)
     barriers = [2 - x**2 - v**2 - y**2 - w**2, *random_barriers(rng, (x, v, y, w), seed)]
-    safety_filter = SafetyFilter(POINT, barriers, MARGIN, bounds=(-6, 6), dt=DT)
+    safety_filter = SafetyFilter(POINT, barriers, MARGIN, input_bounds=(-6, 6), dt=DT)
     states, nominal = rng.normal(0.0, 0.5, (80, 4)), rng.uniform(-9, 9, (80, 2))
     found = safety_filter.filter(states, nominal)
     axis = np.linspace(-6, 6, 121)
@@ -118,7 +118,7 @@ def test_several_inputs_end_at_one_that_has_been_checked(seed):
 
 def test_where_no_input_holds_the_filter_says_so():
     # Inwards by no more than what the bounds allow: psi = -2 x v - 2 v u + h stays negative.
-    safety_filter = SafetyFilter(CART, 1 - x**2 - v**2, MARGIN, bounds=(-0.3, 1), dt=DT)
+    safety_filter = SafetyFilter(CART, 1 - x**2 - v**2, MARGIN, input_bounds=(-0.3, 1), dt=DT)
     found = safety_filter.filter([0.5, 0.85], [0.5])
     assert not found.feasible
     assert found.action == [-0.3]
@@ -134,10 +134,10 @@ def test_a_cart_pole_at_15_hz_is_no_less_safe_with_the_margin(policy, alpha, hal
     import cart_pole as example
 
     theta, omega = example.theta, example.omega
-    problem = state_problem(
+    problem = define_problem(
         example.cart_pole,
         1 - (theta / 0.2) ** 2 - omega**2,
-        box=(-half, half),
+        input_bounds=(-half, half),
         start=[(-0.3, 0.3), (-0.3, 0.3), (-0.05, 0.05), (-0.1, 0.1)],
         dt=1 / 15,
         horizon=5.0,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, SafetyProblem, define_problem
 from safe_envs.filters.specification import (
     MOST_STATES,
     Automaton,
@@ -33,8 +33,8 @@ def problem_of(steps: int = LONGEST - 1) -> SafetyProblem:
     """Return a problem whose sets are half-spaces: each of a state, whose value is its own."""
     u = sp.Symbol("u", real=True)
     system = ControlAffineSDE(STATES, (u,), [0] * 7, [1] + [0] * 6, [[0]] * 7)
-    problem = state_problem(
-        system, STATES[0], box=(-1, 1), start=[1.0] * 7, dt=1.0, horizon=float(steps)
+    problem = define_problem(
+        system, STATES[0], input_bounds=(-1, 1), start=[1.0] * 7, dt=1.0, horizon=float(steps)
     )
     regions = dict(zip(("a", "b", "c", "d", "e"), STATES[2:], strict=True))
     return replace(problem, goal=STATES[1], regions=regions)

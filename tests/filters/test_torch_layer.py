@@ -54,7 +54,7 @@ def registered(request):
     problem = make_problem(f"safe_envs/{name}-v0")
     module = TorchFilter.for_problem(problem, parse_conditions(condition, problem))
     rng = np.random.default_rng(1)
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     x = visited(f"safe_envs/{name}-v0", 200) + 0.05 * rng.normal(size=(200, problem.model.n))
     return (
         module,
@@ -82,7 +82,7 @@ def planar(m, k, *, contradicting=False, seed=0):
     return SafetyFilter(
         model,
         rows,
-        bounds=[(-1.0, 1.5)] * m,
+        input_bounds=[(-1.0, 1.5)] * m,
         weights=rng.uniform(0.3, 3.0, m),
         priorities=rng.uniform(0.3, 3.0, k),
     )
@@ -260,7 +260,9 @@ def test_rows_of_functions_with_kinks():
     )
     module = TorchFilter(
         SafetyFilter(
-            model, [(Barrier(1 - x - sp.sqrt(2) * y**2), CBF(alpha=1.0))], bounds=[(-9.0, 9.0)]
+            model,
+            [(Barrier(1 - x - sp.sqrt(2) * y**2), CBF(alpha=1.0))],
+            input_bounds=[(-9.0, 9.0)],
         )
     )
     rng = np.random.default_rng(0)
@@ -270,12 +272,12 @@ def test_rows_of_functions_with_kinks():
 def test_a_minimum_has_the_gradients_of_its_pieces_and_a_maximum_is_refused():
     x, y, u, w = sp.symbols("x y u w", real=True)
     model = ControlAffineSDE((x, y), (u, w), [y, 0], [[1, 0], [0, 1]])
-    minimum = SafetyFilter(model, 1 - x - sp.Abs(y), "cbf:alpha=2", bounds=[(-9, 9)] * 2)
+    minimum = SafetyFilter(model, 1 - x - sp.Abs(y), "cbf:alpha=2", input_bounds=[(-9, 9)] * 2)
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(30, 2)) / 2, rng.normal(size=(30, 2)) + 1
     assert assert_slopes(TorchFilter(minimum), states, inputs) > 25
     with pytest.raises(ConfigurationError, match="maximum"):
-        TorchFilter(SafetyFilter(model, sp.Max(x, y), "cbf", bounds=[(-9, 9)] * 2))
+        TorchFilter(SafetyFilter(model, sp.Max(x, y), "cbf", input_bounds=[(-9, 9)] * 2))
 
 
 def test_names_of_symbols_change_nothing():
@@ -291,7 +293,9 @@ def test_names_of_symbols_change_nothing():
             [[0], [0]],
         )
         module = TorchFilter(
-            SafetyFilter(model, [(Barrier(1 - a - b**2), CBF(alpha=1.0))], bounds=[(-9.0, 9.0)])
+            SafetyFilter(
+                model, [(Barrier(1 - a - b**2), CBF(alpha=1.0))], input_bounds=[(-9.0, 9.0)]
+            )
         )
         states = torch.tensor([0.9, 0.4], dtype=torch.float64, requires_grad=True)
         module(states, torch.tensor([8.0], dtype=torch.float64)).sum().backward()

@@ -77,7 +77,7 @@ grid: {filter: [none, scbf], noise: [0.2, 0.5]}
 _CELLS = """
 fixed: {episodes: 10, horizon: 0.5, policy: random, seed: 4}
 cells:
-  - {env: DubinsDisk-v0, filter: "hocbf:p=2,8", plant.v: 0.9}
+  - {env: DubinsDisk-v0, filter: "hocbf:alpha=2,8", plant.v: 0.9}
   - {env: CubicSDEDisk-v0, filter: srcbf, start: [0.1, 0.6], objective: nearest}
   - {env: QuadrotorLimits-v0, filter: hocbf, knowledge: plant, noise: 0.1}
 """
@@ -193,7 +193,7 @@ def cases() -> dict[str, Case]:
     )
     found["render/stills"] = Case(
         (
-            "render DubinsDisk-v0 --horizon 2 --start 0,0.1,0 --compare none,hocbf:p=2,8 --out still.png",
+            "render DubinsDisk-v0 --horizon 2 --start 0,0.1,0 --compare none,hocbf:alpha=2,8 --out still.png",
             "render Scalar-v0 --policy random --noise 1 --horizon 0.3 --start 0 --seed 3 --out still.png",
         )
     )

@@ -7,7 +7,7 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.backup import Backup, BackupLaw
-from safe_envs.problem.builder import state_problem
+from safe_envs.problem.builder import define_problem
 from safe_envs.proofs.backup_filter import BackupFilter, BackupSettings
 
 x, v, a = sp.symbols("x v a", real=True)
@@ -42,11 +42,11 @@ def cart_filter(horizon=4.0, settings=None, dt=DT):
 
 
 def cart_problem(noise=0.0, laws=(BRAKE,), barriers=1 - x, **options):
-    return state_problem(
+    return define_problem(
         cart(noise),
         barriers,
         **{
-            "box": (-STRONGEST, STRONGEST),
+            "input_bounds": (-STRONGEST, STRONGEST),
             "start": [(-0.5, 0.0), (-0.5, 0.5)],
             "dt": DT,
             "horizon": 5.0,
@@ -109,11 +109,11 @@ STOP = BackupLaw(
 
 
 def table_problem(**options):
-    return state_problem(
+    return define_problem(
         table(),
         (1 - x, sp.Float(4) - y),
         **{
-            "box": (-STRONGEST, STRONGEST),
+            "input_bounds": (-STRONGEST, STRONGEST),
             "start": [(-0.5, 0.0), (-0.5, 0.5), 0.0, (-0.5, 0.5)],
             "dt": DT,
             "horizon": 3.0,

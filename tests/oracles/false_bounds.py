@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 
 x, y, u = sp.symbols("x y u", real=True)
 
@@ -15,10 +15,10 @@ def kink():
     local time, which pulls h down."""
     system = ControlAffineSDE.from_rate((x,), (u,), [u], diffusion=[0.5])
     barrier = 0.5 - sp.sqrt(2 - 2 * sp.cos(x))
-    return state_problem(
+    return define_problem(
         system,
         [barrier],
-        box=(-5, 5),
+        input_bounds=(-5, 5),
         workspace={x: (-2, 2)},
         start=(0.1,),
         dt=0.01,
@@ -32,10 +32,10 @@ def pole():
     d, v = sp.symbols("d v", real=True)
     system = ControlAffineSDE.from_rate((d, v), (u,), [-v, u], diffusion=[0, 0])
     ranges = {d: (0, 200), v: (-30, 30)}
-    return state_problem(
+    return define_problem(
         system,
         [d / v - 1.8],
-        box=(-30, 30),
+        input_bounds=(-30, 30),
         workspace=ranges,
         start=(20.0, 7.03),
         dt=0.05,
@@ -49,10 +49,10 @@ def island():
     system = ControlAffineSDE.from_rate((x, y), (u,), [u, 0], diffusion=[[0.1], [0.1]])
     barrier = 1 - x**2 - y**2 + 30 * sp.exp(-((x - 1.5) ** 2 + (y - 0.3) ** 2) / 1e-4**2)
     ranges = {x: (-2, 2), y: (-2, 2)}
-    return state_problem(
+    return define_problem(
         system,
         [barrier],
-        box=(-5, 5),
+        input_bounds=(-5, 5),
         workspace=ranges,
         start=(1.5, 0.3),
         dt=0.01,
@@ -74,10 +74,10 @@ def rotated():
     system = ControlAffineSDE.from_rate(xs, (u,), drift, diffusion=[0] * 10)
     start, ranges = tuple((0.97 * axes[0]).tolist()), dict.fromkeys(xs, (-2, 2))
     barrier = 1 - sum(s**2 for s in xs)
-    return state_problem(
+    return define_problem(
         system,
         [barrier],
-        box=(-1.9, 1.9),
+        input_bounds=(-1.9, 1.9),
         workspace=ranges,
         start=start,
         dt=0.01,
@@ -90,10 +90,10 @@ def corridor():
     """Two rows on one input, which overshoot at this period without margins of first order."""
     system = ControlAffineSDE.from_rate((x,), (u,), [u], diffusion=[0])
     ranges = {x: (-2, 2)}
-    return state_problem(
+    return define_problem(
         system,
         [1 - x, 1 + x],
-        box=(-100, 100),
+        input_bounds=(-100, 100),
         workspace=ranges,
         start=(0.0,),
         dt=0.3,

@@ -25,7 +25,7 @@ def situations(problem: SafetyProblem, count: int) -> tuple[np.ndarray, np.ndarr
     """States in and around the region of a problem, with proposals in and around its box."""
     rng = np.random.default_rng(0)
     found = []
-    for ranges, beyond in ((problem.sampling_domain.region, 0.2), (problem.box, 0.5)):
+    for ranges, beyond in ((problem.sampling_domain.region, 0.2), (problem.input_bounds, 0.5)):
         low, high = np.array(ranges).T
         shares = rng.uniform(-beyond, 1.0 + beyond, (count, len(low)))
         found.append(low + (high - low) * shares)
@@ -215,7 +215,7 @@ def case_of(name: str) -> tuple[SafetyFilter, np.ndarray, np.ndarray]:
     safety_filter = SafetyFilter(
         integrators(m),
         [(Barrier(h, name=f"h_{i}"), condition) for i, (h, condition) in enumerate(pairs)],
-        bounds=[(-1.0, 1.5), (-2.0, 0.5), (-1.0, 1.0)][:m],
+        input_bounds=[(-1.0, 1.5), (-2.0, 0.5), (-1.0, 1.0)][:m],
         priorities=[1.0, 4.0, 0.3][: len(pairs)],
         dt=0.05,
         **options,

@@ -11,7 +11,7 @@ from scipy.linalg import toeplitz
 from scipy.special import ndtr
 from scipy.stats import norm
 
-from safe_envs import state_problem
+from safe_envs import define_problem
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
 
@@ -27,8 +27,14 @@ def brownian(
     system = ControlAffineSDE(
         states=(X,), inputs=(u,), drift=[0], input_matrix=[1], diffusion=[s], parameters={s: sigma}
     )
-    return state_problem(
-        system, barriers, box=(-10.0, 10.0), start=[0.0], dt=dt, horizon=horizon, nominal=drift
+    return define_problem(
+        system,
+        barriers,
+        input_bounds=(-10.0, 10.0),
+        start=[0.0],
+        dt=dt,
+        horizon=horizon,
+        nominal=drift,
     )
 
 
@@ -38,8 +44,8 @@ def mean_reverting(
     """dx = (u - theta x) dt + sigma dW from 0, which is to stay in [-1, 1], without an input."""
     u = sp.Symbol("u", real=True)
     system = ControlAffineSDE.from_rate((X,), (u,), [u - theta * X], diffusion=[sigma])
-    return state_problem(
-        system, 1 - X**2, box=(-1.0, 1.0), start=[0.0], dt=dt, horizon=horizon, nominal=0
+    return define_problem(
+        system, 1 - X**2, input_bounds=(-1.0, 1.0), start=[0.0], dt=dt, horizon=horizon, nominal=0
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.problem.measurement import Channel, Measurement
 from safe_envs.problem.problem import SafetyProblem
 
@@ -26,10 +26,10 @@ def problem(noise: float = R, start: float = 0.0, steps: int = STEPS) -> SafetyP
     system = ControlAffineSDE.from_rate(
         (x,), (u,), [A * x + u], diffusion=[sigma], parameters={sigma: S}
     )
-    found = state_problem(
+    found = define_problem(
         system,
         LIMIT - x,
-        box=(-PUSH, PUSH),
+        input_bounds=(-PUSH, PUSH),
         start=[start],
         dt=DT,
         horizon=steps * DT,

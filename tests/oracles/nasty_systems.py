@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from tests.oracles import false_bounds
 
 x, y, v, u, w = sp.symbols("x y v u w", real=True)
@@ -17,7 +17,7 @@ SQUARE = {x: (-2, 2), y: (-2, 2)}
 
 def _made(
     barrier: Any,
-    text: str = "szcbf:alphas=0.5",
+    text: str = "szcbf:alpha=0.5",
     *,
     states: Any = (x,),
     rows: Any = None,
@@ -31,10 +31,10 @@ def _made(
     rows = [u, *[0] * (len(states) - 1)] if rows is None else rows
     noise = [[each] for each in (*noise, *[0] * (len(states) - len(noise)))]
     system = ControlAffineSDE.from_rate(states, inputs, rows, diffusion=noise)
-    problem = state_problem(
+    problem = define_problem(
         system,
         barrier if isinstance(barrier, list) else [barrier],
-        box=[(-high, high)] * len(inputs),
+        input_bounds=[(-high, high)] * len(inputs),
         workspace={x: (-2, 2)} if workspace is None else workspace,
         start=start,
         dt=1e-3,
@@ -71,7 +71,7 @@ def _saturated(switch: Any) -> Any:
     """An input that moves x at once, but only beyond 5: no point near 0 tells."""
     return _made(
         7 - x,
-        "hocbf:p=0.1,1",
+        "hocbf:alpha=0.1,1",
         states=(x, v),
         rows=[v - 3 * switch * u, u],
         noise=(0.0, 0.0),
@@ -83,7 +83,7 @@ def _saturated(switch: Any) -> Any:
 def _scales(ratio: int, noise: float) -> Any:
     return _made(
         1 - x**2 - y**2 / 4,
-        "szcbf:alphas=1",
+        "szcbf:alpha=1",
         states=(x, y),
         rows=[u - x, -y / ratio],
         noise=(noise, 1 / ratio),
@@ -97,7 +97,7 @@ def _given(make: Any, text: str) -> Any:
 
 
 NASTY: dict[str, Any] = {
-    "hidden kink": _given(false_bounds.kink, "szcbf:alphas=0.1"),
+    "hidden kink": _given(false_bounds.kink, "szcbf:alpha=0.1"),
     "pole d/v": _given(false_bounds.pole, "cbf:alpha=1"),
     "second peak": _given(false_bounds.island, "scbf"),
     "turned axes, 10 states": _given(false_bounds.rotated, "cbf:alpha=0.1"),
@@ -111,7 +111,7 @@ NASTY: dict[str, Any] = {
     "saturated tanh": lambda: _saturated((1 + sp.tanh(10**6 * (x - 5))) / 2),
     "saturated erf": lambda: _saturated((1 + sp.erf(10**3 * (x - 5))) / 2),
     "identity in an input": lambda: _made(
-        1 - x, "hocbf:p=1,2", states=(x, v),
+        1 - x, "hocbf:alpha=1,2", states=(x, v),
         rows=[v + (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1) * u, u], noise=(0.0, 0.0),
         workspace={x: (-2, 2), v: (-3, 3)}, start=(0.0, 0.0),
     ),
@@ -123,10 +123,10 @@ NASTY: dict[str, Any] = {
         sp.atan(1 / x), "cbf:alpha=1", rows=[u - 1], noise=(0.0,), start=(0.3,)
     ),
     "atan(1/x) at no middle": lambda: _made(
-        sp.atan(1 / (x - R(1, 3))), "szcbf:alphas=1", noise=(0.5,), start=(0.5,)
+        sp.atan(1 / (x - R(1, 3))), "szcbf:alpha=1", noise=(0.5,), start=(0.5,)
     ),
     "jump at an edge of the workspace": lambda: _made(
-        sp.atan(1 / x) + R(1, 10), "szcbf:alphas=1", workspace={x: (0, 2)}, start=(0.5,)
+        sp.atan(1 / x) + R(1, 10), "szcbf:alpha=1", workspace={x: (0, 2)}, start=(0.5,)
     ),
     "cut of atan2": lambda: _made(
         R(5, 2) - sp.atan2(y, x), states=(x, y), noise=(0.5, 0.5), workspace=SQUARE,
@@ -154,10 +154,10 @@ NASTY: dict[str, Any] = {
         1 - y, states=(x, y), rows=[0, u], noise=(0.3, 0.1 / x), workspace=SQUARE, start=(0.3, 0.0)
     ),
     "period of two turns": lambda: _made(
-        sp.sin(x / 2) + R(1, 2), "szcbf:alphas=1", workspace={}, start=(3.0,), units={x: "rad"}
+        sp.sin(x / 2) + R(1, 2), "szcbf:alpha=1", workspace={}, start=(3.0,), units={x: "rad"}
     ),
     "angle": lambda: _made(
-        sp.cos(x) + R(1, 2), "szcbf:alphas=1", workspace={}, start=(0.3,), units={x: "rad"}
+        sp.cos(x) + R(1, 2), "szcbf:alpha=1", workspace={}, start=(0.3,), units={x: "rad"}
     ),
     "scales of a million": lambda: _scales(10**6, 0.5),
     "scales without noise": lambda: _scales(10**6, 0.0),
@@ -167,9 +167,9 @@ NASTY: dict[str, Any] = {
     "tiny barrier": lambda: _made((1 - x**2) / 10**12, start=(0.3,)),
     "huge barrier": lambda: _made((1 - x**2) * 10**12, start=(0.3,)),
     "reciprocal": lambda: _made(1 - x**2, "rcbf", noise=(0.0,), start=(0.3,)),
-    "two barriers on one input": lambda: _made([1 - x, 1 + x], "szcbf:alphas=1", start=(0.2,)),
+    "two barriers on one input": lambda: _made([1 - x, 1 + x], "szcbf:alpha=1", start=(0.2,)),
     "two of degree two": lambda: _made(
-        [1 - x, 1 + x], "hocbf:p=1,2", states=(x, v), rows=[v, u], noise=(0.0, 0.0),
+        [1 - x, 1 + x], "hocbf:alpha=1,2", states=(x, v), rows=[v, u], noise=(0.0, 0.0),
         workspace={x: (-2, 2), v: (-4, 4)}, start=(0.0, 0.0), high=2.0,
     ),
 }  # fmt: skip

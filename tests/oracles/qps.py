@@ -184,7 +184,9 @@ def filter_of(qps: QPs, i: int = 0) -> SafetyFilter:
     """The filter with the bounds and weights of a QP, of states that `state_of` gives."""
     system, pairs = system_of(*qps.a.shape[1:])
     bounds = np.stack([qps.low[i], qps.high[i]], axis=1)
-    return SafetyFilter(system, pairs, bounds=bounds, weights=qps.w[i], priorities=qps.priority)
+    return SafetyFilter(
+        system, pairs, input_bounds=bounds, weights=qps.w[i], priorities=qps.priority
+    )
 
 
 def state_of(qps: QPs, i: int = 0) -> np.ndarray:

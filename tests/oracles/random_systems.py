@@ -11,7 +11,7 @@ import numpy as np
 import sympy as sp
 from scipy import stats
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.starts import Start
@@ -108,7 +108,7 @@ def _of_degree_one(rng: np.random.Generator) -> tuple[SafetyProblem, str]:
     if not noisy:
         text = f"cbf:alpha={_number(rng, 0.5, 4)}"
     else:
-        text = "scbf" if rng.random() < 0.3 else f"szcbf:alphas={_number(rng, 0.1, 2)}"
+        text = "scbf" if rng.random() < 0.3 else f"szcbf:alpha={_number(rng, 0.1, 2)}"
     return _problem(rng, system, barriers, dict.fromkeys(xs, (-1.5, 1.5))), text
 
 
@@ -127,7 +127,7 @@ def _of_degree_two(rng: np.random.Generator) -> tuple[SafetyProblem, str]:
     a, b = _number(rng, 0.1, 0.6), _number(rng, 0.1, 0.6)
     if not noisy:
         a, b = 2 * a, 5 * b
-    text = f"szcbf:alphas={a},{b}" if noisy else f"hocbf:p={a},{b}"
+    text = f"szcbf:alpha={a},{b}" if noisy else f"hocbf:alpha={a},{b}"
     ranges = {**dict.fromkeys(ps, (-1.5, 1.5)), **dict.fromkeys(vs, (-2.0, 2.0))}
     return _problem(rng, system, barriers, ranges), text
 
@@ -136,10 +136,10 @@ def _problem(
     rng: np.random.Generator, system: ControlAffineSDE, barriers: Any, ranges: Any
 ) -> SafetyProblem:
     high = _number(rng, 4, 16)
-    return state_problem(
+    return define_problem(
         system,
         barriers,
-        box=[(-high, high)] * system.m,
+        input_bounds=[(-high, high)] * system.m,
         workspace=ranges,
         start=(0.0,) * system.n,
         dt=_DT,

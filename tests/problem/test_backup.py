@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, define_problem
 from safe_envs.problem.backup import Backup, BackupLaw, backup_of
 
 x, v, u, k = sp.symbols("x v u k", real=True)
@@ -18,8 +18,8 @@ BRAKE = BackupLaw("brake", (-k * v,), terminal=1 - x)
 
 
 def problem(backup, **rest):
-    given = {"box": (-1.0, 1.0), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0, **rest}
-    return state_problem(SYSTEM, 1 - x, backup=backup, **given)
+    given = {"input_bounds": (-1.0, 1.0), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0, **rest}
+    return define_problem(SYSTEM, 1 - x, backup=backup, **given)
 
 
 def by_period(stated):
@@ -34,7 +34,7 @@ def test_a_problem_has_no_backup_unless_it_states_one():
 def test_a_function_follows_the_numbers_of_the_problem():
     sent = pickle.loads(pickle.dumps(problem(by_period)))
     assert backup_of(sent) == backup_of(problem(by_period))
-    changed = sent.configured(dt=0.05, plant={"k": 3.0}, box=(-2.0, 2.0))
+    changed = sent.configured(dt=0.05, plant={"k": 3.0}, input_bounds=(-2.0, 2.0))
     found = backup_of(changed)
     assert found is not None
     assert found.horizon == 0.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, SystemDefinitionError, state_problem
+from safe_envs import ControlAffineSDE, SystemDefinitionError, define_problem
 from safe_envs.problem.frame import Frame
 from safe_envs.problem.signals import Variable
 from safe_envs.registry import make_problem
@@ -33,9 +33,9 @@ def turning(speed, noise: float = 0.05, half_width: float = 2.0, barriers=1 - x*
         [[s_1, 0], [0, s_2]],
         {s_1: noise, s_2: noise},
     )
-    given = {"frame": TURNING, "dt": 0.1, "horizon": 1.0, "box": (-1.0, 1.0), **rest}
+    given = {"frame": TURNING, "dt": 0.1, "horizon": 1.0, "input_bounds": (-1.0, 1.0), **rest}
     workspace = dict.fromkeys((x, y), (-half_width, half_width))
-    return state_problem(system, barriers, start=[0.5, 0.0], workspace=workspace, **given)
+    return define_problem(system, barriers, start=[0.5, 0.0], workspace=workspace, **given)
 
 
 def names(problem, **given):
@@ -120,13 +120,13 @@ def test_a_workspace_that_cuts_safe_states_must_be_a_function_of_the_coordinates
     assert "workspace" in found.note
     # A second state that nothing depends on, and safe states without end.
     system = ControlAffineSDE.from_rate((x, y), (u,), [u - x, sp.cos(y)], [k, 0], {k: 0.1})
-    numbers = {"box": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0, "start": [0.5, (0, 1)]}
-    problem = state_problem(system, 1 + x, workspace={x: (-1.5, 1.5)}, frame=LINE, **numbers)
+    numbers = {"input_bounds": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0, "start": [0.5, (0, 1)]}
+    problem = define_problem(system, 1 + x, workspace={x: (-1.5, 1.5)}, frame=LINE, **numbers)
     found = reduced(problem)
     assert found.symbols == (q,)
     assert found.outside == sp.Abs(q) - 1.5
     bounded = {x: (-1.5, 1.5), y: (-1.0, 1.0)}
-    both = reduced(state_problem(system, 1 + x, workspace=bounded, frame=LINE, **numbers))
+    both = reduced(define_problem(system, 1 + x, workspace=bounded, frame=LINE, **numbers))
     assert both.symbols == (x, y)
     assert "workspace" in both.note
 
@@ -160,26 +160,26 @@ def test_a_state_that_stands_for_itself_is_a_coordinate_or_known():
     )
     radius = 1 + sp.sin(p) / 5
     frame = replace(TURNING, section=(r, sp.Integer(0), p))
-    numbers = {"box": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0, "frame": frame}
+    numbers = {"input_bounds": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0, "frame": frame}
     numbers["workspace"] = dict.fromkeys((x, y), (-2.0, 2.0))
     h = radius**2 - x**2 - y**2
-    known = reduced(state_problem(system, h, start=[0.5, 0.0, 0.3], **numbers))
+    known = reduced(define_problem(system, h, start=[0.5, 0.0, 0.3], **numbers))
     assert known.symbols == (r,)
     np.testing.assert_allclose(known.known[p], 0.3 + 0.1 * np.arange(11))
     assert known.barriers[0].free_symbols == {r, p}
-    drawn = reduced(state_problem(system, h, start=[0.5, 0.0, (0.0, 1.0)], **numbers))
+    drawn = reduced(define_problem(system, h, start=[0.5, 0.0, (0.0, 1.0)], **numbers))
     assert drawn.symbols == (r, p)
     assert [c.period for c in drawn.coordinates] == [0.0, 2 * math.pi]
     assert drawn.of_states((3.0, 4.0, 7.0)) == (5.0, 7.0)
     # Where its own bounds cut safe states, they are kept.
     numbers["workspace"][p] = (-1.0, 4.0)
-    cut = reduced(state_problem(system, h, start=[0.5, 0.0, (0.0, 1.0)], **numbers))
+    cut = reduced(define_problem(system, h, start=[0.5, 0.0, (0.0, 1.0)], **numbers))
     assert cut.symbols == (r, p)
     assert cut.outside == sp.Max(-p - 1.0, p - 4.0)
     del numbers["workspace"][p]
     # Its motion is compared as well: here the clock's rate depends on the angle.
     uneven = ControlAffineSDE.from_rate((x, y, p), (u,), [*rate[:2], 1 + x], parameters={})
-    found = reduced(state_problem(uneven, h, start=[0.5, 0.0, (0.0, 1.0)], **numbers))
+    found = reduced(define_problem(uneven, h, start=[0.5, 0.0, (0.0, 1.0)], **numbers))
     assert found.symbols == (x, y, p)
     assert "the law of p" in found.note
 
@@ -189,13 +189,13 @@ def test_a_frame_that_fails_is_named_where_there_are_too_many_states():
     system = ControlAffineSDE.from_rate(
         (x, y, *more), (u,), [u * x - y, u * y + 2 * x, *(-m + x for m in more)]
     )
-    problem = state_problem(
+    problem = define_problem(
         system,
         1 - x**2 - y**2,
         start=[0.5, 0.0, (0, 1), (0, 1), (0, 1)],
         workspace=dict.fromkeys((x, y, *more), (-2.0, 2.0)),
         frame=replace(TURNING, section=(r, sp.Integer(0), *more)),
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         dt=0.1,
         horizon=1.0,
     )

@@ -12,7 +12,7 @@ import sympy as sp
 from safe_envs import ConfigurationError, SafeEnv, SystemDefinitionError
 from safe_envs.agents.evaluation.attainable import attainable_safety
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.builder import state_problem
+from safe_envs.problem.builder import define_problem
 from safe_envs.problem.measurement import Channel, Measurement, default_measurement
 from safe_envs.problem.signals import TIME, Feature
 from safe_envs.values.reduction import reduced
@@ -24,11 +24,11 @@ ACC, SCALAR = "safe_envs/ACC-v0", "safe_envs/Scalar-v0"
 
 OWN = """
 import sympy as sp
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 
 x, v, u = sp.symbols("x v u", real=True)
 system = ControlAffineSDE.from_rate((x, v), (u,), [v, u])
-problem = state_problem(system, 1 - x, box=(-1, 1), start=[0.0, 0.0], dt=0.1, horizon=1.0)
+problem = define_problem(system, 1 - x, box=(-1, 1), start=[0.0, 0.0], dt=0.1, horizon=1.0)
 """
 
 
@@ -151,8 +151,8 @@ def test_channels_of_unknown_symbols_or_without_a_state_are_refused(expression, 
 def own_problem(**options):
     x, v, u = sp.symbols("x v u", real=True)
     system = ControlAffineSDE((x, v), (u,), [v, 0], [0, 1], [0, 0])
-    given = {"box": (-1, 1), "start": (0, 0), "dt": 0.1, "horizon": 1.0, **options}
-    return state_problem(system, 1 - x, **given)
+    given = {"input_bounds": (-1, 1), "start": (0, 0), "dt": 0.1, "horizon": 1.0, **options}
+    return define_problem(system, 1 - x, **given)
 
 
 def test_a_system_without_ranges_has_a_sensor_of_its_states():
@@ -227,7 +227,7 @@ def test_ranges_of_channels_leave_room_for_their_errors():
 def test_inputs_of_limited_rate_are_measured_with_the_states(given):
     problem = problem_of(ACC).configured(rate_limit=(-5000, 5000), measurement=given)
     found = {c.name: c for c in problem.measurement.channels}
-    low, high = problem_of(ACC).box[0]
+    low, high = problem_of(ACC).input_bounds[0]
     expected = 1e-3 * (high - low) if given == "default" else 2.0
     assert found["u"].noise == pytest.approx(expected)
     SafeEnv(problem).reset(seed=0)

@@ -10,7 +10,7 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, SafetyProblem
 from safe_envs.errors import ConfigurationError, NumericalError, SystemDefinitionError
-from safe_envs.problem.builder import state_problem
+from safe_envs.problem.builder import define_problem
 from safe_envs.problem.named_sets import NamedSets, set_expressions, set_names
 from tests.conftest import problem_of
 
@@ -19,8 +19,14 @@ SYSTEM = ControlAffineSDE((x, y), (u,), [y, -k * x], [0, 1], [[0], [0]], {k: 2.0
 
 
 def own_problem(**rest) -> SafetyProblem:
-    return state_problem(
-        SYSTEM, [1 - y, 1 + y], box=(-1.0, 1.0), start=[0.0, 0.0], dt=0.1, horizon=1.0, **rest
+    return define_problem(
+        SYSTEM,
+        [1 - y, 1 + y],
+        input_bounds=(-1.0, 1.0),
+        start=[0.0, 0.0],
+        dt=0.1,
+        horizon=1.0,
+        **rest,
     )
 
 

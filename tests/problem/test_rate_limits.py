@@ -13,7 +13,7 @@ from safe_envs import ControlAffineSDE, SafeEnv, SafeVectorEnv
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError
 from safe_envs.filters.conditions import parse_conditions
-from safe_envs.problem.builder import state_problem
+from safe_envs.problem.builder import define_problem
 from safe_envs.problem.problem import Barrier
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper
 from tests.conftest import problem_of
@@ -24,17 +24,17 @@ SYSTEM = ControlAffineSDE((x, y), (u,), [y, -k * sp.sin(x)], [0, 1], [0, 0], {k:
 
 
 def oscillator(**rest):
-    given = {"box": (-2.0, 3.0), "start": [0.0, 0.0], "dt": 0.1, "horizon": 2.0}
-    return state_problem(SYSTEM, 1 - x**2, **{**given, "gains": (1.0, 3.0), **rest})
+    given = {"input_bounds": (-2.0, 3.0), "start": [0.0, 0.0], "dt": 0.1, "horizon": 2.0}
+    return define_problem(SYSTEM, 1 - x**2, **{**given, "gains": (1.0, 3.0), **rest})
 
 
 def test_the_constraint_is_that_of_the_system_augmented_by_hand():
     limited = oscillator().configured(rate_limit=(-4.0, 6.0))
     rates = [y, -k * sp.sin(x) + u, 0]
     by_hand = ControlAffineSDE((x, y, u), (v,), rates, [0, 0, 1], [0, 0, 0], {k: 2.0})
-    pairs = [(Barrier(1 - x**2), *parse_conditions("hocbf:p=1,3,5", limited))]
-    hand = SafetyFilter(by_hand, pairs, bounds=(-4.0, 6.0))
-    ours = SafetyFilter.for_problem(limited, "hocbf:p=1,3,5")
+    pairs = [(Barrier(1 - x**2), *parse_conditions("hocbf:alpha=1,3,5", limited))]
+    hand = SafetyFilter(by_hand, pairs, input_bounds=(-4.0, 6.0))
+    ours = SafetyFilter.for_problem(limited, "hocbf:alpha=1,3,5")
     # Where no bound of u is within reach of one period: -2 + .4 <= u <= 3 - .6.
     states = np.random.default_rng(0).uniform([-0.9, -1.0, -1.59], [0.9, 1.0, 2.39], (500, 3))
     proposed = np.random.default_rng(1).uniform(-4.0, 6.0, (500, 1))
@@ -58,10 +58,10 @@ def test_near_a_bound_the_rates_that_cross_it_are_left_out(own):
 @pytest.mark.parametrize("substeps", [1, 3])
 def test_inputs_and_rates_stay_within_their_bounds_for_thousands_of_steps(sigma, substeps):
     noisy = ControlAffineSDE((x,), (u, w), [-x], [[1, 1]], [[sigma]])
-    problem = state_problem(
+    problem = define_problem(
         noisy,
         100 - x**2,
-        box=[(-1.0, 3.0), (0.2, 0.3)],
+        input_bounds=[(-1.0, 3.0), (0.2, 0.3)],
         start=[0.0],
         dt=0.1,
         horizon=100.0,
@@ -88,8 +88,14 @@ def test_inputs_and_rates_stay_within_their_bounds_for_thousands_of_steps(sigma,
 
 def test_one_step_of_euler_reaches_what_a_slewing_actuator_reaches():
     noisy = ControlAffineSDE((x,), (u,), [-x], [1], [sp.Rational(1, 10)])
-    problem = state_problem(
-        noisy, 100 - x**2, box=(-1.0, 1.0), start=[0.0], dt=0.1, horizon=90.0, nominal=x * 5 - 0.3
+    problem = define_problem(
+        noisy,
+        100 - x**2,
+        input_bounds=(-1.0, 1.0),
+        start=[0.0],
+        dt=0.1,
+        horizon=90.0,
+        nominal=x * 5 - 0.3,
     )
     env = SafeEnv(problem.configured(rate_limit=(-2.0, 3.0)))
     env.reset(seed=0)
@@ -115,14 +121,14 @@ def test_what_else_follows():
     assert limited.inputs[0].unit == "rad/s/s"
     assert limited.frame is not None
     assert limited.frame.section[-1] == problem.inputs[0].symbol
-    assert limited.configured(dt=problem.dt, box=limited.box) == limited
+    assert limited.configured(dt=problem.dt, input_bounds=limited.input_bounds) == limited
     assert limited.configured(noise=0.1).rates == ((-5.0, 5.0),)
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0, 1.0])
     assert SafeEnv(given).reset(seed=0)[0][-1] == 1.0
     given = problem.configured(rate_limit=(-5.0, 5.0), start=[0.1, 0.0, 0.0])
     assert SafeEnv(given).reset(seed=0)[0][-1] == 0.0
-    several = state_problem(
-        SYSTEM, [1 - x, 2 - y], box=(-1, 1), start=[0, 0], dt=0.1, horizon=1.0
+    several = define_problem(
+        SYSTEM, [1 - x, 2 - y], input_bounds=(-1, 1), start=[0, 0], dt=0.1, horizon=1.0
     ).configured(rate_limit=(-1, 1))
     assert [len(gains) for gains in several.gains] == [3, 2]
     acc = problem_of("safe_envs/ACC-v0").configured(rate_limit=(-1e4, 1e4))
@@ -135,7 +141,7 @@ def test_compiled_programs_have_the_same_rates():
     make = functools.partial(gym.make_vec, "safe_envs/Pendulum-v0", num_envs=2)
     options = {"autoreset_mode": "SameStep", "rate_limit": (-20.0, 50.0), "horizon": 0.06}
     envs = [
-        SafetyFilterVectorWrapper(make(engine=engine, **options), "szcbf:alphas=1,50")
+        SafetyFilterVectorWrapper(make(engine=engine, **options), "szcbf:alpha=1,50")
         for engine in ("numpy", "compiled")
     ]
     for env in envs:
@@ -146,7 +152,9 @@ def test_compiled_programs_have_the_same_rates():
         np.testing.assert_allclose(mine["safe_action"], other["safe_action"], rtol=1e-9)
 
 
-@pytest.mark.parametrize("options", [{"dt": 0.01}, {"box": (-1, 1)}, {"rate_limit": (-1, 1)}])
+@pytest.mark.parametrize(
+    "options", [{"dt": 0.01}, {"input_bounds": (-1, 1)}, {"rate_limit": (-1, 1)}]
+)
 def test_what_the_rates_come_from_is_changed_together_or_not_at_all(options):
     limited = oscillator().configured(rate_limit=(-4.0, 6.0))
     with pytest.raises(ConfigurationError, match=f"{next(iter(options))}: "):
@@ -157,7 +165,9 @@ def test_what_the_rates_come_from_is_changed_together_or_not_at_all(options):
 
 def test_names_that_are_taken_are_refused():
     system = ControlAffineSDE((x, v), (u,), [v, 0], [0, 1], [0, 0])
-    problem = state_problem(system, 1 - x**2, box=(-1, 1), start=[0, 0], dt=0.1, horizon=1.0)
+    problem = define_problem(
+        system, 1 - x**2, input_bounds=(-1, 1), start=[0, 0], dt=0.1, horizon=1.0
+    )
     with pytest.raises(SystemDefinitionError, match="u_rate"):
         problem.configured(rate_limit=(-1.0, 1.0))
 

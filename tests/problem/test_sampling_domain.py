@@ -77,6 +77,6 @@ def test_every_problem_can_be_explored(env_id):
     problem = make_problem(env_id)
     domain = problem.sampling_domain
     assert len(domain.region) == len(problem.states)
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     assert all(((low <= u) & (u <= high)).all() for u in np.array(domain.inputs))
     assert set().union(*(c.free_symbols for c in domain.coordinates)) <= set(problem.plant.states)

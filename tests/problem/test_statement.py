@@ -18,7 +18,7 @@ from safe_envs import (
     SafeVectorEnv,
     SystemDefinitionError,
     SystemDefinitionWarning,
-    state_problem,
+    define_problem,
 )
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.signals import TIME, Feature
@@ -29,11 +29,11 @@ x, v, u, w, k, sigma = sp.symbols("x v u w k sigma", real=True)
 SYSTEM = ControlAffineSDE.from_rate(
     (x, v), (u,), [v, k * u - x], diffusion=[0, sigma], parameters={k: 2.0, sigma: 0.1}
 )
-NUMBERS = {"box": (-5.0, 5.0), "start": [(-0.5, 0.5), 0.0], "dt": 0.05, "horizon": 2.0}
+NUMBERS = {"input_bounds": (-5.0, 5.0), "start": [(-0.5, 0.5), 0.0], "dt": 0.05, "horizon": 2.0}
 
 
 def stated(system: ControlAffineSDE = SYSTEM, barriers: object = 1 - x**2, **numbers):
-    return state_problem(system, barriers, **{**NUMBERS, **numbers})
+    return define_problem(system, barriers, **{**NUMBERS, **numbers})
 
 
 def features(*names):
@@ -101,9 +101,9 @@ def test_starts_are_drawn_from_the_ranges_where_all_barriers_are_positive():
         ({"workspace": {"x": (-2.0, 3.0)}}, SystemDefinitionError, "the symbol itself"),
         ({"start": [0.0]}, SystemDefinitionError, "2 states: x, v"),
         ({"start": [(0.0, math.inf), 0.0]}, ConfigurationError, "not finite"),
-        ({"box": (1.0, -1.0)}, ConfigurationError, "lower one below the upper"),
-        ({"box": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "give \\(low, high\\)"),
-        ({"box": 3.0}, ConfigurationError, "give \\(low, high\\)"),
+        ({"input_bounds": (1.0, -1.0)}, ConfigurationError, "lower one below the upper"),
+        ({"input_bounds": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "give \\(low, high\\)"),
+        ({"input_bounds": 3.0}, ConfigurationError, "give \\(low, high\\)"),
         ({"system": IDLE}, SystemDefinitionError, "input w never appears"),
         ({"system": BY_NO_INPUT}, RelativeDegreeError, "no action can keep it positive"),
         ({"model": SYSTEM.with_parameters(k=0)}, SystemDefinitionError, "input u never appears"),
@@ -120,9 +120,15 @@ def test_mistakes_are_found_and_explained(change, error, says):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"box": (-500.0, 500.0), "workspace": {v: (-3.0, 3.0)}}, "across its whole workspace"),
+        (
+            {"input_bounds": (-500.0, 500.0), "workspace": {v: (-3.0, 3.0)}},
+            "across its whole workspace",
+        ),
         ({"nominal": -5000 * (x + 2)}, "check that both have the unit"),
-        ({"box": (-1e-4, 1e-4), "start": [0.9, 0.9]}, "the input bounds are too narrow for h"),
+        (
+            {"input_bounds": (-1e-4, 1e-4), "start": [0.9, 0.9]},
+            "the input bounds are too narrow for h",
+        ),
         ({"start": [(-300.0, 300.0), 0.0]}, "degrees for radians"),
     ],
 )
@@ -137,7 +143,7 @@ def test_what_other_units_would_explain_is_doubtful(change, says):
 def test_what_is_sound_is_not_doubted():
     stated(
         system=ControlAffineSDE.from_rate((x, v), (u,), [v, u - 1000]),
-        box=(990.0, 1010.0),
+        input_bounds=(990.0, 1010.0),
         workspace={v: (-50.0, 50.0)},
     )
     by_the_noise_alone = ControlAffineSDE((x, v), (u,), [-x, 0], [0, 1], [v, 0])
@@ -146,10 +152,10 @@ def test_what_is_sound_is_not_doubted():
 
 def test_starts_are_in_the_workspace_and_where_the_system_has_a_value():
     system = ControlAffineSDE.from_rate((x,), (u,), [sp.sqrt(x) + u])
-    problem = state_problem(
+    problem = define_problem(
         system,
         x - 0.1,
-        box=(-5, 5),
+        input_bounds=(-5, 5),
         start=[(-0.5, 2.0)],
         dt=0.1,
         horizon=1.0,
@@ -162,10 +168,12 @@ def test_starts_are_in_the_workspace_and_where_the_system_has_a_value():
 
 
 def test_arrays_are_taken_for_start_and_box():
-    assert stated(start=np.array([0.1, 0.0]), box=np.array([-5.0, 5.0])).box == ((-5.0, 5.0),)
-    assert stated(start=np.array([[-0.1, 0.1], [0.0, 0.0]]), box=np.array([[-5.0, 5.0]])).box == (
+    assert stated(start=np.array([0.1, 0.0]), input_bounds=np.array([-5.0, 5.0])).input_bounds == (
         (-5.0, 5.0),
     )
+    assert stated(
+        start=np.array([[-0.1, 0.1], [0.0, 0.0]]), input_bounds=np.array([[-5.0, 5.0]])
+    ).input_bounds == ((-5.0, 5.0),)
 
 
 def test_what_is_given_is_what_the_problem_has():
@@ -187,10 +195,10 @@ def test_boxes_without_zero_and_several_inputs_are_weighed_rightly():
     # needed.
     drift = ControlAffineSDE.from_rate((x,), (u, w), [u + w - 4000])
     with pytest.warns(SystemDefinitionWarning, match="the inputs make up 10"):
-        state_problem(
+        define_problem(
             drift,
             x + 1,
-            box=[(-30.0, 4.0), (-30.0, 6.0)],
+            input_bounds=[(-30.0, 4.0), (-30.0, 6.0)],
             start=[0.0],
             dt=0.01,
             horizon=1.0,
@@ -208,10 +216,10 @@ def test_names_of_symbols_are_free_and_scalar_and_vector_envs_agree(name):
         system = ControlAffineSDE(
             (state, v), (force,), [sp.sin(v) * rate, 0], [0, 1], [0, sigma], {rate: 2.0, sigma: 0.3}
         )
-        problem = state_problem(
+        problem = define_problem(
             system,
             1 - state**2 - sp.sin(state) ** 2,
-            **{**NUMBERS, "box": (-1, 1)},
+            **{**NUMBERS, "input_bounds": (-1, 1)},
             nominal=-state,
             reward=state * force * sp.cos(TIME),
         )
@@ -233,7 +241,7 @@ def test_names_of_symbols_are_free_and_scalar_and_vector_envs_agree(name):
 @pytest.mark.parametrize("h", [1 - sp.Abs(x), sp.Min(1 - x, 1 + x), sp.Max(0.5 - x, 1 - x**2)])
 def test_a_barrier_with_kinks_under_noise_is_kept_by_its_pieces_or_refused(h):
     system = ControlAffineSDE((x,), (u,), [0], [1], [sigma], {sigma: 0.3})
-    problem = stated(system, h, box=(-1, 1), start=[0.1])
+    problem = stated(system, h, input_bounds=(-1, 1), start=[0.1])
     env = SafeEnv(problem)
     env.reset(seed=0)
     env.step([1.0])

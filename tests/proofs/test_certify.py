@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates.checker import check
 from safe_envs.proofs.certify import Named, SynthesisSettings, certify
@@ -24,10 +24,10 @@ TURN = 2 * math.pi
 def brownian(horizon, start=math.pi / 2, drift=u):
     """Brownian motion in (0, pi) under the nominal input, which is 0."""
     system = ControlAffineSDE.from_rate((x,), (u,), [drift], diffusion=[1])
-    return state_problem(
+    return define_problem(
         system,
         [x, sp.pi - x],
-        box=(-1, 1),
+        input_bounds=(-1, 1),
         start=(start,) if np.isscalar(start) else [start],
         nominal=0,
         dt=0.01,
@@ -79,10 +79,10 @@ def test_no_degree_is_proved_worse_than_a_lower_one():
     drift = [-1.5 * x + y, -x - 1.5 * y + u]
     noise = [[0.2 * x, 0], [0, 0.2 * y]]
     system = ControlAffineSDE.from_rate((x, y), (u,), drift, diffusion=noise)
-    problem = state_problem(
+    problem = define_problem(
         system,
         x + 80,
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         start=[(45.0, 55.0), (-55.0, -45.0)],
         dt=0.01,
         horizon=1.0,
@@ -122,10 +122,10 @@ def test_nothing_is_certified_where_the_system_leaves_at_once():
 def test_starts_are_taken_within_the_period_of_an_angle():
     system = ControlAffineSDE.from_rate((x, y), (u,), [u - x, 1], diffusion=[0.3, 0])
     problems = [
-        state_problem(
+        define_problem(
             system,
             1 - x**2 + sp.cos(y) / 100,
-            box=(-1, 1),
+            input_bounds=(-1, 1),
             start=(0.0, angle),
             nominal=0,
             dt=0.01,
@@ -176,10 +176,10 @@ def test_a_low_degree_proves_a_bound_of_the_scalar_system_under_held_input():
 def two_inputs():
     """A problem with an input for each of its two states."""
     v = sp.Symbol("v", real=True)
-    return state_problem(
+    return define_problem(
         ControlAffineSDE.from_rate((x, y), (u, v), [u, v], diffusion=[[0.1, 0], [0, 0.1]]),
         1 - x**2,
-        box=(-1, 1),
+        input_bounds=(-1, 1),
         start=(0.0, 0.0),
         dt=0.1,
         horizon=1.0,

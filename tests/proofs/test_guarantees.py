@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.problem.problem import Barrier
 from safe_envs.proofs.guarantees import HOLDING
 from tests.conftest import problem_of
@@ -101,7 +101,7 @@ def test_leaving_the_workspace_counts_as_it_is_evaluated():
     """Brownian motion in [0, 2] with h = x: the bound x/2 is attained, for h is a martingale that
     ends at one of the two edges."""
     problem = problem_with(
-        [0 * x], [x], noise=(1.0,), ranges=((-1.0, 2.0),), box=(-1e-9, 1e-9), start=0.5
+        [0 * x], [x], noise=(1.0,), ranges=((-1.0, 2.0),), input_bounds=(-1e-9, 1e-9), start=0.5
     )
     bound = made_bound(replace(problem, horizon=20.0))
     assert bound.at(np.array([[0.5]]), 20.0)[0] == pytest.approx(0.25, abs=1e-6)
@@ -189,7 +189,7 @@ def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
     found = findings("safe_envs/Scalar-v0", "cbf", noise=0)
     (bound,) = found.guarantee.applicable_bounds(np.array([[0.0], [0.5]]), 1.0)
     assert (bound.status, bound.value) == ("proved", 1.0)
-    weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, box=[-0.8, 0.8])
+    weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, input_bounds=[-0.8, 0.8])
     near, far = (
         weak.guarantee.applicable_bounds(np.array([[0.99]]), 1.0),
         weak.guarantee.applicable_bounds(np.array([[0.0]]), 1.0),
@@ -202,14 +202,14 @@ def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
 
 
 def test_zeroing_forms_and_the_misprint():
-    bounds = findings(CUBIC_DISK, "szcbf:alphas=2").guarantee.applicable_bounds(
+    bounds = findings(CUBIC_DISK, "szcbf:alpha=2").guarantee.applicable_bounds(
         np.array([[0.5, 0.0]]), 1.0
     )
     assert by_name(bounds, "printed").status == "not established"
     assert by_name(bounds, "printed").value == pytest.approx(0.75 * math.exp(-1.0))
     assert by_name(bounds, "corrected").status == "proved"
     assert by_name(bounds, "corrected").value == pytest.approx(0.75 * math.exp(-2.0))
-    slow = findings(CUBIC_DISK, "szcbf:alphas=0.5").guarantee.applicable_bounds(
+    slow = findings(CUBIC_DISK, "szcbf:alpha=0.5").guarantee.applicable_bounds(
         np.array([[0.5, 0.0]]), 1.0
     )
     assert by_name(slow, "printed").value < by_name(slow, "corrected").value
@@ -240,7 +240,7 @@ def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
 
 @pytest.mark.parametrize(("width", "scale"), [(50.0, 1.0), (1e12, 1e-6)])
 def test_no_box_holds_an_srcbf_under_noise(width, scale):
-    problem = problem_with([x], [scale * (1 - x)], noise=(0.2,), box=(-width, width))
+    problem = problem_with([x], [scale * (1 - x)], noise=(0.2,), input_bounds=(-width, width))
     guarantee = made_bound(problem, "srcbf")
     (bound,) = guarantee.applicable_bounds(np.array([[0.5]]), 1.0)
     assert bound.status == "hypothesis fails"
@@ -256,7 +256,7 @@ def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept, monkeyp
     hurry(monkeypatch)
     # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least
     # like h.
-    problem = problem_with([0 * x], [1 - x**2], noise=(noise,), box=(-1e6, 1e6))
+    problem = problem_with([0 * x], [1 - x**2], noise=(noise,), input_bounds=(-1e6, 1e6))
     assert ("unbounded control" in (made_bound(problem, "srcbf").note or "")) is not kept
 
 
@@ -289,7 +289,7 @@ def test_a_range_that_was_chosen_establishes_nothing():
         start=0.0,
     )
     reason = "looked at only for y in [-10, 10]: the workspace is unbounded"
-    guarantee = made_bound(problem, "szcbf:alphas=.1")
+    guarantee = made_bound(problem, "szcbf:alpha=.1")
     bounds = guarantee.applicable_bounds(np.array([[0.0, 0.0]]), 1.0)
     assert {(b.status, b.reason) for b in bounds} == {("not established", reason)}
     assert guarantee.note == reason
@@ -311,7 +311,7 @@ def test_conditions_that_share_several_inputs_have_no_bound(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("env_id", "text"), [(CUBIC_DISK, "szcbf:alphas=2"), (STOCHASTIC, "szcbf:alphas=.1,.1")]
+    ("env_id", "text"), [(CUBIC_DISK, "szcbf:alpha=2"), (STOCHASTIC, "szcbf:alpha=.1,.1")]
 )
 def test_the_bound_is_the_best_of_those_that_hold(env_id, text):
     guarantee = findings(env_id, text).guarantee
@@ -358,10 +358,10 @@ def crowd(noise):
     ]
     angles = 2.0 * np.pi * np.arange(4) / 4
     start = 2.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1).ravel()
-    return state_problem(
+    return define_problem(
         system,
         barriers,
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         start=start.tolist(),
         dt=0.05,
         horizon=5.0,

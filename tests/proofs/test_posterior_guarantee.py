@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 from scipy import stats
 
-from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, state_problem
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, define_problem
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.filters.learning.bayesian import identify
@@ -65,7 +65,7 @@ def best_rows(problem, posterior, simultaneous, x):
         return mean - np.sqrt(variance)
 
     # The row is concave in the input, so that the best one is a step from the best that was tried.
-    low, high = (np.full(len(x), end) for end in problem.box[0])
+    low, high = (np.full(len(x), end) for end in problem.input_bounds[0])
     for _ in range(3):
         tried = low + (high - low) * np.linspace(0.0, 1.0, 21)[:, None]
         best = np.array([row(u) for u in tried])
@@ -193,10 +193,10 @@ def unstable(**options):
     """dx = (3 x + u) dt + .05 dW, inside of |x| < 1."""
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE.from_rate((x,), (u,), [3 * x + u], diffusion=[0.05])
-    return state_problem(
+    return define_problem(
         system,
         [1 - x**2],
-        box=(-10, 10),
+        input_bounds=(-10, 10),
         workspace={x: (-2, 2)},
         start=(0.5,),
         horizon=1.0,

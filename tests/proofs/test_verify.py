@@ -80,7 +80,7 @@ def test_radial_headings_leave_the_dubins_disk_without_control():
 
 @pytest.mark.parametrize(("rates", "missed"), [("1,1", 2 * 0.8**2 - 1), ("1,2", 0.0)])
 def test_the_centre_of_the_dubins_disk_needs_large_rates(rates, missed):
-    (barrier,) = findings(DUBINS, f"hocbf:p={rates}", "plant", samples=1024).barriers
+    (barrier,) = findings(DUBINS, f"hocbf:alpha={rates}", "plant", samples=1024).barriers
     np.testing.assert_allclose(barrier.deepest[:2], 0.0, atol=1e-4)
     assert barrier.deepest_shortfall == pytest.approx(missed, abs=1e-5)
 
@@ -91,8 +91,8 @@ def test_the_centre_of_the_dubins_disk_needs_large_rates(rates, missed):
 def test_a_wide_box_hides_no_state_without_control(exponent):
     # As above, with p_1 = p_2 = .5; at the centre b_2 is p_1 p_2 - 2 v^2, whatever the input is.
     v, p = 0.5, 0.5
-    problem = problem_of(DUBINS, plant={"v": v}, box=[-(10.0**exponent), 10.0**exponent])
-    found = made(problem, "hocbf:p=.5,.5", samples=1024, seed=exponent)
+    problem = problem_of(DUBINS, plant={"v": v}, input_bounds=[-(10.0**exponent), 10.0**exponent])
+    found = made(problem, "hocbf:alpha=.5,.5", samples=1024, seed=exponent)
     rho = (-2 * v + math.sqrt(4 * v * v + 4 * p * p)) / (2 * p)
     assert found.invariant_set.shortfall == pytest.approx(2 * v * (v + p * rho), rel=1e-6)
     assert found.barriers[0].vanishes
@@ -101,8 +101,8 @@ def test_a_wide_box_hides_no_state_without_control(exponent):
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.oracle)])
 def test_moderately_wide_boxes_do_not_depend_on_the_seed(seed):
-    problem = problem_of(STOCHASTIC, box=[-1e4, 1e4])
-    found = made(problem, "szcbf:alphas=5,5", samples=2048, seed=seed)
+    problem = problem_of(STOCHASTIC, input_bounds=[-1e4, 1e4])
+    found = made(problem, "szcbf:alpha=5,5", samples=2048, seed=seed)
     assert found.invariant_set.shortfall == pytest.approx(60.878095, rel=1e-6)
 
 
@@ -143,7 +143,7 @@ def pockets(width, depth, offset):
 @pytest.mark.parametrize("width", [0.05, pytest.param(0.01, marks=pytest.mark.oracle)])
 def test_a_pocket_of_conflict_is_found(width):
     # At the edge of both the best common margin is the mean of the two offsets, less the depth.
-    found = made(pockets(width, 5.0, (0.2, 0.2)), "szcbf:alphas=.1").invariant_set
+    found = made(pockets(width, 5.0, (0.2, 0.2)), "szcbf:alpha=.1").invariant_set
     assert found.shortfall == pytest.approx(4.8, rel=1e-3)
     np.testing.assert_allclose(found.worst, [0.0, 0.0, 0.3, -0.2], atol=1e-3)
 
@@ -153,7 +153,7 @@ def test_a_pocket_of_conflict_is_found(width):
     [
         (problem_of(STOCHASTIC), "scbf"),
         (system_in_a_box(high=0.1), "scbf"),
-        (pockets(0.5, 5.0, (-1.0, 1.2)), "szcbf:alphas=.1"),
+        (pockets(0.5, 5.0, (-1.0, 1.2)), "szcbf:alpha=.1"),
     ],
     ids=["degree two", "one input", "two barriers on one input"],
 )
@@ -220,7 +220,7 @@ def test_the_invariant_set_is_a_part_of_the_safe_set(slowest, rates, share):
         ranges=((-1.0, 1.0), (slowest, 1.0)),
         start=0.5,
     )
-    found = made(problem, f"hocbf:p={rates}", samples=4096)
+    found = made(problem, f"hocbf:alpha={rates}", samples=4096)
     assert found.invariant_set.share == pytest.approx(share, abs=0.005)
     assert found.safe_set.share == pytest.approx(0.5, abs=0.005)
 
@@ -246,7 +246,7 @@ def test_a_narrow_peak_is_in_the_supremum(seed):
         states=(x, y, z),
         inputs=((1.0,), (0.0,), (0.0,)),
         ranges=((-2.0, 2.0),) * 3,
-        box=(-1000.0, 1000.0),
+        input_bounds=(-1000.0, 1000.0),
     )
     (barrier,) = made(problem, "szcbf", seed=seed).barriers
     assert barrier.supremum == pytest.approx(5.91, abs=0.01)
@@ -323,7 +323,7 @@ KINK, POLE = "twice differentiable", "a pole"
 )
 def test_a_kink_or_pole_in_the_safe_set_leaves_no_bound_under_noise(barrier, rough, monkeypatch):
     hurry(monkeypatch)
-    bound = made_bound(problem_with([0 * x], [barrier], noise=(0.3,)), "szcbf:alphas=0.1")
+    bound = made_bound(problem_with([0 * x], [barrier], noise=(0.3,)), "szcbf:alpha=0.1")
     told = (bound.note or "") + (bound.remark if not rough else "")
     assert (rough in told) if rough else not (KINK in told or POLE in told)
     assert not rough or bound.at(np.array([[0.5]]), 0.1)[0] == 0.0

@@ -79,7 +79,12 @@ def findings(env_id, text=None, knowledge="model", samples=analysis.SAMPLES, **o
 def verify_once(problem, conditions, knowledge="model", samples=analysis.SAMPLES, seed=0):
     """`verify`, once for all tests that ask for the same."""
     parts = (problem.name, problem.plant, problem.model, problem.barriers, problem.states)
-    numbers = (problem.box, repr(problem.starts[problem.start]), problem.dt, problem.horizon)
+    numbers = (
+        problem.input_bounds,
+        repr(problem.starts[problem.start]),
+        problem.dt,
+        problem.horizon,
+    )
     key = (parts, numbers, problem.start, tuple(conditions), knowledge, samples, seed)
     if key not in _FOUND:
         _FOUND[key] = verify(problem, conditions, knowledge, samples, seed)

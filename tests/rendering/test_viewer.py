@@ -98,7 +98,7 @@ def test_warning_colors_say_what_the_filter_does():
 def test_without_a_filter_there_is_no_nominal_action():
     env = SafeEnv(problem_of(DUBINS), render_mode="rgb_array")
     bare = stepped(env, 1).render()
-    filtered = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "szcbf:alphas=9,9")
+    filtered = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "szcbf:alpha=9,9")
     assert (stepped(filtered, 1).render()[170:210, PANEL] != bare[170:210, PANEL]).any()
 
 

@@ -3,7 +3,7 @@
 SYSTEM = """
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 
 x, v, u, sigma = sp.symbols("x v u sigma", real=True)
 
@@ -14,7 +14,7 @@ def _cart(noise, parameters, barrier=1 - x**2, **more):
     )
     given = {"start": [(-0.5, 0.5), (-0.5, 0.5)], "dt": 0.03, "horizon": 1.0}
     given |= {"nominal": 1.5 * v - 4 * x, "gains": (2.0, 2.0)}
-    return state_problem(system, barrier, box=(-5.0, 5.0), name="cart", **{**given, **more})
+    return define_problem(system, barrier, box=(-5.0, 5.0), name="cart", **{**given, **more})
 
 
 problem = _cart(sigma, {sigma: 0.1})

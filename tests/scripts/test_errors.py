@@ -36,11 +36,11 @@ evaluate Scalar-v0 --filter cbf:alpha=1_0 | '1_0'
 evaluate Scalar-v0 --filter cbf:alpha | alpha
 evaluate Scalar-v0 --filter scbf@state | --estimator
 evaluate StochasticDubins-v0 --filter hocbf:q=1,1 | 'q'
-evaluate StochasticDubins-v0 --filter hocbf:p=-1,1 | positive
-evaluate StochasticDubins-v0 --filter hocbf:p=1 | relative degree 2
+evaluate StochasticDubins-v0 --filter hocbf:alpha=-1,1 | positive
+evaluate StochasticDubins-v0 --filter hocbf:alpha=1 | relative degree 2
 evaluate StochasticDubins-v0 --filter cbf | use hocbf or ecbf
 evaluate StochasticDubins-v0 --filter ecbf:k=9,1 | poles
-evaluate StochasticDubins-v0 --filter hocbf:p=1,2+scbf | 2 conditions
+evaluate StochasticDubins-v0 --filter hocbf:alpha=1,2+scbf | 2 conditions
 evaluate Scalar-v0 --filter none+scbf | 'none'
 evaluate CubicSDEDisk-v0 --filter bayesian | bayesian-scbf
 evaluate CubicSDEDisk-v0 --filter bayesian-scbf --learned none.npz | none.npz
@@ -71,10 +71,10 @@ evaluate Scalar-v0 --plant sigma=DIGITS | sigma = inf
 evaluate Scalar-v0 --model sigma=inf | sigma
 evaluate Scalar-v0 --barrier limt=1 | did you mean 'limit'
 evaluate Scalar-v0 --barrier limit=1_0 | '1_0'
-evaluate Scalar-v0 --box 1 | '1'
-evaluate Scalar-v0 --box=-1_0,1 | '-1_0,1'
-evaluate Scalar-v0 --box 2,1 | box
-evaluate Scalar-v0 --box 0,1 --box 0,1 | box
+evaluate Scalar-v0 --input-bounds 1 | '1'
+evaluate Scalar-v0 --input-bounds=-1_0,1 | '-1_0,1'
+evaluate Scalar-v0 --input-bounds 2,1 | box
+evaluate Scalar-v0 --input-bounds 0,1 --input-bounds 0,1 | box
 evaluate Scalar-v0 --start 1,2 | start has 2 numbers
 evaluate Scalar-v0 --start 1_0 | '1_0'
 evaluate StochasticDubins-v0 --start inwrd | did you mean 'inward'
@@ -250,7 +250,7 @@ identify DubinsDisk-v0 --method learned-hocbf --out l.npz --data other.npz | --d
 identify --system own.py:problem --method bayesian --out l.npz | workspace
 verify CubicSDEDisk-v0 --filter none | 'none'
 verify CubicSDEDisk-v0 --filter '' | ''
-verify CubicSDEDisk-v0 --filter hocbf:p=1,2 | relative degree 1
+verify CubicSDEDisk-v0 --filter hocbf:alpha=1,2 | relative degree 1
 verify CubicSDEDisk-v0 --knowledge guess | guess
 verify CubicSDEDisk-v0 --episodes 0 | episodes = 0
 verify CubicSDEDisk-v0 --policy missing.zip --no-simulate | no such file

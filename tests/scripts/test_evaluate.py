@@ -30,13 +30,13 @@ ROW_KEYS = {field.name for field in fields(EvaluationRow)} - SELDOM
 
 def test_json_has_the_documented_keys(safe_envs_command):
     status, _, err = safe_envs_command(
-        "evaluate", DUBINS, "--filter none --filter hocbf:p=1,2", *QUICK, "--json out.json"
+        "evaluate", DUBINS, "--filter none --filter hocbf:alpha=1,2", *QUICK, "--json out.json"
     )
     assert (status, err) == (0, "")
     document = strictly("out.json")
     assert list(document) == ["config", "versions", "rows", "comparisons", "timing", "best"]
     assert [{*row} for row in document["rows"]] == [ROW_KEYS, ROW_KEYS]
-    assert [row["filter"] for row in document["rows"]] == ["none", "hocbf:p=1,2"]
+    assert [row["filter"] for row in document["rows"]] == ["none", "hocbf:alpha=1,2"]
     assert {row["policy"] for row in document["rows"]} == {"nominal"}
     for row in document["rows"]:
         assert row["episodes"] == 8 == row["safe"] + row["violations"]
@@ -51,7 +51,7 @@ def test_json_has_the_documented_keys(safe_envs_command):
     ]
     assert {"safe-envs", "python", "numpy", "gymnasium"} <= set(document["versions"])
     assert document["timing"]["num_envs"] == 1024
-    assert [row["filter"] for row in document["timing"]["rows"]] == ["none", "hocbf:p=1,2"]
+    assert [row["filter"] for row in document["timing"]["rows"]] == ["none", "hocbf:alpha=1,2"]
     assert {(row["engine"], row["jobs"]) for row in document["timing"]["rows"]} == {("numpy", 1)}
     assert [p.name for p in Path().iterdir()] == ["out.json"]
 
@@ -71,7 +71,7 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
     status, out, _ = safe_envs_command(
         "evaluate StochasticDubins-v0 --filter hocbf --policy zero --episodes 6 --seed 5 --noise",
         ".1,.3 --plant v=1.5 --model v=1.7 --barrier radius=2.5 --knowledge plant --dt .02",
-        "--substeps 2 --horizon .4 --box -3,4 --start -0.5,0,1 --num-envs 4 --confidence .9",
+        "--substeps 2 --horizon .4 --input-bounds -3,4 --start -0.5,0,1 --num-envs 4 --confidence .9",
         "--json out.json",
     )
     assert status == 0
@@ -83,7 +83,7 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
         "dt": 0.02,
         "substeps": 2,
         "horizon": 0.4,
-        "box": [-3.0, 4.0],
+        "input_bounds": [-3.0, 4.0],
         "start": [-0.5, 0.0, 1.0],
     }
     wanted = evaluate(

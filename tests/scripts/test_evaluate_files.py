@@ -56,7 +56,7 @@ def test_a_policy_is_not_overwritten(safe_envs_command, ppo, policy):
 
 def test_forces_beyond_floating_point_are_an_error_not_a_crash(safe_envs_command):
     # The square of such an input is not finite, and infinity is no JSON.
-    arguments = "--box -1e200,1e200 --policy random --filter none --json out.json"
+    arguments = "--input-bounds -1e200,1e200 --policy random --filter none --json out.json"
     status, _, err = safe_envs_command("evaluate Scalar-v0", *QUICK, arguments)
     assert status in (0, 2)
     assert "Traceback" not in err

@@ -40,10 +40,10 @@ def drawn(path) -> list[np.ndarray]:
 def test_a_still_of_two_filters(tmp_path):
     out = tmp_path / "end.png"
     line = f"safe_envs/DubinsDisk-v0 --horizon 2 --start 0,0.1,0 --out {out}"
-    result = render(line, "--compare none,hocbf:p=2,8")
+    result = render(line, "--compare none,hocbf:alpha=2,8")
     assert result.exit_code == 0, result.output
     assert "none: violation at" in result.output
-    assert "hocbf:p=2,8: " in result.output
+    assert "hocbf:alpha=2,8: " in result.output
     (both,) = drawn(out)
     assert both.shape == (540, 1920, 3)
     bare = both[:, :960]
@@ -88,12 +88,15 @@ def test_an_episode_as_video_and_animation(tmp_path):
 
 def test_filters_are_divided_at_their_names():
     assert split_filters("none,scbf") == ["none", "scbf"]
-    assert split_filters("hocbf:p=2,8,none, scbf:sampling_margin=first-order") == [
-        "hocbf:p=2,8",
+    assert split_filters("hocbf:alpha=2,8,none, scbf:sampling_margin=first-order") == [
+        "hocbf:alpha=2,8",
         "none",
         "scbf:sampling_margin=first-order",
     ]
-    assert split_filters("hocbf:p=2,8+cbf:alpha=1,scbf,scbf") == ["hocbf:p=2,8+cbf:alpha=1", "scbf"]
+    assert split_filters("hocbf:alpha=2,8+cbf:alpha=1,scbf,scbf") == [
+        "hocbf:alpha=2,8+cbf:alpha=1",
+        "scbf",
+    ]
     for text in ("", ",scbf"):
         with pytest.raises(ConfigurationError, match="names no filter"):
             split_filters(text)

@@ -118,7 +118,7 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
             "the start is outside C_1: b_1 = -1.26",
         ),
         pytest.param(
-            "DubinsDisk-v0 --filter hocbf:p=1,1 --knowledge plant",
+            "DubinsDisk-v0 --filter hocbf:alpha=1,1 --knowledge plant",
             "the best action violates it by 0.28",
             marks=pytest.mark.oracle,
         ),

@@ -38,7 +38,7 @@ class Simulated:
     def stays(self, law, x, steps):
         """Return the smallest barrier at control instants under a law, shape (N,)."""
         known = compile_function(self.problem.plant.states, law.law, "arrays")
-        low, high = np.array(self.problem.box).T
+        low, high = np.array(self.problem.input_bounds).T
         smallest = np.full(x.shape[1], np.inf)
         for _ in range(steps):
             smallest = np.minimum(smallest, stacked(self.safe(*x), x.shape[1]).min(axis=1))
@@ -50,7 +50,7 @@ class Simulated:
 @pytest.mark.parametrize(
     ("name", "options", "low", "high"),
     [
-        ("DubinsDisk", {"dt": 0.2, "box": (-2, 5)}, (-1, -1, -4), (1, 1, 4)),
+        ("DubinsDisk", {"dt": 0.2, "input_bounds": (-2, 5)}, (-1, -1, -4), (1, 1, 4)),
         ("ACCGap", {"dt": 0.2, "distance": 30.0}, (0, 30), (50, 200)),
         ("ACC", {"tau": 0.5, "dt": 0.2}, (0, 0, 0), (50, 50, 300)),
         *(
@@ -141,7 +141,7 @@ def stopping_distance(v, lead, force):
 def test_braking_reaches_the_exact_kernel_of_a_car():
     known = Simulated("ACCGap")
     (law,) = known.laws.laws
-    force = known.problem.box[0][1]
+    force = known.problem.input_bounds[0][1]
     speeds = np.linspace(21.0, 50.0, 15)
     exact = np.array([stopping_distance(v, 20.0, force) for v in speeds])
     for excess, kept in ((1e-3, True), (-1e-3, False)):
@@ -153,7 +153,7 @@ def test_braking_reaches_the_exact_kernel_of_a_car():
 def test_the_double_integrator_is_the_car_without_drag():
     known = Simulated("ACCGap", plant={"f_0": 0.0, "f_1": 0.0, "f_2": 0.0, "M": 1.0})
     (law,) = known.laws.laws
-    u = known.problem.box[0][1]
+    u = known.problem.input_bounds[0][1]
     gap, speed = sp.Symbol("z", real=True), sp.Symbol("v", real=True)
     b = law.terminal.args if isinstance(law.terminal, sp.Min) else (law.terminal,)
     expected = gap - 10 - sp.Max(0, speed - 20) ** 2 / (2 * u)
@@ -163,9 +163,9 @@ def test_the_double_integrator_is_the_car_without_drag():
 
 def test_numbers_that_allow_no_backup_leave_no_terminal_set():
     for name, options in (
-        ("DubinsDisk", {"box": (-0.1, 0.1)}),
+        ("DubinsDisk", {"input_bounds": (-0.1, 0.1)}),
         ("DubinsDisk", {"dt": 2.0}),
-        ("ACCGap", {"box": (0.0, 4000.0)}),
+        ("ACCGap", {"input_bounds": (0.0, 4000.0)}),
         ("ACCGap", {"plant": {"v_f": 0.01}, "model": {"v_f": 0.01}}),
     ):
         known = Simulated(name, **options)
@@ -198,7 +198,7 @@ def test_every_stated_backup_fits_its_model(name):
         ({"plant": {"f_1": -1.0}, "model": {"f_1": -1.0}}, "fall with the speed"),
         ({"plant": {"M": -5.0}}, "positive mass"),
         ({"plant": {"f_0": -5000.0}}, "above the lower bound"),
-        ({"box": (-4000.0, -100.0)}, "upper bound"),
+        ({"input_bounds": (-4000.0, -100.0)}, "upper bound"),
     ],
 )
 def test_what_the_proof_of_braking_takes_is_checked(options, said):

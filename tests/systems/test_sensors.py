@@ -33,7 +33,7 @@ def test_all_states_are_observable(env_id):
     problem, plant = problem_of(env_id), problem_of(env_id).plant
     field = plant.numeric(plant.drift + plant.input_matrix * sp.Matrix(plant.inputs))
     rng = np.random.default_rng(0)
-    u = [float(rng.uniform(low, high)) for low, high in problem.box]
+    u = [float(rng.uniform(low, high)) for low, high in problem.input_bounds]
     field = field.subs(dict(zip(plant.inputs, u, strict=True)))
     rows = sp.Matrix([plant.numeric(c.expression) for c in problem.sensors])
     found, x = np.empty((0, plant.n)), problem.starts[problem.start].proposals(1)[0]

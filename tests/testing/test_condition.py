@@ -24,7 +24,7 @@ DISK = problem_of("safe_envs/CubicSDEDisk-v0")
         ("cbf:alpha=s+s**3", "Scalar-v0"),
         ("rcbf", "Pendulum-v0"),
         ("srcbf:form=log", "CubicSDEDisk-v0"),
-        ("hocbf:p=2,s*Abs(s)", "DubinsDisk-v0"),
+        ("hocbf:alpha=2,s*Abs(s)", "DubinsDisk-v0"),
         ("ecbf:sampling_margin=first-order", "StochasticDubins-v0"),
         ("szcbf:sampling_margin=first-order", "ACCGap-v0"),
         ("scbf:sampling_margin=0.1", "QuadrotorLimits-v0"),

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import pytest
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, define_problem
 from safe_envs.problem.signals import Feature
 from safe_envs.problem.starts import Start
 from safe_envs.testing.system import check_system
@@ -19,8 +19,14 @@ SLOW = ControlAffineSDE((x,), (u,), [-x], [1], [s], {s: 0.1})
 
 
 def stated(barrier=1 - x, system=SLOW, **changes) -> SafetyProblem:
-    numbers = {"box": (-1, 1), "start": [(-0.5, 0.5)], "dt": 0.1, "horizon": 10.0, **changes}
-    return state_problem(system, barrier, **numbers)
+    numbers = {
+        "input_bounds": (-1, 1),
+        "start": [(-0.5, 0.5)],
+        "dt": 0.1,
+        "horizon": 10.0,
+        **changes,
+    }
+    return define_problem(system, barrier, **numbers)
 
 
 def test_every_registered_system_passes(env_id):
@@ -54,7 +60,7 @@ def chaotic() -> SafetyProblem:
     """x goes to .97 sin(pi x), which doubles an error of rounding at each step."""
     moved = (sp.Rational(97, 100) * sp.sin(sp.pi * x) - x) * 10
     system = ControlAffineSDE((x,), (u,), [moved], [1], [s], {s: 1e-9})
-    return stated(2 - x, system, start=[(0.2, 0.8)], box=(-1e-9, 1e-9))
+    return stated(2 - x, system, start=[(0.2, 0.8)], input_bounds=(-1e-9, 1e-9))
 
 
 CALLS = itertools.count()

@@ -124,9 +124,9 @@ def test_exact_derivatives_follow_the_closed_form_out_of_the_disk(p):
     # While the condition binds, h = (h(0) + b_1(0) t) exp(-p t).
     dt, b_1 = 0.002, -1.44 + 0.18 * p
     problem = make_problem(figure_3_1.DISK.env).configured(
-        start=figure_3_1.DISK.start, dt=dt, horizon=2.6, box=(-1000.0, 1000.0)
+        start=figure_3_1.DISK.start, dt=dt, horizon=2.6, input_bounds=(-1000.0, 1000.0)
     )
-    (run,) = learning.runs(problem, [f"hocbf:p={p},{p}"], policy="zero", knowledge="plant")
+    (run,) = learning.runs(problem, [f"hocbf:alpha={p},{p}"], policy="zero", knowledge="plant")
     time = -0.18 / b_1
     assert dt * int(np.argmax(run.h < 0)) == pytest.approx(time, abs=2 * dt)
     assert run.smallest == pytest.approx(b_1 / p * math.exp(-p * time - 1), rel=0.02)
@@ -177,7 +177,13 @@ def test_h_over_c_is_attained(start):
 
 def test_the_scalar_system_under_the_scbf_is_brownian():
     # With A h = 0, h = 1 - sigma W_t.
-    options = {"noise": 0.5, "start": [0.0], "box": [-1e12, 1e12], "dt": 0.005, "horizon": 2.5}
+    options = {
+        "noise": 0.5,
+        "start": [0.0],
+        "input_bounds": [-1e12, 1e12],
+        "dt": 0.005,
+        "horizon": 2.5,
+    }
     rate = measure("Scalar-v0", "scbf", 400, 0, options=options).rate / 100
     reach = 1 + example_4_2_2.SHIFT * 0.5 * math.sqrt(0.005)
     expected = 1 - 2 * float(ndtr(-reach / (0.5 * math.sqrt(2.5))))

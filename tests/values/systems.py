@@ -11,7 +11,7 @@ import sympy as sp
 from numpy.polynomial.legendre import leggauss
 from scipy.special import ndtr
 
-from safe_envs import ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import ControlAffineSDE, SafetyProblem, define_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings, ValueTable
@@ -35,7 +35,7 @@ def scalar(
         parameters={s: size} if s in used else {},
     )
     given = {
-        "box": (-1.0, 1.0),
+        "input_bounds": (-1.0, 1.0),
         "start": (0.5,),
         "dt": 0.1,
         "horizon": 1.0,
@@ -44,7 +44,7 @@ def scalar(
         "filter": "scbf",
         **options,
     }
-    return state_problem(system, barriers, **given)
+    return define_problem(system, barriers, **given)
 
 
 def pursued(**options):
@@ -57,10 +57,10 @@ def pursued(**options):
         diffusion=[[s], [0]],
         parameters={s: 0.3},
     )
-    return state_problem(
+    return define_problem(
         system,
         (x - y) ** 2 - sp.Rational(1, 25),
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         start=(0.6, -0.8),
         dt=0.1,
         horizon=1.5,

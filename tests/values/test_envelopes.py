@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, define_problem
 from safe_envs.problem.problem import Barrier
 from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.solve import solve
@@ -161,8 +161,8 @@ def test_robust_envelopes_are_around_the_value_of_every_parameter(drift, sigma, 
 def braking(**options):
     """Return dx = -x^2 - 1/2 + u (1 + x), whose best input for h = x - 0.3 is the largest one."""
     system = ControlAffineSDE((x,), (u,), [-(x**2) - 0.5], [[1 + x]], [[0]])
-    given = {"box": (0.0, 0.4), "start": (1.0,), "dt": 0.1, "horizon": 2.0, **options}
-    return state_problem(system, x - 0.3, workspace={x: (-1.0, 2.0)}, name="braking", **given)
+    given = {"input_bounds": (0.0, 0.4), "start": (1.0,), "dt": 0.1, "horizon": 2.0, **options}
+    return define_problem(system, x - 0.3, workspace={x: (-1.0, 2.0)}, name="braking", **given)
 
 
 def test_without_noise_a_step_of_runge_and_kutta():
@@ -210,7 +210,7 @@ def side_by_side(*names, horizon=0.3, **options):
         {s: 0.4} if any(f[1] is s for f in chosen) else {},
     )
     given = {
-        "box": (-1.0, 1.0),
+        "input_bounds": (-1.0, 1.0),
         "start": (0.5,) * len(names),
         "dt": 0.1,
         "horizon": horizon,
@@ -219,7 +219,7 @@ def side_by_side(*names, horizon=0.3, **options):
         **options,
     }
     barriers = [f[2](q) for f, q in zip(chosen, states, strict=True)]
-    return state_problem(system, barriers, name="side by side", **given)
+    return define_problem(system, barriers, name="side by side", **given)
 
 
 def safe_end(name):
@@ -302,7 +302,7 @@ def test_with_and_without_numba_tables_are_the_same(make, monkeypatch):
 @pytest.mark.parametrize(
     ("harder", "easier"),
     [
-        ({}, {"box": (-1.5, 1.5)}),
+        ({}, {"input_bounds": (-1.5, 1.5)}),
         ({"s": 0.6}, {"s": 0.3}),
         ({"horizon": 2.0}, {}),
         ({"barriers": x - R(1, 5)}, {}),
@@ -345,11 +345,11 @@ def test_leaving_the_workspace_counts_as_said():
 def test_leaving_beyond_another_end_of_the_safe_set():
     # The corner beyond x = 1 is safe only where y has left its workspace.
     system = ControlAffineSDE((x, y), (u, v), [0, -y / 2], sp.eye(2), sp.diag(0.4, R(3, 10)))
-    problem = state_problem(
+    problem = define_problem(
         system,
         [sp.Max(1 - x, y - 1)],
         workspace={x: (-2.0, 2.0), y: (-1.0, 1.0)},
-        box=(3.0, 8.0),
+        input_bounds=(3.0, 8.0),
         start=(0.5, 0.5),
         dt=0.1,
         horizon=0.3,

@@ -7,7 +7,7 @@ import pytest
 import sympy as sp
 from scipy.stats import norm
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.values.frontier import FrontierSettings, price_violations
@@ -24,8 +24,8 @@ def _walk(reward=REWARD, barrier=1 - x, **more):
     """A random walk with a push, which is safe below 1."""
     system = ControlAffineSDE.from_rate((x,), (u,), [u], diffusion=[NOISE])
     given = {"start": [0.2], "dt": DT, "horizon": STEPS * DT, "workspace": {x: (-3, 3)}}
-    given |= {"box": (-2.0, 2.0), "name": "walk", "reward": reward, "nominal": -x}
-    return state_problem(system, barrier, **{**given, **more})
+    given |= {"input_bounds": (-2.0, 2.0), "name": "walk", "reward": reward, "nominal": -x}
+    return define_problem(system, barrier, **{**given, **more})
 
 
 def _exact(prices, inputs):
@@ -122,14 +122,14 @@ def test_an_angle_has_no_ends():
     values = []
     for turn in (0.0, 1.04):  # With an edge of the safe set within, and at pi.
         system = ControlAffineSDE.from_rate((x,), (u,), [u], diffusion=[NOISE])
-        problem = state_problem(
+        problem = define_problem(
             system,
             sp.cos(x - turn) + sp.Rational(1, 2),
             start=[turn + 1.6],
             units={x: "rad"},
             dt=DT,
             horizon=STEPS * DT,
-            box=(-2.0, 2.0),
+            input_bounds=(-2.0, 2.0),
             reward=sp.cos(x - turn - 1.9),
             nominal=0,
         )

@@ -9,7 +9,7 @@ import pytest
 import sympy as sp
 from scipy.special import ndtr
 
-from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, define_problem
 from safe_envs.agents.evaluation.statistics import wilson_interval
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.values.look_ahead import LookAhead, draw_starts, start_values
@@ -20,8 +20,8 @@ from tests.values.systems import pursued, quadrature, row, scalar, solved, u, v,
 def timed():
     """Return a system whose drift changes with a known state."""
     system = ControlAffineSDE((x, y), (u,), [sp.sin(3 * y), 1], [[1], [0]], [[0.3], [0]])
-    numbers = {"box": (-0.5, 0.5), "start": (0.6, 0.0), "dt": 0.1, "horizon": 1.5}
-    return state_problem(system, x, workspace={x: (-1.0, 1.5)}, name="timed", **numbers)
+    numbers = {"input_bounds": (-0.5, 0.5), "start": (0.6, 0.0), "dt": 0.1, "horizon": 1.5}
+    return define_problem(system, x, workspace={x: (-1.0, 1.5)}, name="timed", **numbers)
 
 
 PROBLEMS = {
@@ -126,10 +126,10 @@ def test_nothing_is_said_of_other_known_states_than_the_table_assumes():
 
 def test_known_states_count_through_others_too():
     system = ControlAffineSDE((x, y, v), (u,), [0, v, 0], [[1], [0], [0]], [[0.3], [0], [0]])
-    problem = state_problem(
+    problem = define_problem(
         system,
         (x - y) ** 2 - sp.Rational(1, 25),
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         start=(0.6, -0.8, 0.1),
         dt=0.1,
         horizon=0.5,

@@ -13,7 +13,7 @@ import pytest
 import sympy as sp
 from gymnasium.vector import AutoresetMode
 
-from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, define_problem
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.filters.specification import problem_automaton
@@ -71,7 +71,7 @@ class Episodes:
         self.env = SafeVectorEnv(dataclasses.replace(problem), count, autoreset_mode=mode)
         self.filtered = SafetyFilterVectorWrapper(self.env, chosen)
         self.monitor = SpecificationMonitorVector(self.filtered, text or "always safe")
-        self._low, self._high = np.array(problem.box).T
+        self._low, self._high = np.array(problem.input_bounds).T
 
     def reset(self, x: Any = None, seed: int = 0) -> dict[str, Any]:
         options = None if x is None else {"state": np.reshape(x, (-1, self.env.problem.plant.n))}
@@ -283,8 +283,14 @@ def two_inputs(gain, barrier, box, start, dt=1.0, noise=0.02):
     u, v = sp.symbols("u v", real=True)
     inputs, row = ((u, v), [[1, gain]]) if gain else ((u,), [[1]])
     system = ControlAffineSDE((x,), inputs, [0.5], row, [[noise]])
-    return state_problem(
-        system, barrier, box=box, start=start, dt=dt, horizon=dt, workspace={x: (-3.0, 3.0)}
+    return define_problem(
+        system,
+        barrier,
+        input_bounds=box,
+        start=start,
+        dt=dt,
+        horizon=dt,
+        workspace={x: (-3.0, 3.0)},
     )
 
 

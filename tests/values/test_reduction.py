@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, define_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.simulation import Simulation
@@ -34,7 +34,7 @@ COORDINATES = {
 }
 QUICK = ("Scalar", "StochasticDubins", "DubinsObstacle", "ACC")
 x, y, p, u, a, b, s = sp.symbols("x y p u a b s", real=True)
-NUMBERS = {"box": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0}
+NUMBERS = {"input_bounds": (-1.0, 1.0), "dt": 0.1, "horizon": 1.0}
 
 
 def problem_of(name: str, **options):
@@ -48,7 +48,7 @@ def sampled(problem, count: int = 50):
         [(v.low, v.high) if math.isfinite(v.low) else (-9.0, 9.0) for v in problem.states]
     ).T
     states = low[:, None] + (high - low)[:, None] * random.random((len(low), count))
-    box = np.array(problem.box)
+    box = np.array(problem.input_bounds)
     return states, box[:, :1] + (box[:, 1:] - box[:, :1]) * random.random((len(box), count))
 
 
@@ -182,7 +182,7 @@ def test_constant_states_become_numbers():
 
 def custom(rate, start, barriers=1 - x**2, diffusion=None, states=(x, y), parameters=None, **rest):
     system = ControlAffineSDE.from_rate(states, (u,), rate, diffusion, parameters or {})
-    return state_problem(system, barriers, start=start, **{**NUMBERS, **rest})
+    return define_problem(system, barriers, start=start, **{**NUMBERS, **rest})
 
 
 def test_a_state_is_known_only_if_all_that_moves_it_is():
@@ -308,7 +308,7 @@ def test_fingerprints_tell_chains_apart():
                 {"dt": 0.1},
                 {"substeps": 2},
                 {"horizon": 10.0},
-                {"box": (-1.0, 1.0)},
+                {"input_bounds": (-1.0, 1.0)},
                 {"noise": 0.1},
                 {"plant": {"v_o": 0.6}},
                 {"start": (0.0, 0.0, 0.0, 1.0, 0.0)},

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, define_problem
 from safe_envs.values import proved
 from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.proved import ProvedStarts, TableRefusedError, check_table, check_table_file
@@ -27,9 +27,9 @@ def plane(sigma=((0.3, 0), (0, 0.2)), **options):
     system = ControlAffineSDE(
         (x, y), (u,), [y, -sp.sin(x)], [[0], [1]], [[sp.sympify(a) for a in row] for row in sigma]
     )
-    given = {"box": (-1.0, 1.0), "start": (0.0, 0.0), "dt": 0.1, "horizon": 0.3, **options}
+    given = {"input_bounds": (-1.0, 1.0), "start": (0.0, 0.0), "dt": 0.1, "horizon": 0.3, **options}
     workspace = {x: (-1.0, 1.0), y: (-1.0, 1.0)}
-    return state_problem(system, 0.9 - x**2 - y**2, workspace=workspace, **given)
+    return define_problem(system, 0.9 - x**2 - y**2, workspace=workspace, **given)
 
 
 PROBLEMS = {
@@ -220,10 +220,10 @@ def test_a_file_is_checked(tmp_path):
 
 def moving():
     system = ControlAffineSDE((x, y), (u,), [y, -y], [[1], [0]], [[0.3], [0]])
-    return state_problem(
+    return define_problem(
         system,
         1 - x**2,
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         start=(0.0, 1.0),
         dt=0.1,
         horizon=0.3,

@@ -82,11 +82,11 @@ def test_a_hostile_policy_does_not_break_the_promise(tables, name, probability):
     memory.begin(x)
     promised = memory.levels.mean()
     safe, rng = np.ones(episodes, dtype=bool), np.random.default_rng(2)
-    middle = tuple(np.full(episodes, sum(pair) / 2) for pair in problem.box)
+    middle = tuple(np.full(episodes, sum(pair) / 2) for pair in problem.input_bounds)
     gone = np.zeros(episodes, dtype=bool)
     for k in range(problem.steps):
         # The input after which the least is left, among those at the ends of the bounds.
-        ends = np.array(problem.box).T[None].repeat(episodes, axis=0)
+        ends = np.array(problem.input_bounds).T[None].repeat(episodes, axis=0)
         left = look_ahead.expected(np.full(episodes, k), x, ends)
         worst = np.take_along_axis(ends, left.argmin(axis=1)[:, None, None], axis=1)[:, 0]
         decision = memory.decide_arrays(x, tuple(worst.T))

@@ -181,7 +181,7 @@ CASES: dict[str, Make] = {
     "begun in a violation": own(SCALAR, **{**VIOLATING, "start": [1.1]}),
     "goal of the filter": own(ACC, "cbf", given={"objective": "clf"}),
     "late": own(PENDULUM, delay=3, slew_limit=SLEW),
-    "late, with a filter": own(PENDULUM, "szcbf:alphas=2", delay=3, model_delay=2, slew_limit=SLEW),
+    "late, with a filter": own(PENDULUM, "szcbf:alpha=2", delay=3, model_delay=2, slew_limit=SLEW),
     "late, with several barriers": own(LIMITS, "hocbf", delay=2),
     "measured": own(ACC, measurement=SENSOR),
     "measured and late": own(PENDULUM, delay=2, measurement=SENSOR),

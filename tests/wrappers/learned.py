@@ -115,7 +115,7 @@ def values(system, expressions, x):
 def situations(problem, count, seed=0):
     """States where the problem is explored, and inputs from a box twice as wide as its own."""
     rng = np.random.default_rng(seed)
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     return draw_states(problem, count, rng), rng.uniform(
         1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (count, len(low))
     )
@@ -124,7 +124,7 @@ def situations(problem, count, seed=0):
 def assert_same_decisions(problem, one, other, count=200, tolerance=1e-9):
     """In both flavours; relative to the box, and to what the margins reach."""
     x, u = situations(problem, count)
-    width = np.ptp(problem.box, axis=1)
+    width = np.ptp(problem.input_bounds, axis=1)
     mine, theirs = one.filter(x, u), other.filter(x, u)
     assert (mine.action != u).any()
     assert (abs(mine.action - theirs.action) <= tolerance * width).all()

@@ -76,7 +76,7 @@ def test_a_wrapped_filter_is_a_delayed_one_also_where_a_state_is_set():
     )
     one.reset(seed=0)
     batch.reset(seed=0)
-    sent, high = [0.0] * 3, problem.box[0][1]
+    sent, high = [0.0] * 3, problem.input_bounds[0][1]
     for k, action in enumerate(proposals(9)):
         if k == 4:
             one.unwrapped.state = [0.3, -0.2]

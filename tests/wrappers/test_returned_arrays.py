@@ -45,7 +45,7 @@ class Loop:
     def __init__(self, delay: int, count: int | None = None, mode: str = "") -> None:
         x, v, u = sp.symbols("x v u", real=True)
         system = ControlAffineSDE.from_rate((x, v), (u,), [v, u])
-        self.filter: Any = SafetyFilter(system, 1 - x**2, "hocbf:p=2,8", (-5, 5))
+        self.filter: Any = SafetyFilter(system, 1 - x**2, "hocbf:alpha=2,8", (-5, 5))
         if delay:
             self.filter = DelayedFilter(self.filter, delay, 0.01)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,) if count is None else (count, 1))
@@ -155,7 +155,7 @@ def test_decisions_share_no_memory_with_what_was_given():
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE.from_rate((x,), (u,), [u])
     for barriers in (1 - x, [1 - x, 2 + x]):
-        safety_filter = SafetyFilter(system, barriers, "cbf", bounds=(-1.0, 1.0))
+        safety_filter = SafetyFilter(system, barriers, "cbf", input_bounds=(-1.0, 1.0))
         for shape in ((1,), (3, 1), (1, 1), (2, 3, 1)):
             states, inputs = np.zeros(shape), np.full(shape, 0.5)
             decision = safety_filter.filter(states, inputs)

@@ -52,8 +52,8 @@ def test_the_executed_action_is_the_safe_one_under_the_same_noise():
 @pytest.mark.parametrize("make", [one, many])
 def test_the_filter_sees_the_model_and_never_the_plant(make):
     def first(knowledge="model", **options):
-        options |= {"start": [0.5, 0.0, 0.4], "box": [-50.0, 50.0]}
-        env = make(DISK, "hocbf:p=0.5,0.5", given={"knowledge": knowledge}, **options)
+        options |= {"start": [0.5, 0.0, 0.4], "input_bounds": [-50.0, 50.0]}
+        env = make(DISK, "hocbf:alpha=0.5,0.5", given={"knowledge": knowledge}, **options)
         env.reset(seed=2)
         return env.step(np.zeros(env.action_space.shape))[4]["safe_action"].flat[0]
 
@@ -75,7 +75,7 @@ def test_what_is_reported_at_a_reset_does_not_change_what_was_executed():
 
 
 def test_infeasible_steps_are_counted_and_flagged():
-    env = one(SCALAR, "cbf:alpha=1", start=[0.9], box=[-0.5, 0.5], noise=0.0)
+    env = one(SCALAR, "cbf:alpha=1", start=[0.9], input_bounds=[-0.5, 0.5], noise=0.0)
     env.reset(seed=0)
     for step in range(1, 4):
         *_, info = env.step(np.ones(1, dtype=np.float32))
@@ -88,7 +88,7 @@ def test_infeasible_steps_are_counted_and_flagged():
 
 
 def test_an_action_that_is_the_least_violating_one_already_is_no_intervention():
-    vector = many(SCALAR, "cbf:alpha=5", start=[1.9], noise=0.0, box=[-1.0, 1.0])
+    vector = many(SCALAR, "cbf:alpha=5", start=[1.9], noise=0.0, input_bounds=[-1.0, 1.0])
     vector.reset(seed=0)
     info = vector.step(np.array([[-1.0], [1.0]]))[-1]
     assert info["filter_active"].tolist() == [True, True]
@@ -102,8 +102,8 @@ def test_a_wrong_speed_settles_where_theory_says():
     # A model with speed v_hat settles at h = -2 v_hat (v - v_hat)/(p_1 p_2): thesis-notes, for
     # equal rates.
     p, v, v_hat = 2.0, 0.8, 0.5
-    options = {"start": "valid", "box": [-50.0, 50.0], "dt": 0.005, "horizon": 40.0}
-    env = one(DISK, f"hocbf:p={p},{p}", **options)
+    options = {"start": "valid", "input_bounds": [-50.0, 50.0], "dt": 0.005, "horizon": 40.0}
+    env = one(DISK, f"hocbf:alpha={p},{p}", **options)
     env.reset(seed=0)
     for _ in range(8000):
         *_, info = env.step(np.zeros(1, dtype=np.float32))
@@ -115,7 +115,7 @@ def test_a_known_speed_keeps_the_disk_and_a_wrong_one_does_not():
     for knowledge in ("plant", "model"):
         env = one(
             DISK,
-            "hocbf:p=2,2",
+            "hocbf:alpha=2,2",
             given={"knowledge": knowledge},
             start="valid",
             dt=0.01,
@@ -160,7 +160,9 @@ def test_a_goal_of_the_filter_takes_the_place_of_the_policy():
     for proposal in (0.7, -0.4):  # the policy has no say
         env.reset(seed=0)
         info = env.step(np.array([proposal]))[-1]
-        np.testing.assert_allclose(info["nominal_action"], goal * problem.box[0][1], rtol=1e-4)
+        np.testing.assert_allclose(
+            info["nominal_action"], goal * problem.input_bounds[0][1], rtol=1e-4
+        )
         assert info["intervention"]
         assert info["safe_action"][0] < info["nominal_action"][0] - 1.0
 
@@ -186,7 +188,7 @@ def test_priorities_say_which_barrier_gives_way():
 
 
 def test_the_action_space_knows_the_inputs_at_its_ends():
-    inner = gym.make(DUBINS, box=(-3.0, 5.0))
+    inner = gym.make(DUBINS, input_bounds=(-3.0, 5.0))
     space = SafetyFilterWrapper(inner, "scbf").action_space
     assert space == inner.action_space
     assert inner.action_space == space
@@ -197,7 +199,7 @@ def test_the_action_space_knows_the_inputs_at_its_ends():
         assert type(each) is gym.spaces.Box
         assert [end.tolist() for end in ends_of(each)] == [[-3.0], [5.0]]
     assert ends_of(inner.action_space) is None
-    envs = many(DUBINS, box=(-3.0, 5.0))
+    envs = many(DUBINS, input_bounds=(-3.0, 5.0))
     assert envs.single_action_space.at_low.tolist() == [-3.0]
     assert envs.action_space.shape == (2, 1)
 

@@ -31,7 +31,7 @@ DISK = settings(3, "disk")
 RATES = DISK.rates
 WIDE, NARROW = (-DISK.turn_rate, DISK.turn_rate), (-math.pi, math.pi)  # rad/s
 _SHOWN = 400  # control instants in the figure
-_NOMINAL = [f"hocbf:p={p},{p}" for p in RATES]
+_NOMINAL = [f"hocbf:alpha={p},{p}" for p in RATES]
 _LEARNED = [f"learned-{text}" for text in _NOMINAL]
 _NO_MARGIN = [f"{text}:eps=0" for text in _LEARNED]
 
@@ -46,7 +46,7 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
     """Compute the trajectories of the disk for each gain, from both starts."""
     world, models = disk(sample), learning.residuals(DISK.env, sample)
     printed, valid = (
-        world.configured(start=start, box=WIDE) for start in (DISK.start, DISK.valid_start)
+        world.configured(start=start, input_bounds=WIDE) for start in (DISK.start, DISK.valid_start)
     )
     shown, from_printed = _learned(printed, models)
     shown_valid, from_valid = _learned(valid, models)
@@ -59,9 +59,9 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
     others = {
         f"start {DISK.valid_start}": from_valid,
         f"start {DISK.valid_start}, |omega| <= pi rad/s": _learned(
-            valid.configured(box=NARROW), models
+            valid.configured(input_bounds=NARROW), models
         )[1],
-        "|omega| <= pi rad/s": _learned(printed.configured(box=NARROW), models)[1],
+        "|omega| <= pi rad/s": _learned(printed.configured(input_bounds=NARROW), models)[1],
         "without the margin of Eq. (3.20)": _learned(printed, models, _NO_MARGIN)[1],
     }
     exact = {

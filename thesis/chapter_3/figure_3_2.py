@@ -67,7 +67,7 @@ def compute_clearance(sample: Sample) -> tuple[Outcome, Any]:
     found, at_rest = passages(sample), passages(sample, v_o=0.0)
     problem = make_problem(OBSTACLE.env)
     true_speed = make_problem(OBSTACLE.env, start="thesis", model={"v": OBSTACLE.speed, "v_o": 0.0})
-    (blind,) = learning.runs(true_speed, [f"hocbf:p={OBSTACLE.rates}"])
+    (blind,) = learning.runs(true_speed, [f"hocbf:alpha={OBSTACLE.rates}"])
     printed_claims = [claim for claim in clearance_claims(at_rest, problem) if claim.printed]
     outcome = Outcome(
         numbers=_clearance_numbers(found),
@@ -171,7 +171,7 @@ def _speeds(each: Sequence[Trajectory], dt: float) -> np.ndarray:
 
 def _chord_speed(problem: SafetyProblem) -> float:
     """Return the apparent speed in the sharpest turn, in m/s: a chord is shorter than its arc."""
-    return float(OBSTACLE.speed * np.sinc(problem.box[0][1] * problem.dt / (2 * math.pi)))
+    return float(OBSTACLE.speed * np.sinc(problem.input_bounds[0][1] * problem.dt / (2 * math.pi)))
 
 
 def _slows(run: Trajectory, problem: SafetyProblem) -> bool:

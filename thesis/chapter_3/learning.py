@@ -104,7 +104,7 @@ def by_knowledge(
     problem: SafetyProblem, gains: str, models: Sequence[ResidualModel]
 ) -> Trajectories:
     """Return trajectories with learned, nominal and true derivatives, and without a filter."""
-    exact = f"hocbf:p={gains}"
+    exact = f"hocbf:alpha={gains}"
     nominal, none = runs(problem, [exact, "none"])
     return {
         "learned": [runs(problem, [f"learned-{exact}"], model)[0] for model in models],
@@ -128,7 +128,7 @@ def rates_around(
     problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str
 ) -> list[Number]:
     """Return safety rates from starts around that of the thesis, over the learnings too."""
-    around, exact = problem.configured(start="spread"), f"hocbf:p={gains}"
+    around, exact = problem.configured(start="spread"), f"hocbf:alpha={gains}"
     size = sample.size(LEARNING.episodes), sample.seed
     found = {
         "learned": measure(around, f"learned-{exact}", *size, models),

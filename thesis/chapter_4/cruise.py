@@ -23,7 +23,7 @@ def problem_of(cruise: SimpleNamespace, limit: float, step: float = CAR.step) ->
     return make_problem(
         CAR.env,
         barrier={name: getattr(cruise, name) for name in ("tau", "rate", "slack_weight")},
-        box=[-limit, limit],
+        input_bounds=[-limit, limit],
         noise=CAR.noise,
         start=CAR.start,
         dt=step,

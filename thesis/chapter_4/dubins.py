@@ -35,7 +35,7 @@ def printed_szcbf(
     return AffineConstraint.after(model, (h, first), generator(model, first) + alphas[1] * h)
 
 
-FILTERS = {"SCBF": "scbf", **{name: f"szcbf:alphas={a},{b}" for name, (a, b) in ALPHAS.items()}}
+FILTERS = {"SCBF": "scbf", **{name: f"szcbf:alpha={a},{b}" for name, (a, b) in ALPHAS.items()}}
 PRINTED_FORM = {
     name: PrintedCondition(partial(printed_szcbf, alphas)) for name, alphas in ALPHAS.items()
 }
@@ -78,7 +78,7 @@ def problem_of(noise: float, start: Any) -> SafetyProblem:
         DUBINS.env,
         noise=noise,
         start=start,
-        box=(-DUBINS.turn_rate, DUBINS.turn_rate),
+        input_bounds=(-DUBINS.turn_rate, DUBINS.turn_rate),
         dt=DUBINS.step,
         horizon=max(DUBINS.horizons),
         barrier={"radius": DUBINS.radius},

@@ -12,7 +12,7 @@ import sympy as sp
 from matplotlib.figure import Figure
 from scipy.special import ndtr
 
-from safe_envs import ControlAffineSDE, SafetyFilter, SafetyProblem, state_problem
+from safe_envs import ControlAffineSDE, SafetyFilter, SafetyProblem, define_problem
 from safe_envs.agents import make_problem, rate_interval
 from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.proofs.guarantees import proposition_4_2_8
@@ -41,7 +41,9 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
     limits = (*SCALAR.limits[: 1 if sample.quick else None], SCALAR.unbounded)
     limited = [number for limit in limits for number in _limited(limit, episodes, sample.seed)]
     least = SCALAR.limits[0]
-    calm = measure(SCALAR.env, "rcbf", 1, 0, options={"noise": 0.0, "box": [-least, least]})
+    calm = measure(
+        SCALAR.env, "rcbf", 1, 0, options={"noise": 0.0, "input_bounds": [-least, least]}
+    )
     attained = [
         measure(attaining_problem(start), "scbf", episodes, episode_seed(sample.seed, i))
         for i, start in enumerate(STARTS)
@@ -78,7 +80,7 @@ def largest_inputs(text: str, noise: float) -> np.ndarray:
     It is the filter's answer to a far larger one.
     """
     bound = SCALAR.unbounded
-    problem = make_problem(SCALAR.env, noise=noise, box=[-bound, bound])
+    problem = make_problem(SCALAR.env, noise=noise, input_bounds=[-bound, bound])
     safety_filter = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
     state = (1.0 - DISTANCES)[:, None]
     return safety_filter.filter(state, np.full_like(state, bound)).action[:, 0]
@@ -88,10 +90,10 @@ def attaining_problem(start: float) -> SafetyProblem:
     """Return dx = u dt + s x dW with h = 1 - x^2, which is a martingale under the SCBF."""
     x, u, s = sp.symbols("x u s", real=True)
     system = ControlAffineSDE((x,), (u,), [0], [1], [s * x], {s: SCALAR.scale})
-    return state_problem(
+    return define_problem(
         system,
         1 - x**2,
-        box=(-50.0, 50.0),
+        input_bounds=(-50.0, 50.0),
         start=[start],
         dt=SCALAR.step,
         horizon=SCALAR.horizon,
@@ -116,7 +118,7 @@ def _limited(limit: float, episodes: int, seed: int) -> list[Number]:
     options = {
         "noise": SCALAR.noise,
         "start": [0.0],
-        "box": [-limit, limit],
+        "input_bounds": [-limit, limit],
         "dt": SCALAR.step,
         "horizon": SCALAR.horizon,
     }

@@ -86,7 +86,7 @@ def compute(letter: str, sample: Sample) -> tuple[Outcome, Any]:
     name = f"safe up to {CUBIC.horizon:g} s, {_TITLES[letter]}"
     others = {}
     if letter == "b":
-        options = {"noise": 0.0, "horizon": CUBIC.horizon, "box": CUBIC.wide}
+        options = {"noise": 0.0, "horizon": CUBIC.horizon, "input_bounds": CUBIC.wide}
         size = sample.size(LEARNING.episodes), sample.seed
         runs = measure(CUBIC.env, _CBF, *size, options=options)
         others = {

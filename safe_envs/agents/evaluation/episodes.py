@@ -347,7 +347,7 @@ class Trajectories(EpisodeRecorder):
             units={each.symbol: each.unit for each in variables},
         )
         self.log = DecisionLog(columns)
-        self._dt, self._bounds = problem.dt, np.transpose(problem.box)
+        self._dt, self._bounds = problem.dt, np.transpose(problem.input_bounds)
 
     def note(self, k: int, first: int, present: np.ndarray, h: np.ndarray, x: Components) -> None:
         """See `EpisodeRecorder`."""

@@ -198,7 +198,7 @@ class EvaluationSpec:
         filters = listed(self.filters)
         if not (filters is None or isinstance(filters, Iterable)):
             raise ConfigurationError(
-                f"filters = {shown(filters)}; give texts such as 'hocbf:p=2,8', and conditions"
+                f"filters = {shown(filters)}; give texts such as 'hocbf:alpha=2,8', and conditions"
             )
         filters = None if filters is None else tuple(filters)
         if filters == ():
@@ -355,7 +355,7 @@ def conditions_in(given: Condition | Sequence[Condition]) -> tuple[Condition, ..
     if strangers or not found:
         wrong = type(strangers[0]).__name__ if strangers else "an empty tuple"
         raise ConfigurationError(
-            f"filters hold {wrong}; give texts such as 'hocbf:p=2,8', conditions, or tuples with a"
+            f"filters hold {wrong}; give texts such as 'hocbf:alpha=2,8', conditions, or tuples with a"
             " condition for each barrier"
         )
     return found

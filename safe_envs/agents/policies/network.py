@@ -77,10 +77,10 @@ def _normalization_of(model: Any, problem: SafetyProblem, given: Any) -> Normali
     name = type(model).__name__
     layers = training_layers(model, problem.name, given)
     require_same_env(name, layers, problem, (observation_box(problem), action_box(problem)))
-    if layers.problem is not None and layers.problem.box != problem.box:
+    if layers.problem is not None and layers.problem.input_bounds != problem.input_bounds:
         raise ConfigurationError(
-            f"the policy of {name} was trained with the input bounds {layers.problem.box}, and"
-            f" those of the problem are {problem.box}; give the problem of its training"
+            f"the policy of {name} was trained with the input bounds {layers.problem.input_bounds}, and"
+            f" those of the problem are {problem.input_bounds}; give the problem of its training"
         )
     scales = [each for each in layers.observe if isinstance(each, Normalizer)]
     if layers.act or len(layers.observe) > len(scales) or len(scales) > 1:
@@ -155,7 +155,7 @@ def _policy(content: data.Content, problem: SafetyProblem) -> NetworkPolicy:
 
 def _box(problem: SafetyProblem) -> np.ndarray:
     """Return the physical bounds of a problem's inputs, (m, 2)."""
-    return np.array(problem.box, dtype=float)
+    return np.array(problem.input_bounds, dtype=float)
 
 
 def _spaces(problem: SafetyProblem) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class NominalController(StatelessPolicy):
         require_full_state(problem, "nominal controllers")
         super().__init__(len(problem.features))
         self._name = problem.name
-        self._box = problem.box
+        self._box = problem.input_bounds
         self._center, self._half = center_and_half_width(problem)
         self._symbols = tuple(f.symbol for f in problem.features)
         self._laws = tuple(problem.model.numeric(law) for law in problem.nominal)
@@ -105,7 +105,7 @@ class ZeroController(StatelessPolicy):
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(len(observation_names(problem)))
         center, half = center_and_half_width(problem)
-        inputs = [min(max(0.0, low), high) for low, high in problem.box]
+        inputs = [min(max(0.0, low), high) for low, high in problem.input_bounds]
         self._action = np.array([(u - c) / w for u, c, w in zip(inputs, center, half, strict=True)])
 
     def actions(self, given: np.ndarray) -> np.ndarray:
@@ -191,7 +191,10 @@ class CLFController(StatelessPolicy):
         self._name = problem.name
         self._columns = _columns_of_states(problem)
         self._center, self._half = center_and_half_width(problem)
-        low, high = [pair[0] for pair in problem.box], [pair[1] for pair in problem.box]
+        low, high = (
+            [pair[0] for pair in problem.input_bounds],
+            [pair[1] for pair in problem.input_bounds],
+        )
         qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
         self._qp, self._goal = qp, goal
         self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")

@@ -61,8 +61,11 @@ def policy_of_model(model: Any, problem: SafetyProblem, spaces: Spaces) -> Train
     layers = training_layers(model, problem.name)
     require_same_env(type(model).__name__, layers, problem, spaces)
     act, trained = list(layers.act), layers.problem
-    if trained is not None and trained.box != problem.box:
-        boxes = np.array(trained.box, dtype=float), np.array(problem.box, dtype=float)
+    if trained is not None and trained.input_bounds != problem.input_bounds:
+        boxes = (
+            np.array(trained.input_bounds, dtype=float),
+            np.array(problem.input_bounds, dtype=float),
+        )
         act.append(partial(in_another_box, boxes=boxes))
     return TrainedPolicy(model, spaces[0], layers.observe, act)
 

@@ -24,7 +24,7 @@ _LONGEST = 1_000_000
 
 
 class SafetyFigures(BaseCallback):
-    """Counts over the infos of a `SafeVecEnv`, recorded under `safety/` after each rollout.
+    """Counts over the infos of a `SB3VecEnv`, recorded under `safety/` after each rollout.
 
     | key | meaning |
     |---|---|

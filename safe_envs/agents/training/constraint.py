@@ -351,7 +351,7 @@ def costs_of(infos: Sequence[Any]) -> np.ndarray:
     """Return the cost of each env's last step, float64 of shape (num_envs,).
 
     Args:
-        infos: with the entry "cost"; infos of a `SafeVecEnv` are read at once.
+        infos: with the entry "cost"; infos of a `SB3VecEnv` are read at once.
 
     Raises:
         ConfigurationError: an info has no cost, or one that is negative or no finite number.

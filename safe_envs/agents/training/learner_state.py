@@ -142,7 +142,7 @@ def restore_buffer(
 
 
 def env_arrays(envs: VecEnv) -> Arrays:
-    """Return the states of the episodes of a `SafeVecEnv` and of the wrappers over it, by name."""
+    """Return the states of the episodes of a `SB3VecEnv` and of the wrappers over it, by name."""
     found = dict(envs.unwrapped.snapshot())  # pyright: ignore[reportAttributeAccessIssue]
     return found | {f"{name}_of_layers": getattr(layer, name) for layer, name in _sums(envs)}
 

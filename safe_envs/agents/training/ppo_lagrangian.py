@@ -149,7 +149,7 @@ class PPOLagrangian(PPO):
     deviations of the advantages A_r of rewards and A_c of costs in the rollout: so the same gains
     serve rewards and costs of any unit. With l = 0 it is PPO, bit for bit.
 
-    The costs are `info["cost"]`, of any env; a `SafeVecEnv` gives those of a step at once. Behind a
+    The costs are `info["cost"]`, of any env; a `SB3VecEnv` gives those of a step at once. Behind a
     wrapper that repeats actions they are those of all repetitions, see `StepCosts`. Like the
     rewards, the costs of an episode that only time ended are continued by the critic's value. The
     constraint is on the undiscounted cost of whole episodes, see `EpisodeConstraint`; its discount

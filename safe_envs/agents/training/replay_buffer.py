@@ -10,7 +10,7 @@ instead, constant along all actions that the filter maps to one. With the execut
 is extrapolated at actions that the filter never lets through; "both" also fills those in,
 consistently, as the filter passes its own answer on unchanged.
 
-A penalty on interventions (`SafeVecEnv`) is a function of the proposal: r - c |u - a| belongs to
+A penalty on interventions (`SB3VecEnv`) is a function of the proposal: r - c |u - a| belongs to
 (s, a). Stored with u it would be noise, as the same u follows from many a. So the rewards go as
 with Krasowski et al.: the penalised r to (s, a), the env's own r to (s, u), which the buffers get
 by adding the infos' "intervention_penalty" back (up to the rounding of rewards to single
@@ -98,7 +98,7 @@ def _fitting(
             "the env is filtered, and a wrapper around the filter changes the actions, or the"
             " map of the actions is no straight line, so that the executed ones are unknown in"
             " units of the action space; put the filter around that wrapper, or give"
-            " replay_buffer_kwargs={'box': [(low, high), ...]}: the inputs at its ends. A loop of"
+            " replay_buffer_kwargs={'input_bounds': [(low, high), ...]}: the inputs at its ends. A loop of"
             " your own adds actions in [-1, 1], and not in the units of another action space"
         )
     return known[0]
@@ -140,18 +140,18 @@ def _middle(bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return bounds.mean(axis=-1), 0.5 * (bounds[..., 1] - bounds[..., 0])
 
 
-def bounds_of(box: Sequence[Sequence[float]], inputs: int) -> np.ndarray:
+def bounds_of(input_bounds: Sequence[Sequence[float]], inputs: int) -> np.ndarray:
     """Return (low, high) of each input, shape (m, 2).
 
     Args:
-        box: as pairs.
+        input_bounds: as pairs.
         inputs: m.
 
     Raises:
         ConfigurationError: it is something else.
     """
     try:
-        pairs = np.array(box, dtype=np.float64)
+        pairs = np.array(input_bounds, dtype=np.float64)
     except (TypeError, ValueError):
         pairs = np.empty(0)
     if (
@@ -160,7 +160,7 @@ def bounds_of(box: Sequence[Sequence[float]], inputs: int) -> np.ndarray:
         or np.any(pairs[:, 0] >= pairs[:, 1])
     ):
         raise ConfigurationError(
-            f"box = {box!r}; give a finite (low, high) with low < high for each of the {inputs}"
+            f"input_bounds = {input_bounds!r}; give a finite (low, high) with low < high for each of the {inputs}"
             " inputs"
         )
     return pairs
@@ -185,7 +185,7 @@ class FilteredReplayBuffer(ReplayBuffer):
 
     Args:
         args: those of `ReplayBuffer`.
-        box: physical (low, high) of each input at the ends of the action space, where the infos and
+        input_bounds: physical (low, high) of each input at the ends of the action space, where the infos and
             the action space do not know them, as behind a wrapper that halves the actions.
         action: "executed", "proposed" or "both".
         kwargs: those of `ReplayBuffer`.
@@ -214,7 +214,7 @@ class FilteredReplayBuffer(ReplayBuffer):
     def __init__(
         self,
         *args: Any,
-        box: Sequence[Sequence[float]] | None = None,
+        input_bounds: Sequence[Sequence[float]] | None = None,
         action: str = "executed",
         **kwargs: Any,
     ) -> None:
@@ -229,8 +229,8 @@ class FilteredReplayBuffer(ReplayBuffer):
             )
         self.action = action
         ends = ends_of(self.action_space)
-        if box is not None:
-            self._bounds = bounds_of(box, self.action_dim)
+        if input_bounds is not None:
+            self._bounds = bounds_of(input_bounds, self.action_dim)
         elif ends is not None:  # else there may be no filter, and nothing to scale
             self._bounds = np.stack(ends, axis=-1)
 
@@ -314,7 +314,7 @@ def replay_options(
             an argument is not allowed.
     """
     require_whole("n_steps", n_steps, 1)
-    settings = {"box": _box_of(source), "action": action}
+    settings = {"input_bounds": _box_of(source), "action": action}
     if n_steps == 1:
         return {"replay_buffer_class": FilteredReplayBuffer, "replay_buffer_kwargs": settings}
     settings |= {"n_steps": n_steps, "gamma": gamma}
@@ -335,12 +335,12 @@ def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
 
 def _box_of(source: Any) -> tuple[tuple[float, float], ...]:
     if isinstance(source, SafetyProblem):
-        return source.box
+        return source.input_bounds
     try:
         problems = (
             source.get_attr("problem") if isinstance(source, VecEnv) else [source.unwrapped.problem]
         )
-        boxes = {problem.box for problem in problems}
+        boxes = {problem.input_bounds for problem in problems}
     except AttributeError as error:
         raise ConfigurationError(
             f"{source} is not one of this project's envs; give one, or a SafetyProblem"

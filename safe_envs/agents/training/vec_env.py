@@ -211,7 +211,7 @@ def make_sb3_env(  # noqa: PLR0913  (all but env_id have defaults)
     estimator: str | None = None,
     observe: str = "estimate",
     **options: Any,
-) -> SafeVecEnv:
+) -> SB3VecEnv:
     """Make the `VecEnv` of a registered env for the algorithms of Stable-Baselines3.
 
     Args:
@@ -221,7 +221,7 @@ def make_sb3_env(  # noqa: PLR0913  (all but env_id have defaults)
             unfiltered env.
         knowledge: what the filter knows; see `SafetyFilterWrapper`.
         objective: of the filter; see `SafetyFilterWrapper`.
-        intervention_penalty: see `SafeVecEnv`.
+        intervention_penalty: see `SB3VecEnv`.
         seed: Env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later
             and replaces it.
         engine: "numpy", "compiled" or "auto"; see `SafeVectorEnv`.
@@ -254,13 +254,13 @@ def make_sb3_env(  # noqa: PLR0913  (all but env_id have defaults)
         env = StateEstimatorVectorWrapper(env, estimator, observe, knowledge)
     if filter is not None and filter != UNFILTERED:
         env = SafetyFilterVectorWrapper(env, filter, knowledge, objective)
-    result = SafeVecEnv(env, intervention_penalty)
+    result = SB3VecEnv(env, intervention_penalty)
     if seed is not None:
         result.seed(int(seed))
     return result
 
 
-class SafeVecEnv(VecEnv):
+class SB3VecEnv(VecEnv):
     """The equivalent of DummyVecEnv over the scalar envs, without a loop over them.
 
     The infos are `LazyInfo`s: their entries are made when they are read. The info of an env that is

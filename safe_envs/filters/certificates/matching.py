@@ -53,7 +53,7 @@ def plant_of(
         states=system.states,
         workspace=tuple(_ends(state, used) for state in problem.states),
         inputs=system.inputs,
-        bounds=tuple((_rational(low), _rational(high)) for low, high in problem.box),
+        bounds=tuple((_rational(low), _rational(high)) for low, high in problem.input_bounds),
         drift=drift,
         input_matrix=matrices[0],
         diffusion=matrices[1],

@@ -79,22 +79,24 @@ class HOCBF(Condition):
     is no guarantee.
 
     Attributes:
-        p: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate
+        alpha: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate
             of a linear one in 1/s.
 
     Source: thesis Eq. (3.7), (3.10).
     """
 
-    p: tuple[Rate, ...] = (1.0,)
+    alpha: tuple[Rate, ...] = (1.0,)
     name = "hocbf"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "p", rates("p", self.p))
+        object.__setattr__(self, "alpha", rates("alpha", self.alpha))
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint; see `chain_of` for what it raises."""
-        return AffineConstraint.after(model, *chain_of(model, barrier, self.p, lie_derivative_f))
+        return AffineConstraint.after(
+            model, *chain_of(model, barrier, self.alpha, lie_derivative_f)
+        )
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> HOCBF:
@@ -103,8 +105,8 @@ class HOCBF(Condition):
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
         """Return the rates where all are linear; see `Condition.chain_rates`."""
-        linear = tuple(p for p in self.p if not isinstance(p, ClassK))
-        return linear if len(linear) == len(self.p) else None
+        linear = tuple(p for p in self.alpha if not isinstance(p, ClassK))
+        return linear if len(linear) == len(self.alpha) else None
 
 
 @dataclass(frozen=True)
@@ -255,23 +257,23 @@ class SZCBF(Condition):
     Its bounds: `safe_envs.proofs.guarantees`.
 
     Attributes:
-        alphas: rates alpha_1..alpha_r in 1/s, as many as the relative degree.
+        alpha: rates alpha_1..alpha_r in 1/s, as many as the relative degree.
 
     Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, whose
         h_2 = A h_1 + alpha_2 h lets even noise-free trajectories leave the set.
     """
 
-    alphas: tuple[float, ...] = (1.0,)
+    alpha: tuple[float, ...] = (1.0,)
     name = "szcbf"
     stochastic = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "alphas", positive_rates("alphas", self.alphas))
+        object.__setattr__(self, "alpha", positive_rates("alpha", self.alpha))
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint; see `chain_of` for what it raises."""
-        return AffineConstraint.after(model, *chain_of(model, barrier, self.alphas, generator))
+        return AffineConstraint.after(model, *chain_of(model, barrier, self.alpha, generator))
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> SZCBF:
@@ -280,7 +282,7 @@ class SZCBF(Condition):
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
         """Return the rates; see `Condition.chain_rates`."""
-        return self.alphas
+        return self.alpha
 
 
 _H = sp.Symbol("h", positive=True)

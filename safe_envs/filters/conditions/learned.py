@@ -144,7 +144,7 @@ class LearnedHOCBF(LearnedCondition):
 
     Attributes:
         learned: the residuals.
-        p: rates p_1..p_r in 1/s.
+        alpha: rates p_1..p_r in 1/s.
         level: quantile of the held-out errors that e is, for each residual.
         eps: one number for all e in its place; 0 for no margin.
 
@@ -154,14 +154,14 @@ class LearnedHOCBF(LearnedCondition):
     """
 
     learned: ResidualModel  # pyright: ignore[reportIncompatibleVariableOverride]  (narrower, and frozen)
-    p: tuple[float, ...] = (1.0,)
+    alpha: tuple[float, ...] = (1.0,)
     level: float = 0.95
     eps: float | None = None
     name = method = "learned-hocbf"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "p", positive_rates("p", self.p))
+        object.__setattr__(self, "alpha", positive_rates("alpha", self.alpha))
         require_share("level", self.level)
         if self.eps is not None:
             _at_least_zero("eps", self.eps)
@@ -171,7 +171,7 @@ class LearnedHOCBF(LearnedCondition):
         cls, learned: ResidualModel, gains: Sequence[float], **settings: Any
     ) -> LearnedHOCBF:
         """Return the condition with all rates of a problem, unless others are given."""
-        return cls(learned, **{"p": tuple(gains), **settings})
+        return cls(learned, **{"alpha": tuple(gains), **settings})
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint.
@@ -183,12 +183,12 @@ class LearnedHOCBF(LearnedCondition):
         self._require_no_first_order()
         part = self.learned.parts[self._number_of(model, barrier)]
         r, m = part.degree, model.m
-        if len(self.p) != r:
+        if len(self.alpha) != r:
             raise RelativeDegreeError(
                 f"barrier {barrier.name} has relative degree {r} and needs as many rates;"
-                f" {len(self.p)} given"
+                f" {len(self.alpha)} given"
             )
-        k = [sp.Float(value, 17) for value in (*gains_of_poles([-p for p in self.p]), 1.0)]
+        k = [sp.Float(value, 17) for value in (*gains_of_poles([-p for p in self.alpha]), 1.0)]
         eta = derivatives(model, barrier.expression, r, lie_derivative_f)
         require_smooth(model, barrier, eta[:-1], False)
         a = lie_derivative_g(model, eta[r - 1])

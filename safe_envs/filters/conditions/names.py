@@ -11,10 +11,10 @@ COMMON = ("sampling_margin", "belief", "measurement_error")
 PARAMETERS = {
     "cbf": ("alpha", *COMMON),
     "ecbf": ("k", "poles", *COMMON),
-    "hocbf": ("p", *COMMON),
+    "hocbf": ("alpha", *COMMON),
     "rcbf": ("gamma", "form", *COMMON),
     "srcbf": ("gamma", "form", *COMMON),
-    "szcbf": ("alphas", *COMMON),
+    "szcbf": ("alpha", *COMMON),
     "scbf": COMMON,
 }
 """Names of the parameters of the conditions that need nothing but a model of the system."""

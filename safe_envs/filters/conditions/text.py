@@ -1,4 +1,4 @@
-"""Conditions as text: `hocbf:p=2,8`, or `hocbf:p=2,8+cbf:alpha=1` for two barriers.
+"""Conditions as text: `hocbf:alpha=2,8`, or `hocbf:alpha=2,8+cbf:alpha=1` for two barriers.
 
 A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`; parameters follow, as in
 `my_filter.py:Eager:gain=2`.
@@ -349,7 +349,7 @@ def parse_condition(text: str, gains: Sequence[float]) -> Condition:
 
     Args:
         text: name, and parameters as `key=value` with commas between the entries of a tuple:
-            `scbf`, `hocbf:p=2,8`, `cbf:alpha=2*s**3`, `my_filter.py:Eager:gain=2`.
+            `scbf`, `hocbf:alpha=2,8`, `cbf:alpha=2*s**3`, `my_filter.py:Eager:gain=2`.
         gains: rates p_1..p_r in 1/s that set the parameters where the text names none of them.
 
     Raises:

@@ -628,7 +628,7 @@ def _along(
     for start in problem.starts[problem.start].proposals(_TRIES):
         x, p, transition = start.tolist(), list(initial.covariance), np.eye(n)
         for _ in range(2 * n):
-            u = [float(rng.uniform(low, high)) for low, high in problem.box]
+            u = [float(rng.uniform(low, high)) for low, high in problem.input_bounds]
             rows.append(np.reshape(measured(*x), (-1, n)).astype(float) @ transition)
             step = np.eye(n) + estimator.dt * np.reshape(slopes(*x, *u), (n, n)).astype(float)
             transition = step @ transition

@@ -350,11 +350,11 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
             f"inputs = {inputs!r}; give one or more vectors of {len(problem.inputs)} numbers each:"
             f" {names}"
         )
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     within = ((low <= tried) & (tried <= high)).all(axis=1)
     if not within.all():
         raise ConfigurationError(
-            f"the input {tried[within.argmin()]} is outside the bounds {problem.box} of {names};"
+            f"the input {tried[within.argmin()]} is outside the bounds {problem.input_bounds} of {names};"
             " give inputs within them"
         )
     return tried

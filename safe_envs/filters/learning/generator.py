@@ -222,7 +222,7 @@ def learn_generator(  # noqa: PLR0913 - the friendly keyword form
     begin, tell = time.perf_counter(), progress or (lambda _: None)
     degrees = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if data is None:
-        at_rest = [min(max(0.0, low), high) for low, high in problem.box]
+        at_rest = [min(max(0.0, low), high) for low, high in problem.input_bounds]
         data = collect(
             problem,
             points,

@@ -29,7 +29,7 @@ PANELS: dict[str, str] = {
         "system filter-spec policy trust algo method all against data state degree held rate"
         " x lines backend address"
     ),
-    "Time, start and bounds": "dt substeps horizon start box rate-limit barrier",
+    "Time, start and bounds": "dt substeps horizon start input-bounds rate-limit barrier",
     "Filters": "filter knowledge objective learned estimator belief observe",
     "Noise and mismatch": (
         "noise plant model delay model-delay slew-limit measurement sensor-noise"

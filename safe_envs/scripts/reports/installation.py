@@ -214,7 +214,7 @@ def _step(env_id: str) -> tuple[bool, str]:
     problem = make_problem(env_id)
     env = SafetyFilterWrapper(SafeEnv(problem), problem.filter)
     env.reset(seed=0)
-    low, high = np.transpose(problem.box)
+    low, high = np.transpose(problem.input_bounds)
     inside = True
     for _ in range(_STEPS):
         _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape or ()))

@@ -26,7 +26,7 @@ class Schedule:
     """Physical inputs by the step, which it counts in the hidden state."""
 
     def __init__(self, problem, inputs):
-        low, high = problem.box[0]
+        low, high = problem.input_bounds[0]
         self.actions = [(u - low) / (high - low) * 2 - 1 for u in inputs]
         self.starts = []
 
@@ -40,7 +40,7 @@ class Levelling:
     """ACC with A h = 0: the gap's rate equals tau times the acceleration."""
 
     def __init__(self, problem, tau):
-        self.half = problem.box[0][1]
+        self.half = problem.input_bounds[0][1]
         self.tau = tau
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):

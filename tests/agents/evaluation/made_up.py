@@ -9,7 +9,7 @@ from safe_envs.agents.evaluation.attainable import AttainableSafety
 from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorSummary
 
 LONG_NAME = (
-    "learned-hocbf:p=2.00000001,8:level=.95:file=/a/very/long/path/of/[red]models/v0.npz+cbf"
+    "learned-hocbf:alpha=2.00000001,8:level=.95:file=/a/very/long/path/of/[red]models/v0.npz+cbf"
 )
 LONG_WORD = "a_name_without_any_joint_that_is_longer_than_what_is_left_of_the_line_of_a_terminal"
 

@@ -154,7 +154,7 @@ def test_config_is_enough_to_run_it_again():
         "dt": 0.1,
         "substeps": 2,
         "horizon": 1.0,
-        "box": [-4.0, 5.0],
+        "input_bounds": [-4.0, 5.0],
         "start": [0.5, 0.0, 1.0],
     }
     given = {"episodes": 10, "seed": 9, "knowledge": "plant", "bounds": False}

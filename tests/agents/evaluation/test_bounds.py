@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, state_problem
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.bounds import (
     FilteredPolicy,
@@ -105,10 +105,10 @@ def falling():
     system = ControlAffineSDE.from_rate(
         (x, v), (u,), [v, u], diffusion=[0, sigma], parameters={sigma: 0.1}
     )
-    return state_problem(
+    return define_problem(
         system,
         [1.0 * x, 1 - 0.5 * x],
-        box=(-5.0, 5.0),
+        input_bounds=(-5.0, 5.0),
         start=[(-0.2, 1.0), (-3.0, 1.0)],
         dt=0.05,
         horizon=0.1,
@@ -119,7 +119,7 @@ def falling():
 
 @pytest.mark.parametrize(
     ("name", "p"),
-    [("scbf", 0.0), ("szcbf:alphas=1,1", 1.0), ("hocbf:p=3,1", 3.0), ("ecbf:poles=-4,-2", 2.0)],
+    [("scbf", 0.0), ("szcbf:alpha=1,1", 1.0), ("hocbf:alpha=3,1", 3.0), ("ecbf:poles=-4,-2", 2.0)],
 )
 def test_starts_outside_the_kept_sets_are_counted(falling, name, p):
     given = {"filters": name, "episodes": 30, "num_envs": 7, "bounds": False}

@@ -12,7 +12,7 @@ import pytest
 import sympy as sp
 from scipy.stats import binom
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import bounds, safety_chain
 from safe_envs.agents.evaluation import evaluate as evaluation
@@ -58,7 +58,7 @@ def undecided(monkeypatch):
 @pytest.mark.parametrize(
     ("make", "text", "reason"),
     [
-        false(false_bounds.kink, "szcbf:alphas=0.1", "h is not twice differentiable"),
+        false(false_bounds.kink, "szcbf:alpha=0.1", "h is not twice differentiable"),
         false(false_bounds.pole, "cbf:alpha=1", "h has a pole near"),
         false(false_bounds.island, "scbf", "no action meets the condition"),
         false(false_bounds.rotated, "cbf:alpha=0.1", "no action meets the condition", slow_search),
@@ -74,7 +74,7 @@ def test_false_bounds_are_not_estimated(make, text, reason):
 @pytest.mark.parametrize(
     ("make", "text", "reason"),
     [
-        false(false_bounds.kink, "szcbf:alphas=0.1", "withheld: the interval of the measured rate"),
+        false(false_bounds.kink, "szcbf:alpha=0.1", "withheld: the interval of the measured rate"),
         false(false_bounds.pole, "cbf:alpha=1", "it is 0 at these starts", slow_search),
         false(false_bounds.island, "scbf", "no action meets the condition"),
         false(false_bounds.rotated, "cbf:alpha=0.1", "that an action meets the", slow_search),
@@ -130,7 +130,7 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
 
 @pytest.mark.usefixtures("credulous")
 def test_nothing_converges_beside_a_bound_that_is_contradicted():
-    answer = refine(false_bounds.kink(), filters=["none", "szcbf:alphas=0.1"], episodes=100)
+    answer = refine(false_bounds.kink(), filters=["none", "szcbf:alpha=0.1"], episodes=100)
     bare, filtered = answer.rows
     assert bare.verdict != "contradicted"
     assert (filtered.verdict, bool(filtered.withheld)) == ("contradicted", True)
@@ -189,17 +189,17 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch, request):
     large a b_1."""
     x, v, u = sp.symbols("x v u", real=True)
     system = ControlAffineSDE.from_rate((x, v), (u,), [v, u], diffusion=[0, 0.01])
-    problem = state_problem(
+    problem = define_problem(
         system,
         [1 + x],
-        box=(-9, 9),
+        input_bounds=(-9, 9),
         workspace={x: (-1, 1), v: (-1, 1)},
         start=(0.0, 0.9),
         dt=0.05,
         horizon=1.0,
         nominal=-5,
     )
-    (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
+    (row,) = evaluate(problem, filters="szcbf:alpha=0.1,0.1", episodes=20).rows
     assert (row.continuous_bound, row.withheld) == (
         pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3),
         None,
@@ -207,7 +207,7 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch, request):
     assert row.continuous_word == "proved"
     monkeypatch.setattr(analysis.SafeSetAnalysis, "suprema", np.array([2.0, 0.8]))
     request.getfixturevalue("undecided")
-    (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
+    (row,) = evaluate(problem, filters="szcbf:alpha=0.1,0.1", episodes=20).rows
     assert row.withheld == "b_1 reaches 1, above the supremum of 0.8 that the search found"
 
 

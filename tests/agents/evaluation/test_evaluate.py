@@ -26,8 +26,8 @@ RATES = ("return_mean", "intervention_rate", "infeasible_rate")
     ("env_id", "spec", "policy", "knowledge", "options"),
     [
         ("Scalar-v0", "none", "random", "model", {"noise": 0.8}),
-        ("Scalar-v0", "scbf", "random", "model", {"noise": 0.3, "box": [-0.2, 3.0]}),
-        ("StochasticDubins-v0", "hocbf:p=1,1", "random", "model", {}),
+        ("Scalar-v0", "scbf", "random", "model", {"noise": 0.3, "input_bounds": [-0.2, 3.0]}),
+        ("StochasticDubins-v0", "hocbf:alpha=1,1", "random", "model", {}),
         (
             "DubinsObstacle-v0",
             "hocbf",
@@ -86,7 +86,7 @@ def test_rows_are_what_the_results_of_single_episodes_say(monkeypatch):
     # Quantiles are of the first episodes, which are many.
     monkeypatch.setattr("safe_envs.agents.evaluation.episodes._QUANTILES_OF", 30)
     w = sp.Symbol("w")
-    problem = make_problem("Scalar-v0", noise=0.8, box=[-0.5, 3.0], dt=0.02, horizon=0.5)
+    problem = make_problem("Scalar-v0", noise=0.8, input_bounds=[-0.5, 3.0], dt=0.02, horizon=0.5)
     problem = replace(problem, start="wide", starts={"wide": Start((1.7 * w - 0.5,), (w,))})
     answer = evaluate(
         problem,
@@ -151,7 +151,13 @@ def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
 def test_the_curve_of_a_long_episode_is_thinned_out_evenly_and_has_both_ends(steps):
     # The inputs let x grow by dt in each step: x' = e^dt x + (e^dt - 1) u.
     dt, last = 1e-3, steps // 2 + 1
-    options = {"noise": 0.0, "start": [0.0], "dt": dt, "horizon": steps * dt, "box": [-2.0, 2.0]}
+    options = {
+        "noise": 0.0,
+        "start": [0.0],
+        "dt": dt,
+        "horizon": steps * dt,
+        "input_bounds": [-2.0, 2.0],
+    }
     x = np.cumsum([0.0] + [dt] * steps)
     inputs = (x[1:] - math.exp(dt) * x[:-1]) / (math.exp(dt) - 1)
     limit = {"limit": float(x[last - 1] + x[last]) / 2}
@@ -170,7 +176,7 @@ def test_interventions_after_a_violation_do_not_count():
     # With u = 0 at first, x grows over the edge in step 3; a box with no negative input makes each
     # later step infeasible.
     problem = make_problem(
-        "Scalar-v0", noise=0.0, start=[0.95], dt=0.02, box=[-0.5, 1.0], horizon=0.2
+        "Scalar-v0", noise=0.0, start=[0.95], dt=0.02, input_bounds=[-0.5, 1.0], horizon=0.2
     )
     (row,) = evaluate(problem, Constant(1.0), ["cbf:alpha=1"], episodes=1, bounds=False).rows
     # The condition 1 - x - (x + u) >= 0 asks for u <= 1 - 2 x < -.5 from the start: the

@@ -24,7 +24,7 @@ DUBINS = "safe_envs/StochasticDubins-v0"
 
 
 def test_filters_see_the_same_episodes_and_are_compared_on_them():
-    filters = ["none", "hocbf:p=1,2", "scbf"]
+    filters = ["none", "hocbf:alpha=1,2", "scbf"]
     given = {"options": {"horizon": 3.0, "noise": 0.4}, "episodes": 100, "seed": 4}
     given |= {"confidence": 0.9, "bounds": False}
     answer = evaluate(DUBINS, filters=filters, num_envs=64, record=True, **given)
@@ -80,15 +80,15 @@ def test_a_filter_may_have_a_condition_for_each_barrier_and_be_objects():
     disk = problem.barriers[0]
     wall = replace(disk, name="wall", expression=1 - problem.plant.states[0])
     problem = replace(problem, barriers=(disk, wall))
-    filters = ["hocbf:p=1.0,1.0+hocbf:p=2.0,8.0", "hocbf:p=2.0,8.0+hocbf:p=1.0,1.0"]
-    objects = [HOCBF(p=(2.0, 8.0)), (SCBF.for_gains((1.0, 1.0)),) * 2]
+    filters = ["hocbf:alpha=1.0,1.0+hocbf:alpha=2.0,8.0", "hocbf:alpha=2.0,8.0+hocbf:alpha=1.0,1.0"]
+    objects = [HOCBF(alpha=(2.0, 8.0)), (SCBF.for_gains((1.0, 1.0)),) * 2]
     answer = evaluate(problem, filters=[*filters, *objects], episodes=20, bounds=False)
-    names = [*filters, "hocbf:p=2.0,8.0"]
+    names = [*filters, "hocbf:alpha=2.0,8.0"]
     assert [f["spec"] for f in answer.config["filters"]][:3] == names
     assert len({row.effort_mean for row in answer.rows}) == 4
     (text,) = evaluate(problem, filters=spec_of(objects[0]), episodes=20, bounds=False).rows
     assert text == answer.rows[2]
-    for call, fragment in (("hocbf+hocbf+hocbf", "3"), ((HOCBF(p=(1.0, 1.0)),) * 3, "3")):
+    for call, fragment in (("hocbf+hocbf+hocbf", "3"), ((HOCBF(alpha=(1.0, 1.0)),) * 3, "3")):
         with pytest.raises(ConfigurationError, match=f"{fragment} conditions"):
             evaluate(problem, filters=[call])
 
@@ -114,7 +114,7 @@ def test_the_log_of_the_first_episode_has_its_decisions():
     assert terminated or truncated
     assert log.interventions == info["episode_interventions"] > 0
     assert log.columns.units["omega"] == "rad/s"
-    np.testing.assert_array_equal(log.section("high")[:, 0], problem.box[0][1])
+    np.testing.assert_array_equal(log.section("high")[:, 0], problem.input_bounds[0][1])
     # Without a filter what is proposed is executed.
     bare = found.trajectories["none"].log
     np.testing.assert_array_equal(bare.section("nominal"), bare.section("action"))

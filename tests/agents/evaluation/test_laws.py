@@ -9,7 +9,7 @@ import pytest
 import sympy as sp
 from scipy.stats import kstest, norm
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents import RandomPolicy, evaluate, make_problem
 from safe_envs.agents.evaluation.brownian_bridge import Exponentials, bridge_notes
 from safe_envs.agents.evaluation.episodes import episode_seed
@@ -41,7 +41,7 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme):
     tau, sigma, dt, horizon, distance, episodes = 1.8, 1.0, 0.1, 10.0, 5.0, 4000
     options = {
         "start": [15.0, 20.0, tau * 15 + distance],
-        "box": [-1e5, 1e5],
+        "input_bounds": [-1e5, 1e5],
         "horizon": horizon,
         "noise": sigma,
         "dt": dt,
@@ -103,10 +103,10 @@ def test_between_instants_the_variance_is_that_of_the_beginning_of_the_period():
     diffusion = [[0.3 + 0.5 * x, 0.2], [0.1, 0.4 * y]]
     system = ControlAffineSDE((x, y), (u,), [0, 0], [1, 0], diffusion)
     at, dt = {x: 0.5, y: -0.6}, 0.2
-    problem = state_problem(
+    problem = define_problem(
         system,
         1 - x**2 - y**2,
-        box=(-1.0, 1.0),
+        input_bounds=(-1.0, 1.0),
         start=[0.5, -0.6],
         dt=dt,
         horizon=dt,

@@ -51,11 +51,11 @@ def test_data_cannot_grant_itself_the_right_to_run_code():
 
 def test_numbers_of_numpy_and_paths_are_those_of_python():
     given = {"episodes": np.int64(3), "seed": np.int32(4), "confidence": np.float64(0.9)}
-    options = {"noise": np.float64(0.1), "start": np.array([0.5]), "box": (-1, 1)}
+    options = {"noise": np.float64(0.1), "start": np.array([0.5]), "input_bounds": (-1, 1)}
     spec = EvaluationSpec("Scalar-v0", Path("run"), options=options, learned="m.npz", **given)
     assert (spec.policy, spec.learned) == ("run", ("m.npz",))
     data = json.loads(json.dumps(spec.as_dict()))
-    assert data["options"] == {"noise": 0.1, "start": [0.5], "box": [-1, 1]}
+    assert data["options"] == {"noise": 0.1, "start": [0.5], "input_bounds": [-1, 1]}
     assert EvaluationSpec.from_dict(data).as_dict() == spec.as_dict() == data
 
 
@@ -67,7 +67,7 @@ def test_a_spec_runs_like_its_arguments_however_it_is_run():
     assert found.spec == spec
 
 
-DUBINS, TWO = "StochasticDubins-v0", HOCBF(p=(1.0, 1.0))
+DUBINS, TWO = "StochasticDubins-v0", HOCBF(alpha=(1.0, 1.0))
 MEASURED = {"problem": "Pendulum-v0", "options": {"measurement": "default"}, "estimator": "ekf"}
 EXTERNAL = {"problem": "Pendulum-v1", "filter_spec": PENDULUM}
 

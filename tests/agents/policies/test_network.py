@@ -186,19 +186,19 @@ BOXES = {ENV_ID: (-10.0, 10.0), QUADROTOR: [(0.0, 20.0), (-1.0, 1.0), (-0.5, 1.0
 def trained(request, tmp_path_factory):
     """A policy whose actions reach their bounds: the env's id and the folder."""
     env_id, algorithm, arguments = request.param
-    folder, env = tmp_path_factory.mktemp("trained"), gym.make(env_id, box=BOXES[env_id])
+    folder, env = tmp_path_factory.mktemp("trained"), gym.make(env_id, input_bounds=BOXES[env_id])
     model = algorithm("MlpPolicy", env, device="cpu", seed=0, **arguments)
     last = model.policy.action_net if algorithm is PPO else model.policy.actor.mu
     with torch.no_grad():
         last.weight.mul_(300.0 if algorithm is PPO else 30.0)
-    save_policy(model, folder, make_problem(env_id, box=BOXES[env_id]))
+    save_policy(model, folder, make_problem(env_id, input_bounds=BOXES[env_id]))
     return env_id, folder
 
 
 def actions_in(trained, low, high):
     """What the policy does in a box: actions, and the inputs for which they stand there."""
     env_id, folder = trained
-    problem = make_problem(env_id, box=np.transpose([low, high]).tolist())
+    problem = make_problem(env_id, input_bounds=np.transpose([low, high]).tolist())
     actions = make_policy(str(folder), problem).predict(observations(problem))[0]
     center, half = center_and_half_width(problem)
     return actions, center + np.array(half) * actions
@@ -214,7 +214,7 @@ def actions_in(trained, low, high):
     ids=["narrower", "wider", "beside"],
 )
 def test_another_box_gets_the_same_inputs_or_the_nearest_ones(trained, change):
-    low, high = np.array(make_problem(trained[0], box=BOXES[trained[0]]).box).T
+    low, high = np.array(make_problem(trained[0], input_bounds=BOXES[trained[0]]).input_bounds).T
     least, most = change(low, high)
     alike, wanted = actions_in(trained, low, high)
     actions, found = actions_in(trained, least, most)
@@ -235,10 +235,10 @@ def test_another_box_gets_the_same_inputs_or_the_nearest_ones(trained, change):
 def test_the_env_executes_the_same_input(trained):
     reached = []
     for box in (BOXES[trained[0]], (-20.0, 30.0)):
-        env = gym.make(trained[0], box=box)
+        env = gym.make(trained[0], input_bounds=box)
         observation, _ = env.reset(seed=0)
         before = env.unwrapped.state
-        policy = make_policy(str(trained[1]), make_problem(trained[0], box=box))
+        policy = make_policy(str(trained[1]), make_problem(trained[0], input_bounds=box))
         env.step(policy.predict(observation)[0])
         reached.append(env.unwrapped.state - before)
     np.testing.assert_allclose(reached[1], reached[0], rtol=0, atol=1e-6)
@@ -338,9 +338,9 @@ def moments(**changes):
         (moments(clip=0.0), "the normalisation"),
         (moments(mean=4 * ["a"]), "ValueError"),
         ({"normalization": 1.0}, "TypeError"),
-        ({"box": [[-10.0, 10.0], [-10.0, 10.0]]}, "incomplete or altered"),
-        ({"box": [[10.0, -10.0]]}, "incomplete or altered"),
-        ({"box": 1.0}, "incomplete or altered"),
+        ({"input_bounds": [[-10.0, 10.0], [-10.0, 10.0]]}, "incomplete or altered"),
+        ({"input_bounds": [[10.0, -10.0]]}, "incomplete or altered"),
+        ({"input_bounds": 1.0}, "incomplete or altered"),
         ({"features": None}, "its features: None"),
         (("weights_0", lambda a: np.full_like(a, np.nan)), "finite numbers"),
         (("biases_2", lambda a: np.full_like(a, np.inf)), "finite numbers"),

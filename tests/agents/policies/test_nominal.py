@@ -29,7 +29,7 @@ def observations(problem, count, seed=0):
 
 def physical(problem, actions):
     """From actions in [-1, 1] to the box, written down independently."""
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     return low + (np.asarray(actions) + 1.0) / 2.0 * (high - low)
 
 
@@ -79,14 +79,14 @@ def test_zero_controller_executes_the_point_of_the_box_nearest_to_zero(env_id):
     [([-2.0, 6.0], 0.0), ([1.0, 6.0], 1.0), ([-6.0, -2.0], -2.0), ([0.0, 3.0], 0.0)],
 )
 def test_zero_controller_in_boxes_off_centre(box, wanted):
-    env = gym.make("safe_envs/Scalar-v0", box=box).unwrapped
+    env = gym.make("safe_envs/Scalar-v0", input_bounds=box).unwrapped
     assert isinstance(env, SafeEnv)
     action = ZeroController(env.problem).predict(np.zeros(1))[0]
     assert env.physical_action(action)[0] == pytest.approx(wanted, abs=1e-12)
 
 
 def test_nominal_actions_are_clipped_to_the_box():
-    problem = make_problem("Scalar-v0", box=[-0.5, 2.0])
+    problem = make_problem("Scalar-v0", input_bounds=[-0.5, 2.0])
     observation = np.array([[-2.5], [0.0], [1.9]])
     np.testing.assert_allclose(
         physical(problem, NominalController(problem).predict(observation)[0]),
@@ -96,7 +96,7 @@ def test_nominal_actions_are_clipped_to_the_box():
 
 def test_quadrotor_law_is_the_closed_form():
     problem = make_problem(
-        "QuadrotorAltitude-v0", model={"m": 0.45}, plant={"m": 0.9}, box=[-1000.0, 1000.0]
+        "QuadrotorAltitude-v0", model={"m": 0.45}, plant={"m": 0.9}, input_bounds=[-1000.0, 1000.0]
     )
     given = observations(problem, 300)
     z, zdot, z_ref, z_ref_rate = given.astype(float).T
@@ -110,7 +110,7 @@ def test_quadrotor_law_is_the_closed_form():
 
 
 def test_full_quadrotor_has_the_thrust_of_the_altitude_law():
-    problem = make_problem("Quadrotor-v0", box=[-1e9, 1e9])
+    problem = make_problem("Quadrotor-v0", input_bounds=[-1e9, 1e9])
     given = observations(problem, 100)
     names = [f.name for f in problem.features]
     z, zdot, z_ref, z_ref_rate = (
@@ -129,7 +129,7 @@ def test_cruise_law_solves_its_quadratic_program(env_id, speed, rate, slack_weig
     # min 2 (u/M)^2 + w_d d^2 subject to A V + rate V <= d with V = (v - 22)^2, over u/M, with the
     # best d for each u.
     M = 1500.0
-    problem = make_problem(env_id, model={"sigma_1": sigma, "M": M}, box=[-1e6, 1e6])
+    problem = make_problem(env_id, model={"sigma_1": sigma, "M": M}, input_bounds=[-1e6, 1e6])
     column = [f.name for f in problem.features].index(speed)
     given = observations(problem, 60, seed=3)
     given[:30, column] = np.linspace(21.01, 23.0, 30)

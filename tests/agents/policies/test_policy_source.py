@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.agents.policies.nominal import (
     CLFController,
@@ -104,7 +104,7 @@ def some_network(inputs, outputs, activation, hidden=(7, 5), seed=3):
 @pytest.mark.parametrize("env_id", [DUBINS, "safe_envs/Quadrotor-v0"])
 def test_networks(env_id, activation, output, hidden, normal, other_box):
     problem = problem_of(env_id)
-    k, box = len(problem.features), np.array(problem.box)
+    k, box = len(problem.features), np.array(problem.input_bounds)
     numbers = tuple(0.5 * i for i in range(k))
     scaling = Normalization(numbers, numbers, 1.5, 1e-3) if normal else None
     boxes = (0.7 * box + 0.1, box) if other_box else None
@@ -124,7 +124,7 @@ def planar_problem():
     x, y, u, v = sp.symbols("x y u v", real=True)
     system = ControlAffineSDE((x, y), (u, v), [x, -y], [[1, y], [0, 2]], [[0.3, 0.2], [0.0, 0.4]])
     numbers = {"start": [0.0, 0.0], "dt": 0.1, "horizon": 0.5, "nominal": [0, 0]}
-    return state_problem(system, 3 - x - y, box=[(-1.0, 2.0), (-0.5, 0.5)], **numbers)
+    return define_problem(system, 3 - x - y, input_bounds=[(-1.0, 2.0), (-0.5, 0.5)], **numbers)
 
 
 @pytest.mark.parametrize("weight", [1e-3, 1.0, 1e3])

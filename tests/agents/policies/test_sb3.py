@@ -503,7 +503,7 @@ class Remote(VecEnv):
 
 def test_envs_in_other_processes_are_asked(third_party):
     spec, _ = third_party
-    envs = Remote(lambda: gym.make(ENV_ID, horizon=0.5, box=(-2.0, 4.0)))
+    envs = Remote(lambda: gym.make(ENV_ID, horizon=0.5, input_bounds=(-2.0, 4.0)))
     model = ppo(envs)
     wanted, _ = model.predict(OBSERVATIONS, deterministic=True)
     # The same inputs, in the bounds -10 and 10.
@@ -517,10 +517,10 @@ def test_envs_in_other_processes_are_asked(third_party):
 
 def test_an_action_stands_for_an_input(tmp_path):
     """Of the input bounds of the training, as in a folder of this project."""
-    narrow = make_problem(ENV_ID, box=(-2.0, 4.0))
-    model = ppo(make_sb3_env(ENV_ID, 2, "scbf", box=(-2.0, 4.0)))
+    narrow = make_problem(ENV_ID, input_bounds=(-2.0, 4.0))
+    model = ppo(make_sb3_env(ENV_ID, 2, "scbf", input_bounds=(-2.0, 4.0)))
     save_policy(model, tmp_path, narrow)
-    for other in (narrow, PROBLEM, make_problem(ENV_ID, box=(0.0, 0.5))):
+    for other in (narrow, PROBLEM, make_problem(ENV_ID, input_bounds=(0.0, 0.5))):
         wanted = load_policy(tmp_path, other).predict(OBSERVATIONS)[0]
         np.testing.assert_allclose(acted(model, other), wanted, rtol=1e-5, atol=1e-6)
     with pytest.raises(ConfigurationError, match="trained with the input bounds"):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, NumericalError, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, NumericalError, define_problem
 from safe_envs.agents import NominalController, ZeroController, make_problem
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.policies.base import BlockPolicy
@@ -292,9 +292,9 @@ def test_what_has_no_end_has_the_error_of_numpy(monkeypatch, engine):
     system = ControlAffineSDE(
         states=(X,), inputs=(u,), drift=[X**3], input_matrix=[1], diffusion=[0.01]
     )
-    given = {"box": (-1.0, 1.0), "start": [3.0], "dt": 0.1, "horizon": 2.0, "nominal": 1.0}
+    given = {"input_bounds": (-1.0, 1.0), "start": [3.0], "dt": 0.1, "horizon": 2.0, "nominal": 1.0}
     with pytest.raises(NumericalError, match="finite"):
-        row_of(state_problem(system, 1 + X**2, **given), engine=engine, **SHORT)
+        row_of(define_problem(system, 1 + X**2, **given), engine=engine, **SHORT)
 
 
 def test_an_interrupt_waits_for_parts_under_way_alone(monkeypatch):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events.estimate import estimate_rare
@@ -27,7 +27,7 @@ from tests.oracles.laws import (
 
 pytestmark = pytest.mark.slow
 
-SCALAR: dict[str, Any] = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
+SCALAR: dict[str, Any] = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "input_bounds": [-1.0, 1.0]}
 """Random starts, and a box that is too small for some of them."""
 
 
@@ -53,8 +53,14 @@ def two_channels():
         input_matrix=[[1, 0], [0, 1]],
         diffusion=[[0.15, 0.1], [0.0, 0.2]],
     )
-    given = {"box": (-1.0, 1.0), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0, "nominal": [0, 0]}
-    return replace(state_problem(system, 1.5 - x - y, **given), substeps=2)
+    given = {
+        "input_bounds": (-1.0, 1.0),
+        "start": [0.0, 0.0],
+        "dt": 0.1,
+        "horizon": 1.0,
+        "nominal": [0, 0],
+    }
+    return replace(define_problem(system, 1.5 - x - y, **given), substeps=2)
 
 
 def two_ways():
@@ -67,15 +73,23 @@ def two_ways():
         input_matrix=[[1, 0], [0, 1]],
         diffusion=[[0.2, 0], [0, 3 / 5.15]],
     )
-    given = {"box": (-1.0, 1.0), "start": [0.0, 0.0], "dt": 0.05, "horizon": 1.0, "nominal": [0, 0]}
-    return state_problem(system, [1 - x, 3 - y], **given)
+    given = {
+        "input_bounds": (-1.0, 1.0),
+        "start": [0.0, 0.0],
+        "dt": 0.05,
+        "horizon": 1.0,
+        "nominal": [0, 0],
+    }
+    return define_problem(system, [1 - x, 3 - y], **given)
 
 
 def martingale():
     """Under the SCBF, h = 1 - x^2 is a martingale of dx = u dt + x dW."""
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE((x,), (u,), [0], [1], [x])
-    return state_problem(system, 1 - x**2, box=(-50.0, 50.0), start=[1e-4], dt=0.1, horizon=14.0)
+    return define_problem(
+        system, 1 - x**2, input_bounds=(-50.0, 50.0), start=[1e-4], dt=0.1, horizon=14.0
+    )
 
 
 # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is a

@@ -57,7 +57,7 @@ def one_thread():
 
 
 def make(horizon=0.5, filtered=True, box=BOX):
-    env = gym.make(ENV_ID, horizon=horizon, box=box)
+    env = gym.make(ENV_ID, horizon=horizon, input_bounds=box)
     return Monitor(SafetyFilterWrapper(env, "scbf") if filtered else env)
 
 
@@ -67,7 +67,7 @@ def several(count=3, filtered=True):
 
 
 def native():
-    return VecMonitor(make_sb3_env(ENV_ID, 3, "scbf", horizon=0.25, box=BOX))
+    return VecMonitor(make_sb3_env(ENV_ID, 3, "scbf", horizon=0.25, input_bounds=BOX))
 
 
 class Witness(BaseCallback):
@@ -248,7 +248,9 @@ def test_saving_and_loading(tmp_path):
 
 
 def buffer_of(envs=3, action="executed", kind=FilteredReplayBuffer, box=TWO_INPUTS, **arguments):
-    return kind(20 * envs, *SPACES, device="cpu", n_envs=envs, action=action, box=box, **arguments)
+    return kind(
+        20 * envs, *SPACES, device="cpu", n_envs=envs, action=action, input_bounds=box, **arguments
+    )
 
 
 def add(buffer, infos, rewards=0.0):
@@ -315,7 +317,7 @@ def test_a_full_buffer_starts_again():
 
 def test_options_of_a_problem_and_of_any_env_of_it():
     env = make()
-    vector = SafetyFilterVectorWrapper(gym.make_vec(ENV_ID, num_envs=2, box=BOX), "scbf")
+    vector = SafetyFilterVectorWrapper(gym.make_vec(ENV_ID, num_envs=2, input_bounds=BOX), "scbf")
     for source in (
         env.unwrapped.problem,
         env,
@@ -326,7 +328,7 @@ def test_options_of_a_problem_and_of_any_env_of_it():
     ):
         assert replay_options(source, "both") == {
             "replay_buffer_class": FilteredReplayBuffer,
-            "replay_buffer_kwargs": {"box": (BOX,), "action": "both"},
+            "replay_buffer_kwargs": {"input_bounds": (BOX,), "action": "both"},
         }
 
 
@@ -335,13 +337,16 @@ SMALL = {"optimize_memory_usage": True, "handle_timeout_termination": False}
 
 
 def of_several_bounds():
-    return DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))])
+    return DummyVecEnv([make, lambda: make(input_bounds=(-2.0, 2.0))])
 
 
 @pytest.mark.parametrize(
     ("call", "fragment"),
     [
-        *((lambda box=box: buffer_of(box=box), "box = ") for box in (*BOXES, "b", ((0,), (1, 2)))),
+        *(
+            (lambda box=box: buffer_of(input_bounds=box), "box = ")
+            for box in (*BOXES, "b", ((0,), (1, 2)))
+        ),
         (lambda: buffer_of(action="excuted"), "'executed'"),
         (lambda: buffer_of(action=None), "action = None"),
         (lambda: buffer_of(action="both", **SMALL), "optimize_memory_usage"),
@@ -413,7 +418,7 @@ class Halved(gym.ActionWrapper):
 
 def test_wrappers_around_the_filter_that_change_actions():
     def hidden(around):
-        env = SafetyFilterWrapper(gym.make(ENV_ID, horizon=0.5, box=BOX), "scbf")
+        env = SafetyFilterWrapper(gym.make(ENV_ID, horizon=0.5, input_bounds=BOX), "scbf")
         return Monitor(around(env))
 
     def rescaled(env):
@@ -426,7 +431,7 @@ def test_wrappers_around_the_filter_that_change_actions():
     for around in (Halved, lambda env: Halved(rescaled(env))):
         with pytest.raises(ConfigurationError, match="wrapper around the filter"):
             learned(SAC, hidden(around), **one)
-    wide = {"replay_buffer_kwargs": {"box": [(1.0 - 2.0, 1.0 + 2.0)]}}
+    wide = {"replay_buffer_kwargs": {"input_bounds": [(1.0 - 2.0, 1.0 + 2.0)]}}
     model = SAC("MlpPolicy", hidden(Halved), **one, **wide, buffer_size=9, device="cpu")
     model.env.envs[0].unwrapped.reset(seed=0)
     executed = {"safe_action": np.array([0.0]), "nominal_action": np.array([2.0])}
@@ -444,7 +449,7 @@ def test_wrappers_around_the_filter_that_change_actions():
 
 
 def other_bounds(filtered=True):
-    return make(filtered=filtered, box=(-2.0, 2.0))
+    return make(filtered=filtered, input_bounds=(-2.0, 2.0))
 
 
 def in_units(witness, center=0.0, half=2.0):
@@ -517,7 +522,7 @@ def test_observations_with_keys(tmp_path, action):
 @pytest.mark.parametrize("kind", ["vector_entry_point", "sync"])
 def test_infos_of_vector_envs_of_gymnasium(kind, mode):
     """As loops of one's own add them, without Stable-Baselines3's envs."""
-    settings = {"horizon": 0.25, "box": BOX}
+    settings = {"horizon": 0.25, "input_bounds": BOX}
     if kind == "sync":
         settings |= {
             "wrappers": [lambda env: SafetyFilterWrapper(env, "scbf")],
@@ -567,7 +572,7 @@ def filled(penalty, action="executed", n_steps=1, kind=None):
     """A buffer after episodes of random actions under a penalty on interventions, fed with native
     infos or those of another kind."""
     env = make_sb3_env(
-        ENV_ID, 3, "scbf", intervention_penalty=penalty, horizon=0.25, box=BOX, seed=0
+        ENV_ID, 3, "scbf", intervention_penalty=penalty, horizon=0.25, input_bounds=BOX, seed=0
     )
     options = replay_options(env, action, n_steps, gamma=0.9)
     spaces = (env.observation_space, env.action_space)
@@ -622,7 +627,11 @@ def test_n_step_returns_of_executed_actions_are_without_the_penalty(kind):
 
 def test_penalties_pass_through_the_wrappers():
     env = VecNormalize(
-        VecMonitor(make_sb3_env(ENV_ID, 3, "scbf", intervention_penalty=2.0, horizon=0.25, box=BOX))
+        VecMonitor(
+            make_sb3_env(
+                ENV_ID, 3, "scbf", intervention_penalty=2.0, horizon=0.25, input_bounds=BOX
+            )
+        )
     )
     model, _ = learned(SAC, env, **replay_options(env, "both"))
     rewards = model.replay_buffer.rewards[: model.replay_buffer.size()]
@@ -690,7 +699,7 @@ def test_it_draws_what_stable_baselines3_draws():
     [("executed", 1, [1.0]), ("proposed", 1, [-0.5]), ("both", 2, [1.0, -0.5])],
 )
 def test_a_filtered_step_has_its_cost_in_each_row(action, rows, actions):
-    buffer = fill(plain(FilteredCostReplayBuffer, box=((0.0, 4.0),), action=action), 2)
+    buffer = fill(plain(FilteredCostReplayBuffer, input_bounds=((0.0, 4.0),), action=action), 2)
     assert buffer.pos == 2 * rows
     np.testing.assert_array_equal(
         buffer.costs[: 2 * rows], np.repeat([[0, 1, 2], [10, 11, 12]], rows, axis=0)

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from safe_envs import ConfigurationError, InvalidInputError
-from safe_envs.agents.training.vec_env import SafeVecEnv, make_sb3_env
+from safe_envs.agents.training.vec_env import SB3VecEnv, make_sb3_env
 from safe_envs.wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 
@@ -272,7 +272,7 @@ def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
         lambda self: tuple(np.full((4, 6, 3), i, dtype=np.uint8) for i in range(self.num_envs)),
     )
     monkeypatch.setitem(sys.modules, "moviepy", ModuleType("moviepy"))
-    recorder = VecVideoRecorder(SafeVecEnv(native), str(tmp_path), lambda _: True, video_length=5)
+    recorder = VecVideoRecorder(SB3VecEnv(native), str(tmp_path), lambda _: True, video_length=5)
     assert recorder.frames_per_sec == 20
     assert [picture.max() for picture in recorder.get_images()] == [0, 1]
     recorder.reset()
@@ -375,7 +375,7 @@ def test_wrong_arguments_are_errors(arguments, fragment):
 def test_other_envs_are_errors():
     for env, fragment in (("CartPole-v1", "vector envs"), (DUBINS, "'SameStep'")):
         with pytest.raises(ConfigurationError, match=fragment):
-            SafeVecEnv(gym.make_vec(env, num_envs=2))
+            SB3VecEnv(gym.make_vec(env, num_envs=2))
 
 
 def test_wrong_actions_are_errors():
@@ -395,7 +395,7 @@ def test_agents_learn_behind_the_promise_filter_and_may_observe_p():
         "promise:p=0.97",
         observe_promise=True,
     )
-    envs = SafeVecEnv(env, intervention_penalty=0.1)
+    envs = SB3VecEnv(env, intervention_penalty=0.1)
     assert envs.observation_space.shape == (2,)
     seen = envs.reset()
     rng = np.random.default_rng(0)

@@ -322,7 +322,7 @@ def test_another_problem_is_refused():
     guard = BackupFilter.for_problem(cart_problem())
     guard.require_problem(cart_problem())
     for options, what in (
-        ({"box": (-1, 1)}, "input bounds"),
+        ({"input_bounds": (-1, 1)}, "input bounds"),
         ({"dt": 0.05}, "control period"),
         ({"barriers": 2 - x}, "barriers"),
     ):

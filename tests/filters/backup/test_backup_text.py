@@ -47,7 +47,7 @@ def test_the_text_says_which_filter_is_meant():
                 ("backup:horizon=x", "horizon"),
                 ("backup:margin=-1", "margin = -1"),
                 ("backup+scbf", "alone"),
-                ("backup:horizon=2+hocbf:p=2,8", "alone"),
+                ("backup:horizon=2+hocbf:alpha=2,8", "alone"),
             )
         ),
         (lambda: parse_conditions("backup", cart_problem()), "backup"),

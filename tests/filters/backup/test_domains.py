@@ -35,11 +35,11 @@ class Pressed:
         plant = self.problem.plant
         self.filter = BackupFilter.for_problem(self.problem, knowledge="plant")
         self.rng, self.size = np.random.default_rng(seed), size
-        self.low, self.high = np.array(self.problem.box).T
+        self.low, self.high = np.array(self.problem.input_bounds).T
         self._step = Integrator(plant, self.problem.dt, self.problem.substeps, "arrays")
         expressions = [b.expression for b in self.problem.barriers]
         self._barriers = compile_function(plant.states, expressions, "arrays")
-        self.corners = np.array(list(itertools.product(*self.problem.box)))
+        self.corners = np.array(list(itertools.product(*self.problem.input_bounds)))
         self.held = self.corners[self.rng.integers(len(self.corners), size=size)]
         self.start = np.empty((0, plant.n))
         while len(self.start) < size:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, state_problem
+from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError, define_problem
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.enclosures.intervals import Interval
@@ -41,7 +41,7 @@ def made(rates, law, barrier=10 - x, *, box=(-50.0, 50.0), dt=0.1, **rest):
     system = ControlAffineSDE(states, (u,), rates, inputs, [[0]] * len(states), parameters)
     given = {"start": [0.0] * len(states), "horizon": 10 * dt, **rest}
     backup = None if law is None else Backup((law,), 1.0)
-    return state_problem(system, barrier, box=box, dt=dt, backup=backup, **given)
+    return define_problem(system, barrier, input_bounds=box, dt=dt, backup=backup, **given)
 
 
 def to_zero(entry, extent=3.0, states=(x,), at=0):
@@ -103,7 +103,7 @@ def test_a_derived_set_is_safe_to_its_edge(barrier):
 
 
 def test_a_linear_loops_set_reaches_to_what_bounds_it():
-    problem = made([v, 0], to_zero(-x - 2 * v, 1.0, (x, v)), 1 - x, box=(-1.0, 1.0))
+    problem = made([v, 0], to_zero(-x - 2 * v, 1.0, (x, v)), 1 - x, input_bounds=(-1.0, 1.0))
     ((symbols, e),) = derived_sets(problem, problem.plant, problem.backup.laws[0])
     assert symbols == (x, v)
     p = e.root @ e.root.T
@@ -114,7 +114,7 @@ def test_a_linear_loops_set_reaches_to_what_bounds_it():
 
 def test_the_set_moves_with_the_equilibrium_and_its_parameters():
     law = BackupLaw("a", (-(x - 1 / k) - 2 * v,), equilibrium={x: 1 / k, v: 0}, extent={x: 1, v: 1})
-    problem = made([v, 0], law, 1 - x, box=(-1.0, 1.0), gain=4.0)
+    problem = made([v, 0], law, 1 - x, input_bounds=(-1.0, 1.0), gain=4.0)
     ((_, e),) = derived_sets(problem, problem.plant, law)
     assert e.center.tolist() == [0.25, 0.0]
 
@@ -132,7 +132,7 @@ def require_kept(problem, size=1500, periods=40):
     y = middle + half * rng.uniform(-1, 1, (len(symbols), 40 * size))
     y = y[:, stacked(known(*y), 40 * size)[:, m] >= 0.0][:, :size]
     assert y.shape[1] > 100
-    low, high = np.array(problem.box).T
+    low, high = np.array(problem.input_bounds).T
     for _ in range(periods):
         found = stacked(known(*y), y.shape[1])
         assert (found[:, m:] >= 0.0).all()
@@ -144,7 +144,7 @@ def require_kept(problem, size=1500, periods=40):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: made([v, 0], to_zero(-x - 2 * v, 1.0, (x, v)), 1 - x, box=(-1.0, 1.0)),
+        lambda: made([v, 0], to_zero(-x - 2 * v, 1.0, (x, v)), 1 - x, input_bounds=(-1.0, 1.0)),
         lambda: made([v, -sp.sin(x)], to_zero(-2 * v, 1.0, (x, v)), sp.Rational(1, 2) - x),
         lambda: made(
             [v, -sp.sin(x)], to_zero(-2 * v, 1.0, (x, v)), 1 - x, dt=0.3, substeps=3, horizon=3.0
@@ -153,7 +153,10 @@ def require_kept(problem, size=1500, periods=40):
         lambda: made([-x, x / 2 - v, x**2 - w], to_zero(0, 0.6, (x, v, w)), sp.Rational(3, 5) - w),
         # Saturated: the branch of the law at the equilibrium, as far as it is the law.
         lambda: made(
-            [v, -x], to_zero(sp.Max(-1, sp.Min(1, -2 * v)), 1.0, (x, v)), 2 - x, box=(-1.0, 1.0)
+            [v, -x],
+            to_zero(sp.Max(-1, sp.Min(1, -2 * v)), 1.0, (x, v)),
+            2 - x,
+            input_bounds=(-1.0, 1.0),
         ),
     ],
 )
@@ -173,7 +176,7 @@ def test_derived_sets_are_kept(make):
                 {"plant": {"m": 0.8}, "model": {"m": 0.8}},
                 {"floor": 4.5, "ceiling": 5.5},
                 {"tilt": 0.2},
-                {"box": (1e4, 9e4)},
+                {"input_bounds": (1e4, 9e4)},
             )
         ),
     ],
@@ -202,7 +205,7 @@ def test_laws_and_stated_sets_come_back_in_numbers():
 
 
 def test_derived_sets_keep_a_margin():
-    problem = made([-x], to_zero(-x), box=(-3, 3))
+    problem = made([-x], to_zero(-x), input_bounds=(-3, 3))
     ends = {}
     for margin in (0.0, 8.0):
         terminal = with_terminal_sets(problem, problem.plant, margin).laws[0].terminal
@@ -215,10 +218,10 @@ def test_derived_sets_keep_a_margin():
 
 def test_a_constant_input_at_the_equilibrium_is_within_the_bounds():
     # x' = -x + u under u = 2 rests at 2; under 3, the most, x leaves for 3; 5 is clipped.
-    problem = made([-x], to_zero(2, 0.5, at=2.0), box=(-3, 3), start=[2.0])
+    problem = made([-x], to_zero(2, 0.5, at=2.0), input_bounds=(-3, 3), start=[2.0])
     terminal = with_terminal_sets(problem, problem.plant).laws[0].terminal
     assert terminal.subs({x: 2.0}) == 1
-    problem = made([-x], to_zero(5, 0.5, at=5.0), box=(-3, 3), start=[2.0])
+    problem = made([-x], to_zero(5, 0.5, at=5.0), input_bounds=(-3, 3), start=[2.0])
     with pytest.raises(ConfigurationError, match="proved"):
         with_terminal_sets(problem, problem.plant)
 
@@ -228,13 +231,19 @@ ANGLE = sp.atan2(x - 0.1, -1)
 
 def test_a_law_that_jumps_elsewhere_is_kept_away_from_the_jump():
     # The angle is -3 below x = .1, and 3 above.
-    problem = made([-x], to_zero(-sp.Max(x, ANGLE), 0.5), box=(-3, 3))
+    problem = made([-x], to_zero(-sp.Max(x, ANGLE), 0.5), input_bounds=(-3, 3))
     terminal = with_terminal_sets(problem, problem.plant).laws[0].terminal
     assert float(terminal.subs({x: 0.09})) > 0.0 > float(terminal.subs({x: 0.11}))
 
 
 def cart(**rest):
-    given = {"extent": {x: 1.0, v: 1.0}, "gain": 2.0, "box": (-1.0, 1.0), "barrier": 1 - x, **rest}
+    given = {
+        "extent": {x: 1.0, v: 1.0},
+        "gain": 2.0,
+        "input_bounds": (-1.0, 1.0),
+        "barrier": 1 - x,
+        **rest,
+    }
     law = BackupLaw("rest", (-x - k * v,), equilibrium={x: 0, v: 0}, extent=given.pop("extent"))
     return made([v, 0], law, **given)
 
@@ -245,7 +254,7 @@ def cart(**rest):
         (lambda: cart(gain=-1.0), ConfigurationError, "x, v"),
         (lambda: cart(dt=3.0), ConfigurationError, "dt"),
         (lambda: cart(barrier=-x - 1, start=[-2, 0]), ConfigurationError, "rest"),
-        (lambda: cart(box=(0.5, 1.0)), ConfigurationError, "rest"),
+        (lambda: cart(input_bounds=(0.5, 1.0)), ConfigurationError, "rest"),
         (lambda: cart(extent={x: 1.0}), SystemDefinitionError, "extent of v"),
         (
             lambda: made([v, 0], BackupLaw("a", (-v,), equilibrium={v: 0}, extent={v: 1.0}), 1 - x),
@@ -276,7 +285,7 @@ def cart(**rest):
         (lambda: made([-x], to_zero(-x, 1e-300)), ConfigurationError, "extent.* said"),
         (lambda: made([-x], to_zero(-x, 1e300)), ConfigurationError, "extent.* said"),
         pytest.param(
-            lambda: make_problem("safe_envs/QuadrotorLimits-v0", box=(0.0, 4e4)),
+            lambda: make_problem("safe_envs/QuadrotorLimits-v0", input_bounds=(0.0, 4e4)),
             ConfigurationError,
             "proved",
             marks=pytest.mark.oracle,

@@ -99,7 +99,7 @@ def test_covariances_take_the_derivative_of_the_simulated_step(env):
     estimator = make_estimator("ekf", problem)
     n, model = estimator.n, estimator.model
     x = problem.starts[problem.start].proposals(3)[-1]
-    u = [0.3 * low + 0.7 * high for low, high in problem.box]
+    u = [0.3 * low + 0.7 * high for low, high in problem.input_bounds]
     step = Integrator(model, problem.dt, problem.substeps, "floats")
     nothing = [0.0] * step.channels
     size = 1e-6

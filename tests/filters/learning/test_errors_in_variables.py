@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.learning.bayesian import identify, unbiased
 from safe_envs.filters.learning.collection import collect
@@ -51,10 +51,10 @@ def line(noise: float, spread: float = 1.0):
     system = ControlAffineSDE.from_rate(
         (x,), (u,), [-x + u], diffusion=[sigma], parameters={sigma: 0.2}
     )
-    problem = state_problem(
+    problem = define_problem(
         system,
         spread**2 - x**2,
-        box=(-2, 2),
+        input_bounds=(-2, 2),
         start=[(-0.5, 0.5)],
         dt=0.1,
         horizon=1.0,

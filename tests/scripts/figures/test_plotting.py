@@ -48,7 +48,7 @@ def test_a_figure_is_written_in_the_format_of_the_suffix(evaluation, tmp_path, n
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["single", "double"])
 def test_eight_filters_of_long_names_can_be_read(size):
-    names = [f"hocbf:p=1.2345*s**3+0.5*tanh(s)+0.25*s**5+{k}*s" for k in range(1, 8)]
+    names = [f"hocbf:alpha=1.2345*s**3+0.5*tanh(s)+0.25*s**5+{k}*s" for k in range(1, 8)]
     found = evaluate(
         SCALAR, filters=["none", *names], episodes=4, bounds=False, record=True, best=False
     )

@@ -112,8 +112,20 @@ def test_panels_without_room_are_counted(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 MANY = {
-    "short": ["none", "scbf", "cbf", "rcbf", "srcbf", "hocbf:p=1", "hocbf:p=22", "promise:p=0.99"],
-    "long": ["none", *(f"hocbf:p={k},8,sampling_margin=true,a_long_name={k}" for k in range(7))],
+    "short": [
+        "none",
+        "scbf",
+        "cbf",
+        "rcbf",
+        "srcbf",
+        "hocbf:alpha=1",
+        "hocbf:alpha=22",
+        "promise:p=0.99",
+    ],
+    "long": [
+        "none",
+        *(f"hocbf:alpha={k},8,sampling_margin=true,a_long_name={k}" for k in range(7)),
+    ],
 }
 
 

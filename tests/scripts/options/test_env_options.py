@@ -30,7 +30,7 @@ GIVEN = (
     "--barrier=radius=a b",
     "--dt=0.05",
     "--substeps=2",
-    "--box=-1,2",
+    "--input-bounds=-1,2",
     "--start=-1,2,0",
 )
 
@@ -62,7 +62,7 @@ def test_a_command_is_handed_the_env_that_its_options_ask_for():
         "barrier": {"radius": "a b"},
         "dt": 0.05,
         "substeps": 2,
-        "box": [-1.0, 2.0],
+        "input_bounds": [-1.0, 2.0],
         "start": [-1.0, 2.0, 0.0],
     }
     assert read("StochasticDubins-v0").arguments == {}
@@ -132,7 +132,7 @@ def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
 def test_bounds_are_of_the_horizon_that_is_simulated(safe_envs_command):
     """Which is 7 periods of .3 s where 2 s were asked for."""
     arguments = (
-        "Pendulum-v0 --start .1,.1 --filter szcbf:alphas=1 --dt .3 --no-simulate --json found.json"
+        "Pendulum-v0 --start .1,.1 --filter szcbf:alpha=1 --dt .3 --no-simulate --json found.json"
     )
     status, out, _ = safe_envs_command("verify", arguments)
     assert status == 0

@@ -37,7 +37,7 @@ def test_the_files_that_a_simulation_reads():
     assert {Path("a+b.npz"), Path("c.npz")} <= {
         path for option, path in found if option == "--filter"
     }
-    assert not list(text_options.inputs_of(None, "nominal", ["none", "hocbf:p=1,2"]))
+    assert not list(text_options.inputs_of(None, "nominal", ["none", "hocbf:alpha=1,2"]))
     assert not list(text_options.inputs_of("my.module:problem", filter_spec="my.module:view"))
 
 

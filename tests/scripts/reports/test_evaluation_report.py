@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 from rich.console import Console
 
-from safe_envs import ControlAffineSDE, state_problem
+from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.statistics import touches
 from safe_envs.scripts.reports.evaluation import print_evaluation
@@ -74,7 +74,7 @@ def moving(rate, barrier, *, start=0.0, horizon=4.0, nominal=0):
         "horizon": horizon,
         "nominal": nominal,
     }
-    return state_problem(system, [barrier], box=(-1, 1), **options)
+    return define_problem(system, [barrier], input_bounds=(-1, 1), **options)
 
 
 def test_violations_that_are_no_more_than_rounding_are_told():
@@ -105,7 +105,7 @@ def test_violations_that_are_no_more_than_rounding_are_told():
 
 
 def test_violations_of_a_filter_that_rides_the_edge_are_told():
-    options = {"noise": 0.0, "box": [-20, 20], "horizon": 10.0}
+    options = {"noise": 0.0, "input_bounds": [-20, 20], "horizon": 10.0}
 
     def told(spec):
         answer = evaluate(
@@ -119,11 +119,11 @@ def test_violations_of_a_filter_that_rides_the_edge_are_told():
         )
         return answer, answer.document()["rows"][0], printed(answer)
 
-    answer, stored, text = told("hocbf:p=10,10")
+    answer, stored, text = told("hocbf:alpha=10,10")
     assert (stored["violations"], stored["touching"], stored["below_rounding"]) == (4, 0, 4)
     worst = -answer.episode_columns()["min_h"].min()
     assert stored["worst_below_rounding"] == worst < 1e-10
-    all_of_them = "all violations of hocbf:p=10,10 are below rounding"
+    all_of_them = "all violations of hocbf:alpha=10,10 are below rounding"
     assert f"{all_of_them}, worst violation {worst:.2g}: they settle on the edge" in text
     answer, stored, text = told("none")
     assert answer.rows[0].violations == 4
