@@ -20,6 +20,8 @@ from safe_envs.lazy_attributes import lazy_attributes, package_version
 from safe_envs.systems import ENV_IDS
 
 if TYPE_CHECKING:
+    from safe_envs.agents.evaluation.evaluate import evaluate
+    from safe_envs.agents.questions import best, certify, check, sweep, verify
     from safe_envs.dynamics.sde import ControlAffineSDE
     from safe_envs.envs.env import SafeEnv
     from safe_envs.envs.registered import register
@@ -29,7 +31,9 @@ if TYPE_CHECKING:
     from safe_envs.problem.builder import define_problem
     from safe_envs.problem.clf import CLF
     from safe_envs.problem.problem import Barrier, SafetyProblem
+    from safe_envs.registry import make_problem
     from safe_envs.scripts.figures.log import plot_log
+    from safe_envs.wrappers.safety_filter import SafetyFilterWrapper
 
     __version__: str
 
@@ -47,12 +51,20 @@ __all__ = [
     "SafeEnvsError",
     "SafeVectorEnv",
     "SafetyFilter",
+    "SafetyFilterWrapper",
     "SafetyProblem",
     "SystemDefinitionError",
     "SystemDefinitionWarning",
+    "best",
+    "certify",
+    "check",
     "define_problem",
+    "evaluate",
+    "make_problem",
     "plot_log",
     "register",
+    "sweep",
+    "verify",
 ]
 
 _MODULES = {
@@ -63,7 +75,11 @@ _MODULES = {
     "SafeEnv": "safe_envs.envs.env",
     "SafeVectorEnv": "safe_envs.envs.vector_env",
     "SafetyFilter": "safe_envs.filters.safety_filter",
+    "SafetyFilterWrapper": "safe_envs.wrappers.safety_filter",
     "SafetyProblem": "safe_envs.problem.problem",
+    **dict.fromkeys(("best", "certify", "check", "sweep", "verify"), "safe_envs.agents.questions"),
+    "evaluate": "safe_envs.agents.evaluation.evaluate",
+    "make_problem": "safe_envs.registry",
     "plot_log": "safe_envs.scripts.figures.log",
     "register": "safe_envs.envs.registered",
     "define_problem": "safe_envs.problem.builder",

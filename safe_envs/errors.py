@@ -107,8 +107,23 @@ def install_extra(extra: str) -> str:
     return f'pip install --editable ".[{extra}]" in a checkout'
 
 
+RENAMED = {
+    "SafeVecEnv": "SB3VecEnv",
+    "alphas": "alpha",
+    "bounds": "input_bounds",
+    "box": "input_bounds",
+    "condition": "filter",
+    "conditions": "filters",
+    "p": "alpha",
+    "state_problem": "define_problem",
+}
+"""Names of today for arguments, settings and functions of version 0.1, for advice in errors."""
 _FEW = 6
 """So many allowed names are listed in full, of more of them the nearest three."""
+
+
+def _as_argument(option: str) -> str:
+    return option.removeprefix("--").replace("-", "_")
 
 
 def nearest(name: str, allowed: Iterable[str], more: str = "") -> str:
@@ -123,6 +138,9 @@ def nearest(name: str, allowed: Iterable[str], more: str = "") -> str:
         The nearest name, and the others: all where they are few, else the next two.
     """
     names = list(allowed)
+    now = RENAMED.get(name.removeprefix("--"), "")
+    if new := next((each for each in names if now and now in (each, _as_argument(each))), None):
+        return f"it is {new} now"
     # Whoever writes a name in capitals means the name.
     lower = {each.lower(): each for each in reversed(names)}
     found = difflib.get_close_matches(shortened(name).lower(), lower, n=3, cutoff=0.4)

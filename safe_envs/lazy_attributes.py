@@ -11,6 +11,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any
 
+from safe_envs.errors import RENAMED
+
 
 def lazy_attributes(
     package: str, modules: Mapping[str, str], namespace: dict[str, Any]
@@ -45,7 +47,8 @@ def _module_in(package: str, name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != full:
             raise
-    raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    advice = f"; it is {RENAMED[name]} now" if name in RENAMED else ""
+    raise AttributeError(f"module {package!r} has no attribute {name!r}{advice}")
 
 
 def package_version(package: str = "safe-envs") -> str:

@@ -56,7 +56,7 @@ def require_system(given: Any) -> ControlAffineSDE:
         return given
     kind = given.__name__ if inspect.isclass(given) else type(given).__name__
     advice = (
-        "take SafetyFilter.for_problem(problem, conditions) for a problem"
+        "take SafetyFilter.for_problem(problem, filters) for a problem"
         if isinstance(given, SafetyProblem)
         else "give a ControlAffineSDE, or take SafetyFilter.for_problem for the problem of an env"
     )
@@ -77,7 +77,7 @@ def require_problem(given: Any) -> SafetyProblem:
     raise SystemDefinitionError(
         f"problem is {type(given).__name__}; give a SafetyProblem, such as"
         " safe_envs.registry.make_problem('safe_envs/Pendulum-v0'), or take SafetyFilter(system,"
-        " barriers, conditions, bounds) for a system"
+        " barriers, filters, input_bounds) for a system"
     )
 
 
@@ -146,8 +146,8 @@ def read_pairs(system: ControlAffineSDE, barriers: Any, conditions: Any) -> Pair
         if conditions is not None or not all(map(_is_pair, entries)):
             numeric = numbers_in(conditions).size and conditions is not None
             raise ConfigurationError(
-                f"barriers holds (barrier, condition) pairs, and conditions = {shown(conditions)};"
-                f" {'input bounds go by name, bounds=...; ' if numeric else ''}give pairs alone, or"
+                f"barriers holds (barrier, condition) pairs, and filters = {shown(conditions)};"
+                f" {'bounds go by name, input_bounds=...; ' if numeric else ''}give pairs alone, or"
                 " barriers alone and their conditions"
             )
         entries, conditions = [list(part) for part in zip(*entries, strict=True)]
@@ -202,10 +202,10 @@ def _no_condition(given: Any) -> ConfigurationError:
     if inspect.isclass(given) and issubclass(given, Condition):
         advice = f"make one of the class, {given.__name__}(...)"
     elif numbers_in(given).size:
-        advice = f"input bounds are the next argument, bounds=...; {_FORMS}"
+        advice = f"input bounds are the next argument, input_bounds=...; {_FORMS}"
     else:
         advice = _FORMS
-    return ConfigurationError(f"conditions = {shown(given)}; {advice}")
+    return ConfigurationError(f"filters = {shown(given)}; {advice}")
 
 
 def refuse_unknown(given: Iterable[str], known: Callable[..., Any]) -> None:
@@ -217,8 +217,7 @@ def refuse_unknown(given: Iterable[str], known: Callable[..., Any]) -> None:
     """
     for name in given:
         allowed = list(inspect.signature(known).parameters)[1:-1]
-        advice = "input bounds are bounds=..." if name == "box" else nearest(name, allowed)
-        raise unexpected_argument("SafetyFilter", name, advice)
+        raise unexpected_argument("SafetyFilter", name, nearest(name, allowed))
 
 
 def require_goal(clf: Any, weights: Any) -> None:

@@ -38,7 +38,7 @@ from safe_envs.filters.conditions.estimates import (
     constraint_at_estimate,
     with_belief_signals,
 )
-from safe_envs.filters.conditions.text import Conditions
+from safe_envs.filters.conditions.text import Conditions, spec_of
 from safe_envs.filters.estimation.estimator import Estimator
 from safe_envs.filters.estimation.registry import make_estimator
 from safe_envs.filters.measurement_filter import MeasurementFilter, certain_states
@@ -79,9 +79,9 @@ class SafetyFilter:
         filters: a `Condition` for all barriers, one for each, or their text, like "hocbf:alpha=2,8"
             or "szcbf+hocbf"; see `parse_condition`. "szcbf" with noise and "hocbf" without by
             default. None with pairs.
-        input_bounds: (low, high) of all inputs in physical units, or one such pair for each. An end may
-            be infinite unless the filter has a goal, a reciprocal condition or certificate, or an
-            uncertain constraint: these go as far as they can.
+        input_bounds: (low, high) of all inputs in physical units, or one such pair for each. An end
+            may be infinite unless the filter has a goal, a reciprocal condition or certificate, or
+            an uncertain constraint: these go as far as they can.
         weights: diagonal of W, one positive number for each input; ones by default.
         priorities: weights of the squared slacks, one positive number for each barrier; ones by
             default.
@@ -156,6 +156,11 @@ class SafetyFilter:
         self._measured = None if estimator is None else MeasurementFilter(self, estimator)
         self.warm_up()
 
+    def __repr__(self) -> str:
+        pairs = ", ".join(f"{spec_of(c)} of {barrier.name}" for barrier, c in self.pairs)
+        ends = zip(self.model.inputs, self.qp.low, self.qp.high, strict=True)
+        return f"SafetyFilter({pairs}; {', '.join(f'{u} in [{a:g}, {b:g}]' for u, a, b in ends)})"
+
     @classmethod
     def for_problem(
         cls,
@@ -170,7 +175,7 @@ class SafetyFilter:
         """Return the filter for the barriers of a problem.
 
         Args:
-            problem: problem whose model, barriers and box are taken.
+            problem: problem whose model, barriers and input bounds are taken.
             filters: one for every barrier, one for all, or their text; see
                 `SafetyFilterWrapper`.
             knowledge: "model" for what the designer believes, "plant" for the true system.
@@ -222,7 +227,7 @@ class SafetyFilter:
         Args:
             x: states, shape (n,) or (..., n).
             u_nominal: proposed inputs in physical units, shape (m,) or (..., m).
-            input_bounds: input bounds in place of the filter's own: (low, high) for all inputs, one such
+            input_bounds: bounds in place of the filter's own: (low, high) for all inputs, one such
                 pair for each, (m, 2), or for each input of each state, (..., m, 2). An input whose
                 bounds are equal is held there.
             parameters: values by name or symbol: of all signals of the system, and of adjustable

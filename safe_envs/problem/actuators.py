@@ -245,8 +245,8 @@ def require_apart(given: ProblemOptions, problem: Any) -> None:
     if changed:
         raise ConfigurationError(
             f"{', '.join(changed)}: the inputs of this problem have limited rates, which were"
-            " derived with its own dt and input_bounds; give dt, input_bounds and rate_limit together, to the problem"
-            " without limits"
+            " derived with its own dt and input_bounds; give dt, input_bounds and rate_limit"
+            " together, to the problem without limits"
         )
 
 

@@ -28,8 +28,8 @@ def require_bounds(name: str, low: float, high: float) -> None:
     """
     if not -_WIDEST <= low < high <= _WIDEST:
         raise ConfigurationError(
-            f"input_bounds of input {name} is [{low}, {high}]; it needs bounds within {_WIDEST:g}, the lower"
-            " one below the upper. Unbounded control is a wide input_bounds"
+            f"input_bounds of {name} are [{low}, {high}]; give bounds within {_WIDEST:g}, the lower"
+            " one below the upper. Unbounded control has wide bounds"
         )
 
 
@@ -80,7 +80,7 @@ def wrong_start(count: int, states: Sequence[str]) -> ConfigurationError:
     )
 
 
-def refused_box(input_bounds: Any, count: int) -> ConfigurationError:
+def refused_bounds(input_bounds: Any, count: int) -> ConfigurationError:
     """Return the error of input bounds that are no pair, and not one for each input.
 
     Args:

@@ -67,7 +67,7 @@ class SafetyProblem:
         model: what the designer believes; filters and nominal controllers see this one.
         barriers: what is safe.
         states: range and unit of each state of the plant, in order.
-        inputs: input_bounds and unit of each input, in order.
+        inputs: bounds and unit of each input, in order.
         reward: of a step, an expression of the state that it reaches, of the executed input and of
             `TIME`.
         nominal: the nominal controller, an expression for each input of the features' symbols and
@@ -138,6 +138,13 @@ class SafetyProblem:
     sensors: tuple[Channel, ...] = ()
     measurement: Measurement | None = None
     input_bounds: tuple[tuple[float, float], ...] = field(init=False)
+
+    def __repr__(self) -> str:
+        barriers = ", ".join(barrier.name for barrier in self.barriers)
+        return (
+            f"SafetyProblem({self.name}, n={len(self.states)}, m={len(self.inputs)},"
+            f" barriers=[{barriers}], dt={self.dt:g}, horizon={self.duration:g})"
+        )
 
     def __post_init__(self) -> None:
         plant, model = self.plant, self.model

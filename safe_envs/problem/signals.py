@@ -12,7 +12,7 @@ import sympy as sp
 
 from safe_envs.arrays import numbers_in
 from safe_envs.dynamics import symbols
-from safe_envs.problem.option_errors import refused_box
+from safe_envs.problem.option_errors import refused_bounds
 
 TIME = symbols.TIME
 """Time since the start of the episode, in s: references and rewards may depend on it. No state or
@@ -80,5 +80,5 @@ def bound_pairs(input_bounds: Any, count: int) -> list[tuple[float, float]]:
     pairs = numbers_in(input_bounds)
     pairs = np.broadcast_to(pairs, (count, 2)) if pairs.shape == (2,) else pairs
     if pairs.shape != (count, 2):
-        raise refused_box(input_bounds, count)
+        raise refused_bounds(input_bounds, count)
     return [(float(low), float(high)) for low, high in pairs]

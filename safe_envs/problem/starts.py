@@ -205,7 +205,7 @@ class SamplingDomain:
             tuple(min(max(v, low), high) for v, (low, high) in zip(u, input_bounds, strict=True))
             for u in self.inputs
         )
-        # Inputs that a narrow input_bounds makes one and the same would tell nothing of the input's effect.
+        # Inputs that narrow bounds make one and the same would tell nothing of the input's effect.
         inputs = (
             clipped
             if clipped and len(set(clipped)) == len(set(self.inputs))

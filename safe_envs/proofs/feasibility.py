@@ -61,7 +61,7 @@ class BarrierFindings:
 
     Attributes:
         name: of the barrier.
-        condition: its spec.
+        filter: text of its condition.
         degree: r.
         control_authority: smallest one that was met in C: half of the range of L_g b_(r-1) u over
             the input bounds.
@@ -79,7 +79,7 @@ class BarrierFindings:
     """
 
     name: str
-    condition: str
+    filter: str
     degree: int
     control_authority: float
     control_authority_at: np.ndarray
@@ -277,7 +277,7 @@ def _barrier(i: int, analysis: SafeSetAnalysis) -> BarrierFindings:
     )
     return BarrierFindings(
         name=formulas.problem.barriers[i].name,
-        condition=spec_of(formulas.conditions[i]),
+        filter=spec_of(formulas.conditions[i]),
         degree=stages.stop - stages.start,
         control_authority=max(-negated, 0.0),
         control_authority_at=weakest,

@@ -65,9 +65,9 @@ def identify(
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
-    The plant is only stepped, or not at all with --data: then --dt, --substeps, --input-bounds and settings
-    of what is collected are refused. The truth, with which the estimates are compared at fresh
-    states of the sampling domain, is that of the plant, with its --noise.
+    The plant is only stepped, or not at all with --data: then --dt, --substeps, --input-bounds and
+    settings of what is collected are refused. The truth, with which the estimates are compared at
+    fresh states of the sampling domain, is that of the plant, with its --noise.
     """
     from safe_envs.filters.learning import learner_of
     from safe_envs.filters.learning.bayesian import IdentifiabilityWarning

@@ -51,8 +51,8 @@ def render(
             help=(
                 "In place of --filter: several, with commas between, side by side from the same"
                 " start with the same noise: "
-                "none,hocbf:alpha=2,8,scbf. A comma that no filter's name follows belongs to the filter"
-                " before it."
+                "none,hocbf:alpha=2,8,scbf. A comma that no filter's name follows belongs to the"
+                " filter before it."
             ),
         ),
     ] = None,

@@ -19,7 +19,7 @@ from typing import Any
 
 from safe_envs.errors import unknown
 from safe_envs.problem.option_errors import (
-    refused_box,
+    refused_bounds,
     refused_noise,
     require_bounds,
     require_period,
@@ -93,7 +93,7 @@ class SystemSummary:
                 else [given.input_bounds] * len(self.inputs)
             )
             if len(pairs) != len(self.inputs):
-                raise refused_box(given.input_bounds, len(self.inputs))
+                raise refused_bounds(given.input_bounds, len(self.inputs))
             for name, (low, high) in zip(self.inputs, pairs, strict=True):
                 require_bounds(name, low, high)
         if given.dt is not None:

@@ -79,8 +79,8 @@ class FilterSpec:
         state_fn: from the observation that the wrapper gets, (..., k) mostly, to states (..., n),
             over any leading axes: write `observation[..., 0]`.
         action_map: between the env's actions and the model's inputs; None where they are the same.
-        filter: text of the filter where an evaluation names none, like "hocbf:alpha=2,8"; None for what
-            suits the model.
+        filter: text of the filter where an evaluation names none, like "hocbf:alpha=2,8"; None for
+            what suits the model.
         dt: control period in s; None for the env's own attribute `dt`.
         gains: rates of conditions whose text sets none; ones by default. See
             `SafetyProblem`.

@@ -44,8 +44,8 @@ class SafetyFilterWrapper(
     Args:
         env: one of this project's envs, possibly wrapped; or any env with a Box action space.
         filter: a `Condition` for every barrier, one for each, or their text, like "scbf",
-            "hocbf:alpha=2,8" or "hocbf:alpha=2,8+cbf:alpha=1"; without parameters it takes the env's. Or
-            the promise filter, like "promise:p=0.99".
+            "hocbf:alpha=2,8" or "hocbf:alpha=2,8+cbf:alpha=1"; without parameters it takes the
+            env's. Or the promise filter, like "promise:p=0.99".
         knowledge: "model" (what the designer believes) or "plant" (the true system).
         objective: "nearest" to the policy's action; or "clf" for the joint QP with the env's
             goal, in which the policy has no say: `info["nominal_action"]` is what the goal alone
@@ -72,7 +72,7 @@ class SafetyFilterWrapper(
     def __init__(
         self,
         env: gym.Env[np.ndarray, np.ndarray],
-        filter: FilterChoice,
+        filter: FilterChoice,  # noqa: A002  (as everywhere)
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -190,7 +190,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        filter: FilterChoice,
+        filter: FilterChoice,  # noqa: A002  (as everywhere)
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,

@@ -355,8 +355,8 @@ def conditions_in(given: Condition | Sequence[Condition]) -> tuple[Condition, ..
     if strangers or not found:
         wrong = type(strangers[0]).__name__ if strangers else "an empty tuple"
         raise ConfigurationError(
-            f"filters hold {wrong}; give texts such as 'hocbf:alpha=2,8', conditions, or tuples with a"
-            " condition for each barrier"
+            f"filters hold {wrong}; give texts such as 'hocbf:alpha=2,8', conditions, or tuples"
+            " with a condition for each barrier"
         )
     return found
 

@@ -79,8 +79,9 @@ def _normalization_of(model: Any, problem: SafetyProblem, given: Any) -> Normali
     require_same_env(name, layers, problem, (observation_box(problem), action_box(problem)))
     if layers.problem is not None and layers.problem.input_bounds != problem.input_bounds:
         raise ConfigurationError(
-            f"the policy of {name} was trained with the input bounds {layers.problem.input_bounds}, and"
-            f" those of the problem are {problem.input_bounds}; give the problem of its training"
+            f"the policy of {name} was trained with the input bounds"
+            f" {layers.problem.input_bounds}, and those of the problem are"
+            f" {problem.input_bounds}; give the problem of its training"
         )
     scales = [each for each in layers.observe if isinstance(each, Normalizer)]
     if layers.act or len(layers.observe) > len(scales) or len(scales) > 1:

@@ -98,8 +98,8 @@ def _fitting(
             "the env is filtered, and a wrapper around the filter changes the actions, or the"
             " map of the actions is no straight line, so that the executed ones are unknown in"
             " units of the action space; put the filter around that wrapper, or give"
-            " replay_buffer_kwargs={'input_bounds': [(low, high), ...]}: the inputs at its ends. A loop of"
-            " your own adds actions in [-1, 1], and not in the units of another action space"
+            " replay_buffer_kwargs={'input_bounds': [(low, high), ...]}: the inputs at its ends. A"
+            " loop of your own adds actions in [-1, 1], not in the units of another action space"
         )
     return known[0]
 
@@ -160,8 +160,8 @@ def bounds_of(input_bounds: Sequence[Sequence[float]], inputs: int) -> np.ndarra
         or np.any(pairs[:, 0] >= pairs[:, 1])
     ):
         raise ConfigurationError(
-            f"input_bounds = {input_bounds!r}; give a finite (low, high) with low < high for each of the {inputs}"
-            " inputs"
+            f"input_bounds = {input_bounds!r}; give a finite (low, high) with low < high for each"
+            f" of the {inputs} inputs"
         )
     return pairs
 
@@ -185,8 +185,9 @@ class FilteredReplayBuffer(ReplayBuffer):
 
     Args:
         args: those of `ReplayBuffer`.
-        input_bounds: physical (low, high) of each input at the ends of the action space, where the infos and
-            the action space do not know them, as behind a wrapper that halves the actions.
+        input_bounds: physical (low, high) of each input at the ends of the action space, where the
+            infos and the action space do not know them, as behind a wrapper that halves the
+            actions.
         action: "executed", "proposed" or "both".
         kwargs: those of `ReplayBuffer`.
 

@@ -79,8 +79,8 @@ class HOCBF(Condition):
     is no guarantee.
 
     Attributes:
-        alpha: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate
-            of a linear one in 1/s.
+        alpha: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the
+            rate of a linear one in 1/s.
 
     Source: thesis Eq. (3.7), (3.10).
     """
@@ -105,7 +105,7 @@ class HOCBF(Condition):
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
         """Return the rates where all are linear; see `Condition.chain_rates`."""
-        linear = tuple(p for p in self.alpha if not isinstance(p, ClassK))
+        linear = tuple(a for a in self.alpha if not isinstance(a, ClassK))
         return linear if len(linear) == len(self.alpha) else None
 
 

@@ -354,8 +354,8 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
     within = ((low <= tried) & (tried <= high)).all(axis=1)
     if not within.all():
         raise ConfigurationError(
-            f"the input {tried[within.argmin()]} is outside the bounds {problem.input_bounds} of {names};"
-            " give inputs within them"
+            f"the input {tried[within.argmin()]} is outside the bounds {problem.input_bounds} of"
+            f" {names}; give inputs within them"
         )
     return tried
 

@@ -11,8 +11,8 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.scripts.options import completion, early_checks, text_options
 
 LEARNED_PARAMETERS = (
-    "learned-hocbf:alpha=..:level=.95:eps=.. (quantile of the held-out errors that is the margin, or"
-    " the margin itself), ddscbf:margin=0, bayesian-scbf:confidence=P or"
+    "learned-hocbf:alpha=..:level=.95:eps=.. (quantile of the held-out errors that is the margin,"
+    " or the margin itself), ddscbf:margin=0, bayesian-scbf:confidence=P or"
     " bayesian-scbf:simultaneous=P (robust at each state by itself, or at all at once), and with"
     " each file=FILE, as by --learned, and sampling_margin=M"
 )
@@ -25,9 +25,10 @@ Filters = Annotated[
         autocompletion=completion.filters,
         callback=early_checks.known_filters,
         help=(
-            "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf or scbf; with parameters: hocbf:alpha=2,8; one"
-            " for each barrier: hocbf:alpha=2,8+cbf:alpha=1; promise:p=0.99, which keeps a probability"
-            " of being safe; backup, which lets pass what a backup law of the env can make good;"
+            "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf or scbf; with parameters: hocbf:alpha=2,8;"
+            " one for each barrier: hocbf:alpha=2,8+cbf:alpha=1; promise:p=0.99, which keeps a"
+            " probability of being safe; backup, which lets pass what a backup law of the"
+            " env can make good;"
             " certified:file=FILE, of a barrier certificate; learned: learned-hocbf, ddscbf,"
             " bayesian-scbf; a condition of your own: FILE.py:NAME. Repeatable. By default none and"
             " the env's own."

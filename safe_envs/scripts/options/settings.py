@@ -84,7 +84,11 @@ def refuse_collecting(settings: Mapping[str, Any], env: EnvOptions) -> None:
         ConfigurationError: a setting or an option does.
     """
     idle = [f"--set {name}" for name in _OF_COLLECTING if name in settings]
-    idle += [f"--{name}" for name in ("dt", "substeps", "box") if name in env.changes]
+    idle += [
+        f"--{name.replace('_', '-')}"
+        for name in ("dt", "substeps", "input_bounds")
+        if name in env.changes
+    ]
     if idle:
         raise ConfigurationError(
             f"{', '.join(idle)}: not allowed with --data, since nothing is collected then; leave"

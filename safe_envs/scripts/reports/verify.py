@@ -376,7 +376,7 @@ def print_report(console: Console, answer: VerifyAnswer) -> None:
         order = f"relative degree {barrier.degree} " if condition.differentiates else ""
         _section(
             console,
-            f"Barrier {barrier.name}: {order}with {barrier.condition}",
+            f"Barrier {barrier.name}: {order}with {barrier.filter}",
             _barrier_lines(found, i),
         )
     conditions = "conditions" if len(found.barriers) > 1 else "condition"
