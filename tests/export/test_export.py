@@ -56,7 +56,7 @@ def cart(**options: Any) -> SafetyFilter:
         signals={p: rate, rate: 0, mass: 0},
     )
     barriers = [p - x, 4 + TIME / 10 - x]
-    return SafetyFilter(system, barriers, "hocbf:alpha=2,8", **{"bounds": (-5, 5), **options})
+    return SafetyFilter(system, barriers, "hocbf:alpha=2,8", **{"input_bounds": (-5, 5), **options})
 
 
 def run_selftest(directory: Path, *flags: str, compiler: Sequence[str] = COMPILER or ()) -> str:

@@ -98,7 +98,7 @@ def test_a_loop_with_a_belief_is_logged_at_its_estimate():
     with pytest.raises(ConfigurationError, match="filter_measurement"):
         own.filter([0.1, 0.0], [1.0])
     moving = ControlAffineSDE.from_rate((x,), (u,), [u], signals={y: w, w: 0})
-    settings = {"dt": 0.1, "instants": 10, "bounds": (-9, 9)}
+    settings = {"dt": 0.1, "instants": 10, "input_bounds": (-9, 9)}
     beside = SafetyFilter(moving, y - x, "cbf:belief=0.1", **settings)
     log = DecisionLog.for_filter(beside, {y: "m"})
     given = {"y": 2.0, "w": -1.0, **{s.name: 0.01 for s in beside.qp.runtime if s not in (y, w)}}

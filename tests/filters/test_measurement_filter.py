@@ -173,7 +173,7 @@ def test_what_moves_is_part_of_barriers_at_an_estimate(condition, batch):
 def test_the_belief_of_a_moving_barrier_is_the_one_by_hand():
     # h_B = lead - x^ - z sqrt(P_11 + ..), whose rate is that of the lead, x^ and the root.
     car, estimator = follower(rate=[U, -V], diffusion=[0.2, 0])
-    given = {"bounds": (-90, 90), "dt": 0.05, "instants": 100, "estimator": estimator}
+    given = {"input_bounds": (-90, 90), "dt": 0.05, "instants": 100, "estimator": estimator}
     measured = SafetyFilter(car, LEAD - X, "cbf:alpha=3:belief=0.1", **given)
     runtime = {"lead": 2.0, "lead_speed": -1.0, "belief_gust": 5.0}
     found = measured.filter_measurement([0.2], [60.0], parameters=runtime)
@@ -203,7 +203,7 @@ def test_no_estimator_predicts_what_it_is_not_given(changed, words):
 
 def test_parameters_of_the_prediction_are_not_adjustable():
     car, estimator = follower()
-    given = {"bounds": (-9, 9), "estimator": estimator, "adjustable": ("mass",)}
+    given = {"input_bounds": (-9, 9), "estimator": estimator, "adjustable": ("mass",)}
     with pytest.raises(ConfigurationError, match="mass"):
         SafetyFilter(car, LEAD - X, "hocbf:alpha=1,2", **given)
     weighed = replace(car, parameters={}, signals={**car.signals, MASS: 0})

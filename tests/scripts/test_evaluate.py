@@ -71,7 +71,8 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
     status, out, _ = safe_envs_command(
         "evaluate StochasticDubins-v0 --filter hocbf --policy zero --episodes 6 --seed 5 --noise",
         ".1,.3 --plant v=1.5 --model v=1.7 --barrier radius=2.5 --knowledge plant --dt .02",
-        "--substeps 2 --horizon .4 --input-bounds -3,4 --start -0.5,0,1 --num-envs 4 --confidence .9",
+        "--substeps 2 --horizon .4 --input-bounds -3,4 --start -0.5,0,1 --num-envs 4"
+        " --confidence .9",
         "--json out.json",
     )
     assert status == 0
