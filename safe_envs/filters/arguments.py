@@ -282,15 +282,16 @@ def read_bounds(
         pairs = np.broadcast_to(pairs, (len(inputs), 2))
     if pairs.shape != (len(inputs), 2):
         raise ConfigurationError(
-            f"bounds = {shown(given)}; give (low, high) of the input in physical units, for all"
-            f" inputs or for each of the {len(inputs)}"
+            f"input_bounds = {shown(given)}; give (low, high) of the input in physical units, for"
+            f" all inputs or for each of the {len(inputs)}"
             f"{'; an end may be infinite' if endless else ''}"
         )
     table: Any = pairs.tolist()
     for symbol, (low, high) in zip(inputs, table, strict=True):
         if not low < high:
             raise ConfigurationError(
-                f"bounds of {symbol} are [{low}, {high}]; the lower one has to be below the upper"
+                f"input_bounds of {symbol} are [{low}, {high}]; the lower one has to be below the"
+                " upper"
             )
         require_ends(symbol, low, high, endless)
     low, high = np.clip(pairs, -WIDEST, WIDEST).T
@@ -308,13 +309,13 @@ def require_ends(symbol: sp.Symbol, low: float, high: float, endless: bool) -> N
     """
     if not endless and (math.isinf(low) or math.isinf(high)):
         raise ConfigurationError(
-            f"bounds of {symbol} are [{low}, {high}]; a filter with a goal, a reciprocal condition,"
-            " a certificate or an uncertain constraint needs finite ones, for it may go to their"
+            f"input_bounds of {symbol} are [{low}, {high}]; a filter with a goal, a reciprocal"
+            " condition, a certificate or an uncertain constraint needs finite ones: it may go to their"
             " ends"
         )
     if low == math.inf or high == -math.inf or any(WIDEST < abs(b) < math.inf for b in (low, high)):
         raise ConfigurationError(
-            f"bounds of {symbol} are [{low}, {high}]; finite ones are within {WIDEST:g}, and"
+            f"input_bounds of {symbol} are [{low}, {high}]; finite ones are within {WIDEST:g}, and"
             " -math.inf and math.inf stand for none"
         )
 
@@ -583,8 +584,8 @@ class RuntimeArguments:
         if pairs.shape[-2:] != (m, 2) or pairs.shape[:-2] not in ((), batch):
             per_state = f", or {(*batch, m, 2)} for each state" if batch else ""
             raise InvalidInputError(
-                f"bounds has the shape {np.shape(given)}; give (low, high) for all inputs, or such"
-                f" a pair for each, ({m}, 2){per_state}"
+                f"input_bounds has the shape {np.shape(given)}; give (low, high) for all inputs, or"
+                f" such a pair for each, ({m}, 2){per_state}"
             )
         low, high = pairs[..., 0], pairs[..., 1]
         if not (low <= high).all() or not (abs(pairs) <= WIDEST).all():
@@ -600,7 +601,8 @@ class RuntimeArguments:
             for low, high in ends.reshape(-1, 2).tolist():
                 if not low <= high:
                     raise InvalidInputError(
-                        f"bounds of {symbol} are [{low}, {high}]; give numbers, the lower one first"
+                        f"input_bounds of {symbol} are [{low}, {high}]; give numbers, the lower one"
+                        " first"
                     )
                 require_ends(symbol, low, high, self._endless)
 

@@ -202,9 +202,9 @@ POINT = {"p": 0.0, "q": 1.0}
         ({"input_bounds": (-1, math.nan)}, "the lower one first"),
         ({"input_bounds": (-1, 1e200)}, "within 1e\\+100"),
         ({"input_bounds": (math.inf, math.inf)}, "finite ones are within"),
-        ({"bounds": 1.0}, r"bounds has the shape \(\)"),
-        ({"bounds": np.zeros((3, 2))}, r"bounds has the shape \(3, 2\)"),
-        ({"bounds": "wide"}, "the pair of bounds is 'wide'"),
+        ({"input_bounds": 1.0}, r"bounds has the shape \(\)"),
+        ({"input_bounds": np.zeros((3, 2))}, r"bounds has the shape \(3, 2\)"),
+        ({"input_bounds": "wide"}, "the pair of bounds is 'wide'"),
         ({"input_bounds": (None, 1)}, "the pair of bounds is"),
     ],
 )

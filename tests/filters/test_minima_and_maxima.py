@@ -69,7 +69,7 @@ def test_paths_toward_the_edge_stay_safe(name, dt):
 def test_a_minimum_is_decided_like_the_list_of_its_pieces(text):
     rng = np.random.default_rng(0)
     states, inputs = rng.normal(size=(400, 2)), 3 * rng.normal(size=(400, 2))
-    rest = {"dt": 0.1, "bounds": BOUNDS}
+    rest = {"dt": 0.1, "input_bounds": BOUNDS}
     whole = SafetyFilter(PLANE, [1 - x - sp.Abs(y), 2 - x], text, priorities=[2.0, 1.0], **rest)
     pieces = [1 - x - y, 1 - x + y, 2 - x]
     listed = SafetyFilter(PLANE, pieces, text, priorities=[2.0, 2.0, 1.0], **rest)
