@@ -310,8 +310,8 @@ def require_ends(symbol: sp.Symbol, low: float, high: float, endless: bool) -> N
     if not endless and (math.isinf(low) or math.isinf(high)):
         raise ConfigurationError(
             f"input_bounds of {symbol} are [{low}, {high}]; a filter with a goal, a reciprocal"
-            " condition, a certificate or an uncertain constraint needs finite ones: it may go to their"
-            " ends"
+            " condition, a certificate or an uncertain constraint needs finite ones, which it may"
+            " reach"
         )
     if low == math.inf or high == -math.inf or any(WIDEST < abs(b) < math.inf for b in (low, high)):
         raise ConfigurationError(
