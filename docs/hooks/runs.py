@@ -149,7 +149,7 @@ def _folded(command: str) -> str:
     first, *options = re.split(r" (?=--\w)", command)
     lines = [first]
     for option in options:
-        if len(lines[-1]) + len(option) > _COLUMNS - len(" \\"):
+        if len(lines[-1]) + len(f" {option} \\") > _COLUMNS:
             lines.append(f"    {option}")
         else:
             lines[-1] += f" {option}"

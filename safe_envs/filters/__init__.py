@@ -1,6 +1,1 @@
-"""The quadratic program (QP) of a filter, compiled from its constraints and solved exactly."""
-
-from safe_envs.filters.qp import FilterDecision, FilterQP, UndefinedConstraintError
-from safe_envs.filters.solver import FilterQPSolver
-
-__all__ = ["FilterDecision", "FilterQP", "FilterQPSolver", "UndefinedConstraintError"]
+"""Which input is allowed: conditions, their QPs, the safety filter, what it learns and estimates."""

@@ -9,9 +9,9 @@ from safe_envs.filters import conditions
 from safe_envs.lazy_attributes import lazy_attributes
 
 if TYPE_CHECKING:
-    from safe_envs.filters import FilterDecision
     from safe_envs.filters.conditions import *  # noqa: F403
     from safe_envs.filters.delayed_filter import DelayedFilter
+    from safe_envs.filters.qp import FilterDecision
     from safe_envs.filters.safety_filter import SafetyFilter
     from safe_envs.wrappers.estimator import StateEstimatorVectorWrapper, StateEstimatorWrapper
     from safe_envs.wrappers.external_env import ActionMap, FilterSpec
@@ -54,7 +54,7 @@ _MODULES = {
     "ActionMap": "safe_envs.wrappers.external_env",
     "CostReturnWrapper": "safe_envs.wrappers.statistics",
     "DelayedFilter": "safe_envs.filters.delayed_filter",
-    "FilterDecision": "safe_envs.filters",
+    "FilterDecision": "safe_envs.filters.qp",
     "FilterSpec": "safe_envs.wrappers.external_env",
     "RecordSafetyStatistics": "safe_envs.wrappers.statistics",
     "RecordSafetyStatisticsVector": "safe_envs.wrappers.statistics",

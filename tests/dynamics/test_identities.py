@@ -96,7 +96,7 @@ def noisy(diffusion, gain=1):
 
 
 def test_noise_in_a_part_of_the_workspace_reaches_a_barrier():
-    start = {"box": (-1, 1), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0}
+    start = {"input_bounds": (-1, 1), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0}
     for diffusion in (
         sp.Max(x - 2, 0),
         sp.Piecewise((0, x < 50), (sigma, True)),

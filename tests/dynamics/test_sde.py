@@ -224,7 +224,7 @@ def test_signals_and_parameters_are_dicts(make, name):
 )
 def test_an_env_simulates_what_moves(system, barrier, message):
     with pytest.raises(SystemDefinitionError, match=message):
-        define_problem(system, barrier, box=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)
+        define_problem(system, barrier, input_bounds=(-1, 1), start=(0.0,), dt=0.1, horizon=1.0)
 
 
 def test_sums_and_products_over_an_index_are_written_out():

@@ -28,8 +28,8 @@ x, u, s = sp.symbols("x u s", real=True)
 
 def problem(*, edge: float = 1.0):
     system = ControlAffineSDE((x,), (u,), [x], [1], [s], {s: 0.1})
-    given = dict(box=(-5, 5), start=[(-0.5, 0.5)], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
-    return define_problem(system, SIGN * (edge - x), **given)
+    given = dict(start=[(-0.5, 0.5)], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
+    return define_problem(system, SIGN * (edge - x), input_bounds=(-5, 5), **given)
 
 ready = problem()
 number = 3

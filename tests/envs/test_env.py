@@ -172,10 +172,10 @@ def test_actions_that_are_none_are_errors(action):
         ({"substeps": 0}, "substeps = 0"),
         ({"substeps": 1.5}, "substeps = 1.5"),
         *(
-            ({"input_bounds": box}, "box of input omega")
+            ({"input_bounds": box}, "input_bounds of omega")
             for box in ([1, 1], [-math.inf, math.inf], [2, 1])
         ),
-        ({"input_bounds": [[0.0, 1.0], [0.0, 1.0]]}, "box = "),
+        ({"input_bounds": [[0.0, 1.0], [0.0, 1.0]]}, "input_bounds = "),
         ({"start": [0.0, 0.0]}, "start has 2"),
         ({"start": 0.5}, "start has 1"),
         ({"start": [0.0, math.nan, 0.0]}, "start of y"),

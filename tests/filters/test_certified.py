@@ -242,7 +242,9 @@ def test_several_barriers_get_the_same_constraint():
     safety_filter = SafetyFilter.for_problem(both, condition)
     first, second = safety_filter.constraints
     assert (second.coefficient, second.offset) == (first.coefficient, first.offset)
-    alone = SafetyFilter(both.model, [(both.barriers[0], condition)], input_bounds=both.box)
+    alone = SafetyFilter(
+        both.model, [(both.barriers[0], condition)], input_bounds=both.input_bounds
+    )
     x, u = states_of(DISK, 40, reach=0.3), np.random.default_rng(1).uniform(-15.0, 15.0, (40, 1))
     found, expected = safety_filter.filter(x, u), alone.filter(x, u)
     np.testing.assert_array_equal(found.feasible, expected.feasible)

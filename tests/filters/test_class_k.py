@@ -72,7 +72,7 @@ def test_others_are_refused_with_the_reason(text, message):
 
 def test_sympy_expressions_are_taken_as_they_are():
     assert CBF(S**3).alpha == ClassK("s**3")
-    assert HOCBF((1, sp.tanh(S))).p == (1.0, ClassK("tanh(s)"))
+    assert HOCBF((1, sp.tanh(S))).alpha == (1.0, ClassK("tanh(s)"))
     assert CBF(sp.Symbol("s") ** 3).alpha == ClassK("s**3")
     with pytest.raises(ConfigurationError, match="s alone"):
         CBF(x**3)

@@ -195,9 +195,12 @@ def test_any_text_is_a_filter_or_refused(text):
         ("x" * 10**5, "unknown filter"),
         ("cbf:" + "x" * 10**5, "no parameter"),
         ("+".join(["cbf"] * 10**4), "has 10000 conditions"),
-        ("hocbf:alpha=" + ",".join(["1"] * 10**4), "p takes at most 12 values; 10000 were given"),
+        (
+            "hocbf:alpha=" + ",".join(["1"] * 10**4),
+            "alpha takes at most 12 values; 10000 were given",
+        ),
         ("ecbf:k=" + ",".join(f"1e{300 - 50 * i}" for i in range(12)), "poles"),
-        ("szcbf:alpha=1_0", "alphas = 1_0; give positive numbers"),
+        ("szcbf:alpha=1_0", "alpha = 1_0; give positive numbers"),
         ("cbf:sampling_margin=٣", "sampling_margin = '٣'"),
         ("ecbf:poles=-1_0", "poles"),
         ("ddscbf:file=" + "x" * 300, "cannot be read: File name too long"),
@@ -240,7 +243,7 @@ def test_several_barriers_take_one_text_or_one_each():
     assert [c.name for c in each] == ["hocbf", "ecbf", "hocbf"]
     assert parse_conditions(spec_of(each), problem) == each
     by_gains = parse_conditions("hocbf", problem)
-    assert [c.p for c in by_gains] == [problem.gains_of(i) for i in range(3)]
+    assert [c.alpha for c in by_gains] == [problem.gains_of(i) for i in range(3)]
     with pytest.raises(
         ConfigurationError,
         match="2 conditions",
@@ -291,7 +294,7 @@ def test_parameters_default_to_the_gains():
         ("cbf:alpha=1,2", "alpha"),
         ("scbf:alpha=1", "alpha"),
         ("hocbf:alpha=2,8:p=3,3", "'p'"),
-        ("szcbf:alpha=s", "alphas = s"),
+        ("szcbf:alpha=s", "alpha = s"),
         ("srcbf:gamma=0", "gamma = 0.0"),
         ("rcbf:form=exp", "exp"),
         (

@@ -78,8 +78,8 @@ def test_conditions_of_a_users_file(tmp_path):
         "from safe_envs.wrappers import HOCBF\n\n\n"
         "@dataclass(frozen=True)\nclass Eager(HOCBF):\n    name = 'eager'\n"
     )
-    (found,) = conditions_of(H, f"{path}:Eager:p=3,4")
-    assert (found.name, found.p) == ("eager", (3.0, 4.0))
+    (found,) = conditions_of(H, f"{path}:Eager:alpha=3,4")
+    assert (found.name, found.alpha) == ("eager", (3.0, 4.0))
 
 
 def test_the_filter_is_a_name_of_the_package():
@@ -120,9 +120,9 @@ ENDLESS = (-math.inf, 1.0)
         ({"barriers": [(H, HOCBF())]}, "pairs"),
         (
             {"barriers": [(H, HOCBF())], "filters": [(-5, 5)]},
-            "bounds=",
+            "input_bounds=",
         ),
-        ({"input_bounds": (-5, 5)}, "'box'"),
+        ({"box": (-5, 5)}, "'box'.*input_bounds"),
         ({"weight": [1.0]}, "'weights'"),
         ({"filters": "hocbff"}, "did you mean 'hocbf'"),
         ({"filters": "hocbf:alpha=1,2,3"}, "degree 2"),

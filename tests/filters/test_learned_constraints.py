@@ -75,7 +75,7 @@ EARLY = {"sampling_margin": "first-order"}
             (
                 "disk",
                 "residual",
-                lambda m, s=s: LearnedHOCBF(m, **{"p": (1.0, 2.0), **s}),
+                lambda m, s=s: LearnedHOCBF(m, **{"alpha": (1.0, 2.0), **s}),
                 ConfigurationError,
                 next(iter(s)),
             )
@@ -86,7 +86,7 @@ EARLY = {"sampling_margin": "first-order"}
                 {"eps": True},
                 {"level": 0.0},
                 {"level": 1.0},
-                {"p": (1.0, -2.0)},
+                {"alpha": (1.0, -2.0)},
             )
         ],
         *[
@@ -312,7 +312,7 @@ def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
     for conditions in (
         (learned, plain),
         (learned, replace(plain, sampling_margin="first-order")),
-        (learned, replace(learned, p=(3.0, 1.0))),
+        (learned, replace(learned, alpha=(3.0, 1.0))),
     ):
         found = assert_floats_are_arrays(SafetyFilter.for_problem(both, conditions), x, u)
         assert found.active.any(axis=0).all()
@@ -331,7 +331,7 @@ def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
             )
     if not any(errors):
         known = SafetyFilter.for_problem(both, [HOCBF(both.gains_of(i)) for i in (0, 1)], "plant")
-        ours = [replace(learned, p=both.gains_of(i)) for i in (0, 1)]
+        ours = [replace(learned, alpha=both.gains_of(i)) for i in (0, 1)]
         assert_same_decisions(both, SafetyFilter.for_problem(both, ours), known)
 
 

@@ -114,7 +114,7 @@ def test_the_rates_of_a_problem_are_taken_where_none_are_given(disk, residual):
     (condition,) = parse_conditions(
         "learned-hocbf:eps=0.1:level=0.5", disk, {"learned-hocbf": residual}
     )
-    assert (condition.p, condition.eps, condition.level) == (disk.gains_of(0), 0.1, 0.5)
+    assert (condition.alpha, condition.eps, condition.level) == (disk.gains_of(0), 0.1, 0.5)
 
 
 def test_what_a_learned_condition_cannot_take_is_refused(disk, residual):

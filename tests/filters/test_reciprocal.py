@@ -16,12 +16,12 @@ def scalar(sigma):
     return ControlAffineSDE((x,), (u,), [x], [1], [sigma])
 
 
-def upper_limits(condition, sigma, states, box=1e4):
+def upper_limits(condition, sigma, states, most=1e4):
     """Largest input that the filter allows on h = 1 - x, where the thesis has closed forms."""
     safety_filter = SafetyFilter(
-        scalar(sigma), [(Barrier(1 - x), condition)], input_bounds=[(-box, box)]
+        scalar(sigma), [(Barrier(1 - x), condition)], input_bounds=[(-most, most)]
     )
-    return safety_filter.filter(states[:, None], np.full((len(states), 1), box)).action[:, 0]
+    return safety_filter.filter(states[:, None], np.full((len(states), 1), most)).action[:, 0]
 
 
 def test_the_motivating_example_of_sec_4_2_2():
@@ -58,7 +58,7 @@ def test_the_logarithmic_form():
 
 def test_control_of_the_stochastic_one_is_unbounded_near_the_edge_and_a_box_breaks_it():
     near = 1 - np.array([1e-3, 1e-4, 1e-6])
-    asked = upper_limits(SRCBF(), 0.4, near, input_bounds=1e9)
+    asked = upper_limits(SRCBF(), 0.4, near, most=1e9)
     np.testing.assert_allclose(asked * (1 - near), -0.16, rtol=1e-2)
     safety_filter = SafetyFilter(
         scalar(0.4), [(Barrier(1 - x), SRCBF())], input_bounds=[(-10.0, 10.0)]

@@ -54,7 +54,7 @@ for m, filters in each.items():
     for made in filters:
         states, inputs = 1.5 * rng.normal(size=(60, m)), 3 * rng.normal(size=(60, m))
         states[:, -1] = np.minimum(states[:, -1], 3.0)
-        found = made.filter(states, inputs, bounds=(-1, 0.5))
+        found = made.filter(states, inputs, input_bounds=(-1, 0.5))
         restart = getattr(made, "reset", int)
         restart()
         for state, proposal in zip(states, inputs, strict=True):

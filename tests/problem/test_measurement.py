@@ -28,7 +28,7 @@ from safe_envs import ControlAffineSDE, define_problem
 
 x, v, u = sp.symbols("x v u", real=True)
 system = ControlAffineSDE.from_rate((x, v), (u,), [v, u])
-problem = define_problem(system, 1 - x, box=(-1, 1), start=[0.0, 0.0], dt=0.1, horizon=1.0)
+problem = define_problem(system, 1 - x, input_bounds=(-1, 1), start=[0.0, 0.0], dt=0.1, horizon=1.0)
 """
 
 

@@ -31,7 +31,7 @@ def problem_with(
     states=(x,),
     inputs=((1.0,),),
     ranges=((-2.0, 2.0),),
-    box=(-10.0, 10.0),
+    input_bounds=(-10.0, 10.0),
     start=0.5,
 ):
     """One input u: dX = (drift + inputs u) dt + noise dW."""
@@ -42,7 +42,7 @@ def problem_with(
         model=system,
         barriers=tuple(Barrier(sp.sympify(h), f"h_{i}") for i, h in enumerate(barriers, start=1)),
         states=tuple(Variable(s, *ends) for s, ends in zip(states, ranges, strict=True)),
-        inputs=(Variable(u, *box),),
+        inputs=(Variable(u, *input_bounds),),
         reward=sp.Integer(0),
         nominal=(sp.Integer(0),),
         starts={"given": Start.at((start,) * len(states))},

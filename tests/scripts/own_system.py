@@ -13,8 +13,8 @@ def _cart(noise, parameters, barrier=1 - x**2, **more):
         (x, v), (u,), [v, u - 0.5 * v], diffusion=[0, noise], parameters=parameters
     )
     given = {"start": [(-0.5, 0.5), (-0.5, 0.5)], "dt": 0.03, "horizon": 1.0}
-    given |= {"nominal": 1.5 * v - 4 * x, "gains": (2.0, 2.0)}
-    return define_problem(system, barrier, box=(-5.0, 5.0), name="cart", **{**given, **more})
+    given |= {"nominal": 1.5 * v - 4 * x, "gains": (2.0, 2.0), "name": "cart"}
+    return define_problem(system, barrier, input_bounds=(-5.0, 5.0), **{**given, **more})
 
 
 problem = _cart(sigma, {sigma: 0.1})

@@ -73,8 +73,8 @@ evaluate Scalar-v0 --barrier limt=1 | did you mean 'limit'
 evaluate Scalar-v0 --barrier limit=1_0 | '1_0'
 evaluate Scalar-v0 --input-bounds 1 | '1'
 evaluate Scalar-v0 --input-bounds=-1_0,1 | '-1_0,1'
-evaluate Scalar-v0 --input-bounds 2,1 | box
-evaluate Scalar-v0 --input-bounds 0,1 --input-bounds 0,1 | box
+evaluate Scalar-v0 --input-bounds 2,1 | input_bounds
+evaluate Scalar-v0 --input-bounds 0,1 --input-bounds 0,1 | input_bounds
 evaluate Scalar-v0 --start 1,2 | start has 2 numbers
 evaluate Scalar-v0 --start 1_0 | '1_0'
 evaluate StochasticDubins-v0 --start inwrd | did you mean 'inward'

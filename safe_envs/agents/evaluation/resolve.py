@@ -410,7 +410,7 @@ def _describe(problem: SafetyProblem) -> dict[str, Any]:
         "plant": {p.name: v for p, v in problem.plant.parameters.items()},
         "model": {p.name: v for p, v in problem.model.parameters.items()},
         "barriers": [str(b.expression) for b in problem.barriers],
-        "box": [[float(low), float(high)] for low, high in problem.input_bounds],
+        "input_bounds": [[float(low), float(high)] for low, high in problem.input_bounds],
         "start": problem.start,
         "dt": problem.dt,
         "substeps": problem.substeps,

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.policies.base import Spaces, arrays_of, require_spaces
+from safe_envs.agents.policies.names import statistics_file
 from safe_envs.agents.policies.network_policy import in_another_box
 from safe_envs.agents.policies.trained import (
     Normalizer,
@@ -24,7 +25,6 @@ from safe_envs.agents.policies.trained import (
     TrainingLayers,
     missing_statistics,
     saw_normalized,
-    statistics_file,
     training_layers,
 )
 from safe_envs.errors import ConfigurationError, shortened

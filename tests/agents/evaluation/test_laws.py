@@ -68,7 +68,7 @@ def test_law_of_the_scalar_system():
     # instants.
     sigma, dt, horizon, distance = 0.8, 0.01, 0.6, 0.5
     options = {"start": [1 - distance], "noise": sigma, "horizon": horizon, "dt": dt}
-    options["box"] = [-100.0, 100.0]
+    options["input_bounds"] = [-100.0, 100.0]
     (row,) = evaluate("Scalar-v0", options=options, episodes=8000, seed=2, **PLAIN).rows
     mean = distance * math.exp(-horizon)
     deviation = sigma * math.sqrt((1 - math.exp(-2 * horizon)) / 2)

@@ -26,8 +26,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 
 from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionWarning
 from safe_envs.agents import evaluate, make_policy, make_problem, make_sb3_env, refine
+from safe_envs.agents.policies.names import statistics_file
 from safe_envs.agents.policies.network import load_policy, save_policy
-from safe_envs.agents.policies.trained import statistics_file
 from safe_envs.envs.spaces import action_box, observation_box
 from safe_envs.plugins import load_object
 from safe_envs.wrappers import SafetyFilterWrapper

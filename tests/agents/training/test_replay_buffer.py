@@ -56,8 +56,8 @@ def one_thread():
     torch.set_num_threads(1)
 
 
-def make(horizon=0.5, filtered=True, box=BOX):
-    env = gym.make(ENV_ID, horizon=horizon, input_bounds=box)
+def make(horizon=0.5, filtered=True, input_bounds=BOX):
+    env = gym.make(ENV_ID, horizon=horizon, input_bounds=input_bounds)
     return Monitor(SafetyFilterWrapper(env, "scbf") if filtered else env)
 
 
@@ -247,9 +247,17 @@ def test_saving_and_loading(tmp_path):
     assert stored(again)[before::2].tobytes() == witness.actions()[1].tobytes()
 
 
-def buffer_of(envs=3, action="executed", kind=FilteredReplayBuffer, box=TWO_INPUTS, **arguments):
+def buffer_of(
+    envs=3, action="executed", kind=FilteredReplayBuffer, input_bounds=TWO_INPUTS, **arguments
+):
     return kind(
-        20 * envs, *SPACES, device="cpu", n_envs=envs, action=action, input_bounds=box, **arguments
+        20 * envs,
+        *SPACES,
+        device="cpu",
+        n_envs=envs,
+        action=action,
+        input_bounds=input_bounds,
+        **arguments,
     )
 
 
@@ -344,7 +352,10 @@ def of_several_bounds():
     ("call", "fragment"),
     [
         *(
-            (lambda box=box: buffer_of(input_bounds=box), "box = ")
+            (
+                lambda box=box: buffer_of(input_bounds=box),
+                "input_bounds = ",
+            )
             for box in (*BOXES, "b", ((0,), (1, 2)))
         ),
         (lambda: buffer_of(action="excuted"), "'executed'"),

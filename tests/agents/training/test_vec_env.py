@@ -291,7 +291,7 @@ def test_penalty_is_the_distance_in_units_of_the_box():
     ]
     for env in envs:
         env.reset()
-    half = np.diff(np.array(envs[0].get_attr("problem")[0].box))[:, 0] / 2.0
+    half = np.diff(np.array(envs[0].get_attr("problem")[0].input_bounds))[:, 0] / 2.0
     reduced = 0
     for action in drawn_actions(envs[0], 24):
         (_, plain, dones, infos), (_, rewards, _, penalised) = (env.step(action) for env in envs)

@@ -33,7 +33,7 @@ from tests.oracles.carts import BRAKE, PULL, STRONGEST, cart_problem
 x, v, w, u, k = sp.symbols("x v w u k", real=True)
 
 
-def made(rates, law, barrier=10 - x, *, box=(-50.0, 50.0), dt=0.1, **rest):
+def made(rates, law, barrier=10 - x, *, input_bounds=(-50.0, 50.0), dt=0.1, **rest):
     """Return a problem of x' (and v', w') with one backup law, and no noise."""
     states = (x, v, w)[: len(rates)]
     inputs = [[0]] * (len(rates) - 1) + [[1]]
@@ -41,7 +41,7 @@ def made(rates, law, barrier=10 - x, *, box=(-50.0, 50.0), dt=0.1, **rest):
     system = ControlAffineSDE(states, (u,), rates, inputs, [[0]] * len(states), parameters)
     given = {"start": [0.0] * len(states), "horizon": 10 * dt, **rest}
     backup = None if law is None else Backup((law,), 1.0)
-    return define_problem(system, barrier, input_bounds=box, dt=dt, backup=backup, **given)
+    return define_problem(system, barrier, input_bounds=input_bounds, dt=dt, backup=backup, **given)
 
 
 def to_zero(entry, extent=3.0, states=(x,), at=0):
