@@ -1,1 +1,1 @@
-"""Which input is allowed: conditions, their QPs, the safety filter, what it learns and estimates."""
+"""Which input is allowed: conditions, QPs, the safety filter, what it learns and estimates."""

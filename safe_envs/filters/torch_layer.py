@@ -21,7 +21,8 @@ from sympy.printing.pytorch import TorchPrinter
 from safe_envs.dynamics.codegen import in_plain_names
 from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 from safe_envs.filters.arguments import WIDEST
-from safe_envs.filters.conditions.text import Conditions, name_by_itself
+from safe_envs.filters.conditions.syntax import name_by_itself
+from safe_envs.filters.conditions.text import Conditions
 from safe_envs.filters.qp import FilterQP
 from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.problem.problem import SafetyProblem

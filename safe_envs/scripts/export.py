@@ -74,7 +74,7 @@ def export(
     written are not overwritten.
     """
     from safe_envs.export.export import ExportOptions
-    from safe_envs.filters.conditions.text import names_backup, names_promise
+    from safe_envs.filters.conditions.syntax import names_backup, names_promise
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.export import ExportAnswer, print_export
     from safe_envs.values.promise_filter import PromiseSettings

@@ -119,7 +119,7 @@ def split_filters(text: str) -> list[str]:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.spec import UNFILTERED
-    from safe_envs.filters.conditions.text import head_pattern
+    from safe_envs.filters.conditions.syntax import head_pattern
 
     found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(UNFILTERED)})", text)]
     if not all(found):
@@ -240,7 +240,7 @@ def make_runs(
     from safe_envs.agents.evaluation.resolve import ResolvedEvaluation
     from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.filters.conditions.text import require_known
+    from safe_envs.filters.conditions.syntax import require_known
 
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.

@@ -17,7 +17,8 @@ from safe_envs.envs.info import Info, filter_info
 from safe_envs.envs.starts import refuse_time
 from safe_envs.errors import ConfigurationError, IndependentCopies, NotCompilableError
 from safe_envs.filters.conditions.names import BACKUP, PROMISE
-from safe_envs.filters.conditions.text import Conditions, FilterSettings, name_by_itself, spec_of
+from safe_envs.filters.conditions.syntax import name_by_itself
+from safe_envs.filters.conditions.text import Conditions, FilterSettings, spec_of
 from safe_envs.filters.decision_source import filter_source
 from safe_envs.filters.delayed_filter import Prediction
 from safe_envs.filters.estimation.estimator import Estimator

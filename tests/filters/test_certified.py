@@ -16,7 +16,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates import kept
 from safe_envs.filters.certificates.certificate import HeldCertificate
 from safe_envs.filters.certificates.files import save_certificate
-from safe_envs.filters.conditions.text import files_of, with_absolute_paths
+from safe_envs.filters.conditions.syntax import files_of, with_absolute_paths
 from safe_envs.filters.torch_layer import TorchFilter
 from safe_envs.proofs.guarantees import no_bound
 from safe_envs.proofs.safe_set import Formulas

@@ -14,7 +14,7 @@ from safe_envs import plugins
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.errors import ConfigurationError
-from safe_envs.filters.conditions.text import files_of, learned_parts, with_absolute_paths
+from safe_envs.filters.conditions.syntax import files_of, learned_parts, with_absolute_paths
 from safe_envs.scripts.options import completion
 from safe_envs.wrappers import (
     CBF,

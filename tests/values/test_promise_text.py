@@ -8,7 +8,7 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.filters.conditions.names import PROMISE, condition_names
-from safe_envs.filters.conditions.text import (
+from safe_envs.filters.conditions.syntax import (
     files_of,
     learned_parts,
     require_known,

@@ -17,7 +17,8 @@ from safe_envs.agents.evaluation.statistics import Curve, rate_interval, repeate
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.filters.conditions.base import Condition
 from safe_envs.filters.conditions.registry import LEARNED
-from safe_envs.filters.conditions.text import learned_parts, parse_conditions
+from safe_envs.filters.conditions.syntax import learned_parts
+from safe_envs.filters.conditions.text import parse_conditions
 from safe_envs.filters.learning import learner_of, load_learned
 from safe_envs.filters.learning.models.base import LearnedModel
 from safe_envs.problem.problem import SafetyProblem

@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.rows import BoundSummary, EvaluationRow, Poster
 from safe_envs.agents.evaluation.table import best_notes
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
 from safe_envs.filters.conditions.names import AT_STATE
-from safe_envs.filters.conditions.text import name_by_itself, names_promise
+from safe_envs.filters.conditions.syntax import name_by_itself, names_promise
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.text import number_at_least, number_at_most
 from safe_envs.values.promise_filter import PromiseSettings

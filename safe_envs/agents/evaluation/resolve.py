@@ -46,7 +46,8 @@ from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.filters.conditions.base import Condition
 from safe_envs.filters.conditions.names import AT_STATE, PARAMETERS
-from safe_envs.filters.conditions.text import FilterSettings, parts_of, spec_of
+from safe_envs.filters.conditions.syntax import parts_of
+from safe_envs.filters.conditions.text import FilterSettings, spec_of
 from safe_envs.filters.estimation.estimator import Estimator
 from safe_envs.filters.estimation.kalman import ExtendedKalmanFilter, nonlinearity
 from safe_envs.filters.estimation.registry import make_estimator

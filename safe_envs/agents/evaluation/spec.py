@@ -18,13 +18,8 @@ from safe_envs.engine.choice import require_engine
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.filters.conditions.base import Condition, parts_of
 from safe_envs.filters.conditions.names import AT_STATE, unfiltered_in_sum
-from safe_envs.filters.conditions.text import (
-    learned_parts,
-    parse_conditions,
-    require_known,
-    require_readable,
-    spec_of,
-)
+from safe_envs.filters.conditions.syntax import learned_parts, require_known
+from safe_envs.filters.conditions.text import parse_conditions, require_readable, spec_of
 from safe_envs.filters.estimation.names import settings_of
 from safe_envs.filters.learning.models.base import LearnedModel
 from safe_envs.problem.problem import SafetyProblem

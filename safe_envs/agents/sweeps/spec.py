@@ -44,7 +44,7 @@ from safe_envs.errors import (
 from safe_envs.files import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.filters.conditions.names import AT_STATE
 from safe_envs.filters.conditions.registry import LEARNED
-from safe_envs.filters.conditions.text import (
+from safe_envs.filters.conditions.syntax import (
     files_of,
     modules_of,
     name_by_itself,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safe_envs.agents.policies.sb3 import actor_of
-from safe_envs.agents.training.config import OFF_POLICY, python_value, scheduled
+from safe_envs.agents.training.hyperparameters import OFF_POLICY, python_value, scheduled
 from safe_envs.agents.training.replay_buffer import replay_options
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem

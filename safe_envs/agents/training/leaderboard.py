@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.attainable import (
 from safe_envs.agents.evaluation.frontier import Frontier
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.jobs.store import ResultStore, package_versions, reading
-from safe_envs.agents.training.config import ALGORITHMS
+from safe_envs.agents.training.hyperparameters import ALGORITHMS
 from safe_envs.agents.training.study import (
     DEFAULT,
     SeedEstimate,

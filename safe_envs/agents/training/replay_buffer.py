@@ -43,7 +43,7 @@ import numpy as np
 from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
-from safe_envs.agents.training.config import ACTIONS
+from safe_envs.agents.training.hyperparameters import ACTIONS
 from safe_envs.agents.training.vec_env import of_each, of_envs
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem.problem import SafetyProblem

@@ -62,7 +62,8 @@ from safe_envs.agents.jobs.store import (
     reading,
 )
 from safe_envs.agents.policies.names import is_place, policy_files
-from safe_envs.agents.training.config import ALGORITHMS, Training
+from safe_envs.agents.training.config import Training
+from safe_envs.agents.training.hyperparameters import ALGORITHMS
 from safe_envs.errors import (
     ConfigurationError,
     NumericalError,
@@ -73,7 +74,7 @@ from safe_envs.errors import (
     shown,
 )
 from safe_envs.files import locked, read_bytes
-from safe_envs.filters.conditions.text import files_of, names_promise, parts_of
+from safe_envs.filters.conditions.syntax import files_of, names_promise, parts_of
 from safe_envs.registry import full_id, make_problem
 from safe_envs.values.reduction import reduced
 

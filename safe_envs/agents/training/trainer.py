@@ -43,8 +43,9 @@ from safe_envs.agents.training.checkpoints import (
     restore_model,
     resume_episodes,
 )
-from safe_envs.agents.training.config import OFF_POLICY, Training
+from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.constraint import judged, rank
+from safe_envs.agents.training.hyperparameters import OFF_POLICY
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.engine.choice import engine_for
 from safe_envs.errors import ConfigurationError, SafeEnvsError, install_extra

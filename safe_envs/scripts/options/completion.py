@@ -42,6 +42,6 @@ def policies(incomplete: str) -> list[str]:
 
 def algorithms(incomplete: str) -> list[str]:
     """Names of algorithms."""
-    from safe_envs.agents.training.config import ALGORITHMS
+    from safe_envs.agents.training.hyperparameters import ALGORITHMS
 
     return words(ALGORITHMS)(incomplete)

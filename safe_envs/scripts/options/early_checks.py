@@ -31,7 +31,7 @@ def known_filter(text: str | None) -> str | None:
         ConfigurationError: It begins otherwise.
     """
     from safe_envs.filters.conditions.names import AT_STATE, unfiltered_in_sum
-    from safe_envs.filters.conditions.text import require_known, require_parameters
+    from safe_envs.filters.conditions.syntax import require_known, require_parameters
 
     # An empty text, as of a shell's variable that is not set, is no filter.
     filtered = None if text is None else text.removesuffix(AT_STATE)
@@ -94,7 +94,7 @@ def known_algorithm(name: str) -> str:
     Raises:
         ConfigurationError: There is none.
     """
-    from safe_envs.agents.training.config import ALGORITHMS
+    from safe_envs.agents.training.hyperparameters import ALGORITHMS
 
     if name not in ALGORITHMS:
         raise ConfigurationError(f"--algo {shortened(name)}: {nearest(name, ALGORITHMS)}")

@@ -109,7 +109,7 @@ class EnvOptions:
             RelativeDegreeError: A filter does not suit a barrier.
         """
         from safe_envs.filters.conditions.names import AT_STATE
-        from safe_envs.filters.conditions.text import require_degrees
+        from safe_envs.filters.conditions.syntax import require_degrees
         from safe_envs.registry import require_own
         from safe_envs.systems.summary import summaries
 

@@ -11,7 +11,8 @@ from stable_baselines3 import PPO
 
 import safe_envs
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.config import ALGORITHMS, CONSTRAINED, Training, whole_batches
+from safe_envs.agents.training.config import Training
+from safe_envs.agents.training.hyperparameters import ALGORITHMS, CONSTRAINED, whole_batches
 from safe_envs.agents.training.trainer import train
 from safe_envs.filters.learning.data import load
 from safe_envs.scripts.options.settings import read_hyperparameters

@@ -13,8 +13,9 @@ from stable_baselines3 import PPO
 
 from safe_envs import ENV_IDS, ConfigurationError
 from safe_envs.agents import evaluate
-from safe_envs.agents.training.config import CONSTRAINED, Training, hyperparameters
+from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.constraint import COST, DEFAULT_VIOLATION_LIMIT, VIOLATION
+from safe_envs.agents.training.hyperparameters import CONSTRAINED, hyperparameters
 from safe_envs.agents.training.trainer import train
 from safe_envs.scripts.reports.sweep import print_evaluations
 from tests.agents.training.small import SCALAR, evaluations, logged, training
