@@ -13,18 +13,14 @@ from safe_envs.text import real
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ppo-lag", "sac-lag")
 
-
 OFF_POLICY = ("sac", "td3", "sac-lag")
-
 
 CONSTRAINED = ("ppo-lag", "sac-lag")
 """Algorithms with a limit on the cost of an episode, on which alone they differ from others."""
 
-
 ACTIONS = ("executed", "proposed", "both")
 """Actions on which an off-policy algorithm may learn with a filter in the loop; see
 `safe_envs.agents.training.replay_buffer`."""
-
 
 _WHOLE = {
     "n_timesteps": 1,
@@ -43,10 +39,8 @@ _WHOLE = {
 }
 """Hyperparameters that are whole numbers, and the least that each may be."""
 
-
 _SHARES = ("gamma", "gae_lambda", "tau", "cost_gamma", "cost_gae_lambda")
 """Those from 0 to 1."""
-
 
 _FROM_ZERO = (
     "learning_rate",
@@ -57,22 +51,16 @@ _FROM_ZERO = (
     "target_noise_clip",
 )
 
-
 _ABOVE_ZERO = ("clip_range", "clip_range_vf", "max_grad_norm", "target_kl")
 
-
 _POLICY = "MlpPolicy"
-
 
 _TORCH_NN = ("nn", "th.nn", "torch.nn")
 """How the RL Zoo writes the module of activations."""
 
-
 _LINEAR = "lin_"
 
-
 _EXTENDS = "extends"
-
 
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 

@@ -32,13 +32,10 @@ from safe_envs.plugins import CONDITIONS, module_of, resolved
 _FILE = r"(?:\.{0,2}/[^:]{0,4096}?|[^+:,/][^+:,]{0,4096}?)\.py:[A-Za-z_]\w*"
 """FILE.py:NAME; only a path from / or ./ may hold a "+" or a comma, for these divide conditions."""
 
-
 _MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
 """MODULE:NAME; a parameter is none, for a "=" follows its name."""
 
-
 _HEAD_BY_ITSELF = re.compile(rf"\s*({'|'.join(BY_THEMSELVES)})\s*(?:[:+]|$)")
-
 
 _RATES = re.compile(r"alpha=[-+.0-9e]+(,[-+.0-9e]+)*")
 """Rates that are numbers; with class-K functions among them more may be wrong than their count."""
