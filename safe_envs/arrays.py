@@ -107,6 +107,22 @@ def checksum(described: Any, arrays: Mapping[str, np.ndarray]) -> str:
     return digest.hexdigest()
 
 
+def require_size(path: Path, arrays: Mapping[str, np.ndarray], most: int = MOST_BYTES) -> None:
+    """Raise ConfigurationError where a file of arrays would be too large to be read.
+
+    Args:
+        path: of the file.
+        arrays: numbers by name.
+        most: bytes that are read of such a file.
+    """
+    size = sum(np.asarray(array).nbytes for array in arrays.values())
+    if size > most:
+        raise ConfigurationError(
+            f"{path} would take {size / 1e6:.3g} MB; at most {most / 1e6:g} MB are read: save"
+            " less in a file"
+        )
+
+
 def write_arrays(
     path: Path,
     header: Mapping[str, Any],
@@ -124,12 +140,7 @@ def write_arrays(
     Raises:
         ConfigurationError: It cannot be written there, or would be too large to be read.
     """
-    size = sum(np.asarray(array).nbytes for array in arrays.values())
-    if size > most:
-        raise ConfigurationError(
-            f"{path} would take {size / 1e6:.3g} MB; at most {most / 1e6:g} MB are read: save"
-            " less in a file"
-        )
+    require_size(path, arrays, most)
     encoded = np.frombuffer(
         json.dumps(header, allow_nan=False, default=_plain).encode(), dtype=np.uint8
     )

@@ -58,8 +58,9 @@ class Learning:
                     f"two learned models of the method {model.method} were given; give one of each"
                 )
             if model.method not in self._methods:
+                what = type(model).__name__ if isinstance(entry, LearnedModel) else entry
                 raise ConfigurationError(
-                    f"{entry} holds {model.method}, which no filter uses; add"
+                    f"{what} holds {model.method}, which no filter uses; add"
                     f" {_filter_of(model.method)} or leave it out"
                 )
             type(model).check(model.signature, problem)

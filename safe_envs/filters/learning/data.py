@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from safe_envs import arrays as array_files
-from safe_envs.arrays import ArrayFile, reading, write_arrays
+from safe_envs.arrays import ArrayFile, reading, require_size, write_arrays
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shortened, shown
 from safe_envs.filters.learning.checks import require_kind, require_problem
@@ -257,6 +257,8 @@ def save(
     Raises:
         ConfigurationError: it cannot be written there, or would be too large to be read.
     """
+    # Before the checksum, which takes as long as all that is written.
+    require_size(path, arrays)
     header = {
         "format": _FORMAT,
         "kind": kind,
