@@ -108,7 +108,6 @@ def install_extra(extra: str) -> str:
 
 
 RENAMED = {
-    "SafeVecEnv": "SB3VecEnv",
     "alphas": "alpha",
     "bounds": "input_bounds",
     "box": "input_bounds",
@@ -117,7 +116,8 @@ RENAMED = {
     "p": "alpha",
     "state_problem": "define_problem",
 }
-"""Names of today for arguments, settings and functions of version 0.1, for advice in errors."""
+"""Names of today for earlier ones of arguments, settings and functions, for advice in errors."""
+
 _FEW = 6
 """So many allowed names are listed in full, of more of them the nearest three."""
 
@@ -138,8 +138,8 @@ def nearest(name: str, allowed: Iterable[str], more: str = "") -> str:
         The nearest name, and the others: all where they are few, else the next two.
     """
     names = list(allowed)
-    now = RENAMED.get(name.removeprefix("--"), "")
-    if new := next((each for each in names if now and now in (each, _as_argument(each))), None):
+    now = RENAMED.get(name.removeprefix("--"))
+    if new := next((each for each in names if _as_argument(each) == now), None):
         return f"it is {new} now"
     # Whoever writes a name in capitals means the name.
     lower = {each.lower(): each for each in reversed(names)}

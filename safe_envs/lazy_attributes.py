@@ -26,6 +26,9 @@ def lazy_attributes(
     """
 
     def get(name: str) -> Any:
+        if RENAMED.get(name) in modules:
+            # No AttributeError, in place of which `from ... import` has a message of its own.
+            raise ImportError(f"{name} of {package} is {RENAMED[name]} now")
         if name not in modules:
             return _module_in(package, name)
         found = namespace[name] = getattr(import_module(modules[name]), name)
@@ -47,8 +50,7 @@ def _module_in(package: str, name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != full:
             raise
-    advice = f"; it is {RENAMED[name]} now" if name in RENAMED else ""
-    raise AttributeError(f"module {package!r} has no attribute {name!r}{advice}")
+    raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
 
 def package_version(package: str = "safe-envs") -> str:
