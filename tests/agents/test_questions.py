@@ -34,10 +34,13 @@ def test_what_is_certified_is_checked_from_its_file(tmp_path: Path):
 
 def test_the_best_attainable_safety_is_of_the_plant():
     problem = problem_of(SCALAR)
-    coarse = safe_envs.best(problem, episodes=0, cells=(60,))[0]
-    fine = safe_envs.best(SCALAR, episodes=0, cells=(240,))[0]
-    assert coarse.lower <= fine.upper
-    assert fine.upper - fine.lower <= coarse.upper - coarse.lower
+    coarse, _ = safe_envs.best(problem, episodes=0, cells=(61,))
+    fine, policy = safe_envs.best(SCALAR, episodes=0, cells=(241,))
+    assert (policy.settings.knowledge, fine.cells) == ("plant", (241,))
+    ends = [(found.lower or 0.0, found.upper or 0.0) for found in (coarse, fine)]
+    (low, high), (finer_low, finer_high) = ends
+    assert low <= finer_high
+    assert 0.0 < finer_high - finer_low <= high - low
 
 
 def test_a_sweep_is_computed_once_and_read_as_a_table(tmp_path: Path):
