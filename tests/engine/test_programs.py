@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from safe_envs.engine import program
-from safe_envs.engine.choice import compiled_or_none, periods_of_a_part, require_engine
+from safe_envs.engine.choice import compiled_or_none, engine_for, periods_of_a_part, require_engine
 from safe_envs.engine.formulas import Source
 from safe_envs.engine.program import Program
 from safe_envs.errors import ConfigurationError, NotCompilableError, SystemDefinitionError
@@ -175,3 +175,8 @@ def test_parts_of_the_work_are_short_for_large_networks() -> None:
     assert periods_of_a_part(1) == periods_of_a_part(100) == 1_000_000
     assert periods_of_a_part(125_000) == 800
     assert periods_of_a_part(10**12) == 1
+
+
+def test_short_work_is_not_compiled_unless_it_is_asked_for():
+    assert [engine_for("auto", periods) for periods in (10, 10**9)] == ["numpy", "auto"]
+    assert {engine_for("compiled", periods) for periods in (10, 10**9)} == {"compiled"}
