@@ -118,6 +118,18 @@ RENAMED = {
 }
 """Names of today for earlier ones of arguments, settings and functions, for advice in errors."""
 
+HELD_CERTIFICATES = (
+    "certificates of held input are gone; tables bound the env's own steps: `safe-envs evaluate"
+    " ENV_ID --closed-loop`, or the filter promise:p=0.95"
+)
+"""What to use in place of a certificate of held input."""
+
+GONE = {
+    "--held": HELD_CERTIFICATES,
+    "--arb": "it is gone; `safe-envs check FILE` proves every statement in its own arithmetic",
+}
+"""What serves in place of options that are gone, for advice in errors."""
+
 _FEW = 6
 """So many allowed names are listed in full, of more of them the nearest three."""
 
@@ -137,6 +149,8 @@ def nearest(name: str, allowed: Iterable[str], more: str = "") -> str:
     Returns:
         The nearest name, and the others: all where they are few, else the next two.
     """
+    if name in GONE:
+        return GONE[name]
     names = list(allowed)
     now = RENAMED.get(name.removeprefix("--"))
     if new := next((each for each in names if _as_argument(each) == now), None):

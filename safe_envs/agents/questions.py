@@ -12,15 +12,14 @@ from safe_envs.agents.evaluation.attainable import AttainableSafety, attainable_
 from safe_envs.agents.jobs.executor import Backend, run
 from safe_envs.agents.jobs.job import JobOutcome
 from safe_envs.errors import ConfigurationError
-from safe_envs.filters.certificates.certificate import HeldCertificate
+from safe_envs.filters.certificates.certificate import BarrierCertificate
 from safe_envs.filters.certificates.checker import CheckResult
 from safe_envs.filters.certificates.checker import check as check_certificate
-from safe_envs.filters.certificates.files import AnyCertificate, load_certificate
+from safe_envs.filters.certificates.files import load_certificate
 from safe_envs.filters.conditions.text import parse_conditions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.proofs import certify as synthesis
 from safe_envs.proofs import feasibility
-from safe_envs.proofs.held import check_held
 from safe_envs.registry import full_id, make_problem
 from safe_envs.values.tables import ValueSettings
 
@@ -79,7 +78,7 @@ def certify(problem: Given, policy: bool = False, **settings: Any) -> synthesis.
     return synthesis.certify(named, synthesis.SynthesisSettings(**settings), policy)
 
 
-def check(certificate: AnyCertificate | Path | str, seconds: float = 120.0) -> CheckResult:
+def check(certificate: BarrierCertificate | Path | str, seconds: float = 120.0) -> CheckResult:
     """Check a certificate or the file of one; no code in a file is run.
 
     Args:
@@ -93,8 +92,6 @@ def check(certificate: AnyCertificate | Path | str, seconds: float = 120.0) -> C
         raise ConfigurationError(f"seconds = {seconds}; give a number above 0")
     if isinstance(certificate, str | Path):
         certificate = load_certificate(certificate)
-    if isinstance(certificate, HeldCertificate):
-        return check_held(certificate, seconds)
     return check_certificate(certificate, seconds=seconds)
 
 

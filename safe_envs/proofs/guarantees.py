@@ -41,7 +41,7 @@ from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.kinks import edges
 from safe_envs.dynamics.lie import has_kinks
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.filters.certificates.certificate import BarrierCertificate, HeldCertificate, Plant
+from safe_envs.filters.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.filters.certificates.matching import system_differences
 from safe_envs.filters.conditions.base import AffineConstraint, Condition
 from safe_envs.filters.conditions.certified import Certified
@@ -1197,7 +1197,6 @@ def rounded_up(value: float, digits: int = _DIGITS) -> Fraction:
 
 
 _BUDGET = Budget(boxes=2_000_000, seconds=120.0)
-OF_HELD_INPUT = "its certificate is of held input, and not of continuous control"
 _NAME = "barrier certificate: (psi_0 e^(-a T) - m (1 - e^(-a T))/a)/c"
 
 
@@ -1206,18 +1205,18 @@ class CertificateGuarantee:
     """The bound of a barrier certificate, once the judge has proved its statements.
 
     Attributes:
-        certificate: with psi and the numbers; None where it is of held input.
+        certificate: with psi and the numbers.
         against: why its bound is not one of the filter, in words; empty where it is.
     """
 
-    certificate: BarrierCertificate | None
+    certificate: BarrierCertificate
     against: str = ""
     remark = ""
 
     @cached_property
     def statements(self) -> list[tuple[str, JudgeResult]]:
         """The statements of the certificate, with the judge's word."""
-        return [] if self.certificate is None else judged(self.certificate, _BUDGET)
+        return judged(self.certificate, _BUDGET)
 
     @property
     def note(self) -> str | None:
@@ -1236,7 +1235,7 @@ class CertificateGuarantee:
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
         """Return the bound at starts; see `ChainGuarantee.at`."""
         starts = np.asarray(starts, dtype=np.float64)
-        if self.note or self.certificate is None:
+        if self.note:
             return np.zeros(len(starts))
         return np.where(
             _inside_domain(self.certificate, starts),
@@ -1251,8 +1250,6 @@ class CertificateGuarantee:
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
         """Say what states contradict in c; see `ChainGuarantee.contradiction`."""
-        if self.certificate is None:
-            return ""
         psi = self.certificate.values(reached[_inside_domain(self.certificate, reached)])
         highest, c = float(psi.max(initial=-math.inf)), float(self.certificate.supremum)
         stated = Extremum(c, c)  # The judge does not refute it, or there is no bound.
@@ -1278,8 +1275,6 @@ def certificate_guarantee(
         conditions: one for each barrier, at least one of which is `Certified`.
     """
     first = next(c for c in conditions if isinstance(c, Certified))
-    if isinstance(first.certificate, HeldCertificate):
-        return CertificateGuarantee(None, OF_HELD_INPUT)
     against = ""
     if any(condition != first for condition in conditions):
         against = "other conditions act besides that of the certificate"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,7 +23,6 @@ from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.proofs.certify import Named, SynthesisSettings
 
 
 @with_env_at_state
@@ -46,12 +44,6 @@ def certify(
             " psi's constraint.",
         ),
     ] = "",
-    held: Annotated[
-        bool,
-        typer.Option(
-            "--held", help="A bound for the env's own steps, with an input held for each of them."
-        ),
-    ] = False,
     rates: Annotated[
         list[float] | None,
         typer.Option("--rate", metavar="A", help="a of the bound in 1/s, at least 0. Repeatable."),
@@ -70,12 +62,9 @@ def certify(
 
     Linear programs choose psi for the largest mean bound over the env's starts, at sampled states;
     branch and bound then proves its numbers at all states. Each degree starts from the psi before,
-    and is never worse. The bound is of continuous control. It
-    holds for every policy whose input meets psi's constraint, which a filter ensures; all of it
-    counts leaving the workspace in the safe set as safe.
-
-    With --held the bound is of the env's own steps, with one input that is held for a control
-    period, and leaving the workspace counts as a violation.
+    and is never worse. The bound is of continuous control. It holds for every policy whose input
+    meets psi's constraint, which a filter ensures, and counts leaving the workspace in the safe
+    set as safe.
 
     The exit status is 1 where no bound above 0 is proved.
     """
@@ -85,11 +74,6 @@ def certify(
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.certify import CertifyAnswer, print_certification
 
-    if held and (policy or rates or best):
-        raise ConfigurationError(
-            "--held is for every policy under psi's constraint, has no a, and counts leaving in"
-            " another way than --best: leave --policy, --best and --rate out, or --held"
-        )
     require_whole("seed", seed, 0)
     require_result(json)
     text_options.require_outputs(json, None, inputs=text_options.inputs_of(env.system))
@@ -108,10 +92,6 @@ def certify(
     if policy:
         _require_formula(policy, problem)
     named = Named(problem, known if env.system is None else "", arguments)
-    if held:
-        config = {"env_id": known, "options": arguments, "held": True, "seed": seed}
-        _certify_held(named, settings, _HeldOutput(title_of(known, arguments), config, out, json))
-        return
     upper = _attainable(problem) if best else None
     with progress_bar("Searching") as tell:
         found = find(named, settings, bool(policy), tell)
@@ -121,41 +101,6 @@ def certify(
         save_certificate(found.certificate, out)
     print_certification(stdout(), answer)
     write_result(json, answer.document)
-    if found.certificate is None:
-        sys.stdout.flush()
-        raise SystemExit(1)
-
-
-@dataclass(frozen=True)
-class _HeldOutput:
-    """Where the answer about held input goes.
-
-    Attributes:
-        title: of the env.
-        config: what was asked for, as JSON.
-        out: file of the certificate.
-        json: file of all that was found.
-    """
-
-    title: str
-    config: dict[str, Any]
-    out: Path | None
-    json: Path | None
-
-
-def _certify_held(named: Named, settings: SynthesisSettings, output: _HeldOutput) -> None:
-    """Look for a certificate of held input, prove it, print and write it."""
-    from safe_envs.filters.certificates.files import save_certificate
-    from safe_envs.proofs.held_synthesis import certify_held
-    from safe_envs.scripts.reports.certify import HeldCertifyAnswer
-
-    with progress_bar("Searching") as tell:
-        found = certify_held(named, settings, tell)
-    answer = HeldCertifyAnswer(output.title, output.config, named.problem, found, output.out)
-    if found.certificate is not None and output.out is not None:
-        save_certificate(found.certificate, output.out)
-    answer.print_on(stdout())
-    write_result(output.json, answer.document)
     if found.certificate is None:
         sys.stdout.flush()
         raise SystemExit(1)

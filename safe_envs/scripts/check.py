@@ -28,30 +28,20 @@ def check(
         list[str] | None,
         typer.Option(metavar="A,B,..", help="A start to print the bound of. Repeatable."),
     ] = None,
-    arb: Annotated[
-        bool,
-        typer.Option(
-            "--arb", help="Check it by ball arithmetic too; needs python-flint, takes longer."
-        ),
-    ] = False,
-    seconds: Annotated[float, typer.Option(help="Limit of time of each check.")] = 120.0,
+    seconds: Annotated[float, typer.Option(help="Limit of time.")] = 120.0,
     json: Json = None,
 ) -> None:
     """Check the certificate in a file: what it states, and whether that is so.
 
     All statements are checked by interval branch and bound that shares no code with the search for
-    certificates. Those of held input are judged by the program that also finds their numbers. Where
-    the file names an env, its system has to be exactly that of the env.
+    certificates. Where the file names an env, its system has to be exactly that of the env.
 
     The exit status is 0 where everything is checked, 1 where something is refuted or undecided, and
     2 where the file cannot be read. No code in the file is run.
     """
-    from safe_envs.filters.certificates.balls import check_with_balls, require_flint
-    from safe_envs.filters.certificates.certificate import HeldCertificate
     from safe_envs.filters.certificates.checker import check as check_certificate
     from safe_envs.filters.certificates.files import load_certificate
     from safe_envs.filters.certificates.matching import env_difference
-    from safe_envs.proofs.held import check_held
     from safe_envs.scripts.reports.certify import CheckAnswer, print_check
     from safe_envs.text import numbers
 
@@ -59,22 +49,13 @@ def check(
         raise ConfigurationError(f"seconds = {seconds}; give a number above 0")
     require_result(json)
     text_options.require_outputs(json, None, inputs=[("FILE", file)])
-    if arb:
-        require_flint()
     certificate = load_certificate(file)
     starts = [numbers("--state", text) for text in state or []]
     n = len(certificate.plant.states)
     for start in starts:
         if len(start) != n:
             raise ConfigurationError(f"--state {start} has {len(start)} numbers; give {n}")
-    if isinstance(certificate, HeldCertificate):
-        if arb:
-            raise ConfigurationError(f"--arb is for continuous control; {file} is of held input")
-        found = {"judge": check_held(certificate, seconds)}
-    else:
-        found = {"intervals": check_certificate(certificate, seconds=seconds)}
-    if arb and not isinstance(certificate, HeldCertificate):
-        found["balls"] = check_with_balls(certificate, seconds=seconds)
+    found = check_certificate(certificate, seconds=seconds)
     answer = CheckAnswer(str(file), certificate, found, env_difference(certificate), starts)
     print_check(stdout(), answer)
     write_result(json, answer.document)

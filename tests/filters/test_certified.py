@@ -14,7 +14,6 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates import kept
-from safe_envs.filters.certificates.certificate import HeldCertificate
 from safe_envs.filters.certificates.files import save_certificate
 from safe_envs.filters.conditions.syntax import files_of, with_absolute_paths
 from safe_envs.filters.torch_layer import TorchFilter
@@ -390,8 +389,7 @@ def test_every_certificate_of_the_package_is_of_its_env():
     for path in sorted(kept.FOLDER.glob("*.json")):
         certificate = kept.load_certificate(path)
         problem = problem_of(certificate.env_id, **certificate.options)
-        control = "held" if isinstance(certificate, HeldCertificate) else "continuous"
-        assert kept.kept_certificate(problem, control) == certificate
+        assert kept.kept_certificate(problem) == certificate
 
 
 # its text
@@ -417,6 +415,7 @@ def test_its_text_makes_it_again(psi_file, monkeypatch):
         ("certified:p=2", "'p'"),
         ("certified:certificate=psi.json", "'certificate'"),
         ("certified:sha256=0123", "save it"),
+        ("certified:control=held", "--closed-loop"),
         ("certified:file={file}:file={file}", "'file' twice"),
         ("certified:file={file}:sampling_margin=first-order", "first order"),
         ("certified:file={file}:sampling_margin=-1", "sampling_margin"),

@@ -14,7 +14,6 @@ from safe_envs import ControlAffineSDE, define_problem
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.certificates.checker import check
 from safe_envs.proofs.certify import Named, SynthesisSettings, certify
-from safe_envs.proofs.held_synthesis import certify_held
 from safe_envs.registry import make_problem
 
 x, y, u = sp.symbols("x y u", real=True)
@@ -157,45 +156,3 @@ def test_what_is_out_of_range_or_too_large_is_refused_at_once(call, told):
     with pytest.raises(ConfigurationError, match=told):
         call()
     assert time.process_time() - begin < 5.0
-
-
-# Of held input.
-
-
-def test_a_low_degree_proves_a_bound_of_the_scalar_system_under_held_input():
-    problem = make_problem("safe_envs/Scalar-v0", horizon=0.2)
-    named = Named(problem, "safe_envs/Scalar-v0", {"horizon": 0.2})
-    found = certify_held(named, SynthesisSettings(degrees=(4,)))
-    (attempt,) = found.attempts
-    assert 0.7 < attempt.proved <= attempt.sampled + 1e-6
-    assert attempt.sampled <= attempt.program + 1e-6
-    assert abs(found.mean - attempt.proved) < 0.02
-    assert (found.certificate.steps, found.certificate.env_id) == (20, "safe_envs/Scalar-v0")
-
-
-def two_inputs():
-    """A problem with an input for each of its two states."""
-    v = sp.Symbol("v", real=True)
-    return define_problem(
-        ControlAffineSDE.from_rate((x, y), (u, v), [u, v], diffusion=[[0.1, 0], [0, 0.1]]),
-        1 - x**2,
-        input_bounds=(-1, 1),
-        start=(0.0, 0.0),
-        dt=0.1,
-        horizon=1.0,
-        workspace={x: (-2, 2), y: (-2, 2)},
-    )
-
-
-@pytest.mark.parametrize(
-    ("problem", "told"),
-    [
-        (lambda: make_problem("safe_envs/Scalar-v0", substeps=2), "substeps = 2"),
-        (lambda: make_problem("safe_envs/DubinsDisk-v0"), "no noise"),
-        (lambda: make_problem("safe_envs/Quadrotor-v0"), "12 states"),
-        (two_inputs, "2 inputs"),
-    ],
-)
-def test_what_has_no_bound_under_held_input(problem, told):
-    with pytest.raises(ConfigurationError, match=told):
-        certify_held(Named(problem()), SynthesisSettings(degrees=(2,)))

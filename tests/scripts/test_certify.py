@@ -50,22 +50,6 @@ def test_it_prints_the_bound_and_writes_what_check_accepts(safe_envs_command):
     assert (status, "checked:" in out) == (0, True)
 
 
-def test_held_input(safe_envs_command):
-    held = ("safe_envs/Scalar-v0", "--held", "--degree", 4, "--horizon", 0.2)
-    files = ("--out", "held.json", "--json", "all.json")
-    status, out, _ = safe_envs_command("certify", *held, *files)
-    assert status == 0
-    assert "in the workspace for 20 steps of 0.01 s" in out
-    certificate, found = load_certificate("held.json"), strictly("all.json")
-    assert_says_no_more_than(found, out)
-    assert float(certificate.sag) == found["sag"]
-    assert found["degrees"][0]["proved"] > 0.7
-    status, out, _ = safe_envs_command("certify", *held, "--start 1 --json -")
-    assert (status, json.loads(out)["proved"]) == (1, None)
-    status, out, _ = safe_envs_command("certify", *held, "--start 1")
-    assert (status, "no barrier of degree 4" in out) == (1, True)
-
-
 def test_the_nominal_controller_alone(safe_envs_command):
     status, out, _ = safe_envs_command("certify", *SCALAR[:-1], "0.2 --policy nominal")
     assert status == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from dataclasses import replace
 
 import pytest
@@ -34,14 +33,14 @@ def test_a_proof_ends_with_0_and_says_what_it_proves(safe_envs_command, written)
         assert text in out
     assert "checked: the certificate is a proof" in out
     document = strictly("found.json")
-    assert document["word"] == document["checks"]["intervals"]["word"] == "checked"
+    assert document["word"] == "checked"
     assert [b["state"] for b in document["bounds"]] == [[0, 0], [-0.1, 0.7], [0, 1.5]]
     bounds = [b["bound"] for b in document["bounds"]]
     assert bounds == pytest.approx([0.92, 0.42, 0.0], abs=1e-6)
     assert bounds[1] < 0.42
     shown = [float(text) for text in re.findall(r">= ([\d.]+) %", out)]
     assert all(text <= 100.0 * bound for text, bound in zip(shown, bounds, strict=True))
-    statements = document["checks"]["intervals"]["statements"]
+    statements = document["statements"]
     assert {part["word"] for part in statements} == {"checked"}
     assert (document["degree"], document["control"], document["c"]) == (
         2,
@@ -74,21 +73,7 @@ def test_a_proof_of_another_system_is_none_of_the_env(safe_envs_command, written
     assert "differs from that of safe_envs/Scalar-v0" in out
     document = strictly("found.json")
     assert document["word"] == "refuted"
-    assert document["checks"]["intervals"]["word"] == "checked"
+    assert {part["word"] for part in document["statements"]} == {"checked"}
     status, out, _ = safe_envs_command("check", written(brownian()))
     assert status == 0
     assert "no env of this project" in out
-
-
-def test_the_second_opinion(safe_envs_command, written, monkeypatch):
-    name = written(brownian())
-    with monkeypatch.context() as without:
-        without.setitem(sys.modules, "flint", None)
-        status, _, err = safe_envs_command("check", name, "--arb")
-    assert status == 2
-    assert ".[proofs]" in err
-    pytest.importorskip("flint")
-    status, out, _ = safe_envs_command("check", name, "--arb --json found.json")
-    assert status == 0
-    assert "ball arithmetic" in out
-    assert set(strictly("found.json")["checks"]) == {"intervals", "balls"}

@@ -155,9 +155,8 @@ certify Quadrotor-v0 | 12 states
 certify Scalar-v0 --degree 0 | degree = 0
 certify Scalar-v0 --degree 6 --rate -1 | rate
 certify Scalar-v0 --degree 6 --policy random | random
-certify Scalar-v0 --held --policy nominal | --policy
-certify Scalar-v0 --held --rate 0 | --rate
-certify Scalar-v0 --held --substeps 2 | substeps = 2
+certify Scalar-v0 --held | --closed-loop
+check psi.json --arb | safe-envs check
 certify Scalar-v0 --degree 6 --out a.json --json a.json | two files
 certify Scalar-v0 --degree 6 --seed -1 | seed
 check | FILE

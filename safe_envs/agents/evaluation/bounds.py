@@ -39,23 +39,12 @@ from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import RunningMean, exact_interval, share
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shown
-from safe_envs.filters.certificates.certificate import HeldCertificate
-from safe_envs.filters.certificates.matching import system_differences
 from safe_envs.filters.conditions.base import Condition, with_parts
-from safe_envs.filters.conditions.certified import Certified
 from safe_envs.filters.conditions.text import FilterSettings
 from safe_envs.problem.actuators import why_not_direct
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.proofs.backup_filter import BackupFilter, BackupSettings
-from safe_envs.proofs.guarantees import (
-    NOTHING,
-    RELATIVE,
-    CertificateGuarantee,
-    ChainGuarantee,
-    Extremum,
-    reaches,
-)
-from safe_envs.proofs.held import stated_bound, why_not_proved
+from safe_envs.proofs.guarantees import NOTHING, CertificateGuarantee, ChainGuarantee
 from safe_envs.proofs.judge import Word
 from safe_envs.proofs.posterior import Guarantee, PosteriorGuarantee, guarantee_of
 from safe_envs.text import percents_apart
@@ -100,7 +89,7 @@ class HeldInputBound:
         nowhere: what to say where it is 0 at all starts.
     """
 
-    word: Literal["proved", "certified", "computed"]
+    word: Literal["certified", "computed"]
     note: str
     why_none: str
     nowhere: str
@@ -249,70 +238,6 @@ def _loop_of(of: FilteredPolicy) -> ClosedLoop:
             f"objective = {of.objective}: tables are of filters that take the nearest input"
         )
     return ClosedLoop(of.problem, of.parts[0] if of.parts else None, policy, of.knowledge)
-
-
-PROVED = "the certificate's statements are proved by branch and bound"
-"""Note on such a bound."""
-
-
-class HeldCertificateBound(HeldInputBound):
-    """The bound of a certificate of held input, which holds for every policy under its filter.
-
-    Args:
-        certificate: of the filter.
-        conditions: all of the filter.
-        problem: what is simulated.
-    """
-
-    word = "proved"
-    note = PROVED
-    nowhere = "the certificate says nothing at any start"
-
-    def __init__(
-        self,
-        certificate: HeldCertificate,
-        conditions: tuple[Condition, ...],
-        problem: SafetyProblem,
-    ) -> None:
-        self._certificate, self._conditions, self._problem = certificate, conditions, problem
-        self._bound = stated_bound(certificate)
-        self.why_none = self._why_none()
-
-    def _why_none(self) -> str:
-        if any(condition != self._conditions[0] for condition in self._conditions):
-            return "other conditions act besides that of the certificate"
-        differing = system_differences(self._certificate.plant, self._problem.plant)
-        if differing:
-            parts = ", ".join(differing)
-            return f"the plant differs from the system of the certificate in {parts}"
-        reason = why_not_proved(self._certificate)
-        return f"the certificate is not proved: {reason}" if reason else ""
-
-    def at(self, starts: np.ndarray) -> np.ndarray:
-        """Return the bound at starts; see `HeldInputBound.at`."""
-        return self._bound.held_bounds_at(starts, self._problem.steps)
-
-    def contradiction(self, visited: VisitedStates) -> str:
-        """Return how states contradict psi <= c; "" if they do not."""
-        psi, x = self._certificate.psi, visited.deepest
-        middle, half = (np.array(part, dtype=float) for part in (psi.center, psi.scale))
-        inside = (np.abs(x - middle) <= half).all(axis=1) & (visited.depth > 0.0)
-        highest = float(psi.values(x[inside]).max(initial=-math.inf))
-        c = float(self._certificate.supremum)
-        return reaches("psi", highest, Extremum(c, c)) if highest > c * (1.0 + RELATIVE) else ""
-
-
-def held_certificate_bound(of: FilteredPolicy) -> HeldCertificateBound | None:
-    """Return the bound of a filter with a certificate of held input; None for other filters.
-
-    Args:
-        of: a policy, which does not matter, and the filter.
-    """
-    if isinstance(of.parts, FilterSettings):
-        return None
-    certificates = (c.certificate for c in of.parts if isinstance(c, Certified))
-    held = next((c for c in certificates if isinstance(c, HeldCertificate)), None)
-    return None if held is None else HeldCertificateBound(held, of.parts, of.problem)
 
 
 COMPUTED_TABLE = "computed: the table is of floating-point numbers"
@@ -512,7 +437,7 @@ def without_continuous(row: Bounded, reason: str) -> Bounded:
 
 
 NO_FILTER = "there is no filter"
-_NO_BOUND = "neither a table nor a certificate of the env's own step is known for it"
+_NO_BOUND = "no table of the env's own step is known for it"
 _BETWEEN = "it is of control instants, not of the time between them"
 
 
@@ -525,9 +450,8 @@ def held_bound_of(of: FilteredPolicy) -> HeldInputBound | str:
     why_not = why_not_direct(of.problem, "bounds of a filter")
     if why_not:
         return why_not
-    found: list[HeldInputBound] = [
-        bound for bound in (closed_loop_bound(of), held_certificate_bound(of)) if bound is not None
-    ]
+    closed_loop = closed_loop_bound(of)
+    found: list[HeldInputBound] = [] if closed_loop is None else [closed_loop]
     if isinstance(of.parts, PromiseSettings):
         found.append(PromiseBound(of.parts, of.problem, of.knowledge))
     if isinstance(of.parts, BackupSettings):

@@ -12,8 +12,6 @@ import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
 
-Control = Literal["constraint", "policy"]
-
 
 @dataclass(frozen=True)
 class Plant:
@@ -50,24 +48,7 @@ class Plant:
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """What every certificate has: a barrier psi of the states of a system.
-
-    Attributes:
-        env_id: of the registered env, with its options; empty for other systems.
-        options: of the env, as for `gym.make`, JSON values.
-        plant: the system.
-        psi: the barrier.
-    """
-
-    env_id: str
-    options: dict[str, object]
-    plant: Plant
-    psi: Polynomial
-
-
-@dataclass(frozen=True)
-class BarrierCertificate(Certificate):
+class BarrierCertificate:
     """In continuous control, P(safe up to T) >= [psi(x_0) e^(-a T) - m (1 - e^(-a T))/a]/c.
 
     It is a proof where a sound check of its statements passes: on G, where psi and all h_i are
@@ -76,16 +57,20 @@ class BarrierCertificate(Certificate):
     ends of the period of an angle, unless psi does not depend on it.
 
     Attributes:
-        env_id: see `Certificate`.
-        options: see `Certificate`.
+        env_id: of the registered env, with its options; empty for other systems.
+        options: of the env, as for `gym.make`, JSON values.
         plant: the system.
-        psi: the barrier.
+        psi: the barrier, a polynomial of its states.
         rate: a >= 0 in 1/s.
         shortfall: m >= 0 in 1/s, for psi has no unit.
         supremum: c > 0.
         horizon: T in s.
     """
 
+    env_id: str
+    options: dict[str, object]
+    plant: Plant
+    psi: Polynomial
     rate: Fraction
     shortfall: Fraction
     supremum: Fraction
@@ -119,40 +104,6 @@ class BarrierCertificate(Certificate):
         low = np.array([float(ends[0]) for ends in self.plant.workspace])
         turned = low + np.mod(x - low, 2.0 * math.pi)
         return self.psi.values(np.where(self.plant.angles, turned, x))
-
-
-@dataclass(frozen=True)
-class HeldCertificate(Certificate):
-    """In the env's own steps of held input, P(safe for K periods) >= (psi(x_0) - K (m + s + e))/c.
-
-    Safe is who is in C and in the workspace at the start and after each period. The theorem and
-    what has to be checked are in `HeldBound`.
-
-    Attributes:
-        env_id: see `Certificate`.
-        options: see `Certificate`.
-        plant: the system; without a policy the bound is of every policy whose input meets the
-            constraint `HeldStep.constraint(shortfall)`.
-        psi: the barrier, on B, where its scaled variables lie in [-1, 1].
-        period: control period in s.
-        steps: K, control periods of an episode.
-        supremum: c > 0.
-        shortfall: m >= 0, what the policy, or the constraint, lets psi fall in a period.
-        sag: s >= 0, how far an input between its bounds may be below the constraint; 0 for a
-            policy.
-        tail: e >= 0, for steps that leave B.
-    """
-
-    period: Fraction
-    steps: int
-    supremum: Fraction
-    shortfall: Fraction
-    sag: Fraction
-    tail: Fraction
-
-
-AnyCertificate = BarrierCertificate | HeldCertificate
-"""What a file may hold."""
 
 
 Word = Literal["checked", "refuted", "undecided"]

@@ -20,14 +20,15 @@ from safe_envs.dynamics.expression_text import (
     write_expression,
 )
 from safe_envs.dynamics.polynomial import Polynomial
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, shortened, shown
-from safe_envs.files import read_json, write_json
-from safe_envs.filters.certificates.certificate import (
-    AnyCertificate,
-    BarrierCertificate,
-    HeldCertificate,
-    Plant,
+from safe_envs.errors import (
+    HELD_CERTIFICATES,
+    ConfigurationError,
+    SystemDefinitionError,
+    shortened,
+    shown,
 )
+from safe_envs.files import read_json, write_json
+from safe_envs.filters.certificates.certificate import BarrierCertificate, Plant
 
 FORMAT = 1
 KIND = "barrier certificate of safe-envs"
@@ -37,18 +38,13 @@ _MOST_EXPRESSIONS = 40
 _MOST_COEFFICIENTS = 20_000
 _LARGEST_EXPONENT = 20
 _LARGEST_TENSOR = 200_000
-_MOST_STEPS = 10**9
-_MOST_HELD_TERMS = 5000
-"""Moments of a step that a psi of held input may have: more of them take too long to check."""
-
 _MOST_OPTIONS = 20_000
-_HELD = "held"
 _NOT_NEGATIVE: tuple[str, Callable[[Fraction], bool]] = ("a number of at least 0", lambda v: v >= 0)
 _POSITIVE: tuple[str, Callable[[Fraction], bool]] = ("a number above 0", lambda v: v > 0)
 _ADVICE = "write it again with `safe-envs certify`, or get another copy"
 
 
-def save_certificate(certificate: AnyCertificate, path: Path | str) -> None:
+def save_certificate(certificate: BarrierCertificate, path: Path | str) -> None:
     """Write a certificate, whole or not at all.
 
     Args:
@@ -64,7 +60,7 @@ def save_certificate(certificate: AnyCertificate, path: Path | str) -> None:
     write_json(Path(path), {**content, "sha256": checksum(content)})
 
 
-def load_certificate(path: Path | str) -> AnyCertificate:
+def load_certificate(path: Path | str) -> BarrierCertificate:
     """Read a certificate, which may be a stranger's: no code is run.
 
     Args:
@@ -105,7 +101,7 @@ def checksum(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _content_of(certificate: AnyCertificate) -> dict[str, Any]:
+def _content_of(certificate: BarrierCertificate) -> dict[str, Any]:
     plant, psi = certificate.plant, certificate.psi
     if psi.states != plant.states:
         raise ConfigurationError(f"psi is of {psi.states}, the plant of {plant.states}; use one")
@@ -139,23 +135,14 @@ def _content_of(certificate: AnyCertificate) -> dict[str, Any]:
         },
         "m": number_text(certificate.shortfall),
         "c": number_text(certificate.supremum),
-        **_own_numbers(certificate),
+        "a": number_text(certificate.rate),
+        "horizon": number_text(certificate.horizon),
     }
 
 
-def _own_numbers(certificate: AnyCertificate) -> dict[str, Any]:
-    if isinstance(certificate, BarrierCertificate):
-        return {"a": number_text(certificate.rate), "horizon": number_text(certificate.horizon)}
-    return {
-        "control": _HELD,
-        "period": number_text(certificate.period),
-        "steps": certificate.steps,
-        "sag": number_text(certificate.sag),
-        "tail": number_text(certificate.tail),
-    }
-
-
-def _certificate_of(content: dict[str, Any]) -> AnyCertificate:
+def _certificate_of(content: dict[str, Any]) -> BarrierCertificate:
+    if "control" in content:
+        raise ConfigurationError(HELD_CERTIFICATES)
     env = _part(content, "env", dict)
     options = _part(env, "options", dict)
     if len(json.dumps(options)) > _MOST_OPTIONS:
@@ -164,24 +151,9 @@ def _certificate_of(content: dict[str, Any]) -> AnyCertificate:
     env_id, psi = _part(env, "id", str), _psi_of(_part(content, "psi", dict), plant.states)
     shortfall = _number(content, "m", *_NOT_NEGATIVE)
     supremum = _number(content, "c", *_POSITIVE)
-    if "control" not in content:
-        rate = _number(content, "a", *_NOT_NEGATIVE)
-        horizon = _number(content, "horizon", *_POSITIVE)
-        return BarrierCertificate(env_id, options, plant, psi, rate, shortfall, supremum, horizon)
-    if content["control"] != _HELD:
-        _refuse("control", content["control"], f'"{_HELD}", or nothing for continuous control')
-    if (psi.degree + 1) ** psi.n > _MOST_HELD_TERMS:
-        _refuse("psi.coefficients", psi.degree, "a psi of lower degree for held input")
-    if len(plant.inputs) != 1 and not plant.policy:
-        _refuse("inputs", len(plant.inputs), "one input, or a policy, for held input")
-    steps = content.get("steps")
-    if type(steps) is not int or not 1 <= steps <= _MOST_STEPS:
-        _refuse("steps", steps, f"a whole number from 1 to {_MOST_STEPS:,}")
-    period = _number(content, "period", *_POSITIVE)
-    sag, tail = (_number(content, key, *_NOT_NEGATIVE) for key in ("sag", "tail"))
-    return HeldCertificate(
-        env_id, options, plant, psi, period, steps, supremum, shortfall, sag, tail
-    )
+    rate = _number(content, "a", *_NOT_NEGATIVE)
+    horizon = _number(content, "horizon", *_POSITIVE)
+    return BarrierCertificate(env_id, options, plant, psi, rate, shortfall, supremum, horizon)
 
 
 def _plant_of(content: dict[str, Any]) -> Plant:

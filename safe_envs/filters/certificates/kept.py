@@ -5,36 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.filters.certificates.certificate import (
-    AnyCertificate,
-    BarrierCertificate,
-    HeldCertificate,
-)
+from safe_envs.filters.certificates.certificate import BarrierCertificate
 from safe_envs.filters.certificates.files import load_certificate
-from safe_envs.filters.certificates.held_step import held_period
 from safe_envs.filters.certificates.matching import problem_differences, system_differences
 from safe_envs.problem.problem import SafetyProblem
-
-Control = Literal["continuous", "held"]
-
-_CLASSES: dict[Control, type[AnyCertificate]] = {
-    "continuous": BarrierCertificate,
-    "held": HeldCertificate,
-}
 
 FOLDER = Path(__file__).parent / "kept"
 """Of files NAME-v0.json, or NAME-v0-ANYTHING.json for other options, after the ids of envs."""
 
 
-def kept_certificate(problem: SafetyProblem, control: Control = "continuous") -> AnyCertificate:
+def kept_certificate(problem: SafetyProblem) -> BarrierCertificate:
     """Return the certificate of this package for a problem.
 
     Args:
         problem: which it has to be of exactly: that of a registered env.
-        control: "continuous", or "held" for the env's own steps.
 
     Raises:
         ConfigurationError: There is none, or none of this problem.
@@ -42,8 +28,6 @@ def kept_certificate(problem: SafetyProblem, control: Control = "continuous") ->
     differing: list[str] = []
     for path in _paths(problem.name):
         certificate = _loaded(path)
-        if not isinstance(certificate, _CLASSES[control]):
-            continue
         against = differences(certificate, problem)
         if not against:
             return certificate
@@ -53,12 +37,6 @@ def kept_certificate(problem: SafetyProblem, control: Control = "continuous") ->
         if differing
         else f"there is none of {problem.name} (there are: {_names()})"
     )
-    if control == "held":
-        raise ConfigurationError(
-            "filter 'certified' needs a certificate of held input, and this package has none of"
-            f" this problem: {reason}. Run `safe-envs certify ENV_ID --held --out psi.json` with"
-            " the options of this env, and give certified:file=psi.json"
-        )
     raise ConfigurationError(
         f"filter 'certified' needs a certificate, and this package has none of this problem:"
         f" {reason}. Run `safe-envs certify ENV_ID --out psi.json` with the options of this env,"
@@ -66,36 +44,25 @@ def kept_certificate(problem: SafetyProblem, control: Control = "continuous") ->
     )
 
 
-def is_kept(certificate: AnyCertificate) -> bool:
+def is_kept(certificate: BarrierCertificate) -> bool:
     """Return whether a certificate is one of this package."""
     return any(_loaded(path) == certificate for path in _paths(certificate.env_id))
 
 
-def differences(certificate: AnyCertificate, problem: SafetyProblem) -> list[str]:
+def differences(certificate: BarrierCertificate, problem: SafetyProblem) -> list[str]:
     """Return in what a problem differs from that of a certificate, in words.
 
-    The system of a certificate may be the plant of the problem or its model. One of held input is
-    of the env's own step too, and of its control period.
+    The system of a certificate may be the plant of the problem or its model.
 
     Args:
         certificate: whose problem is compared.
         problem: that it should be of.
-
-    Raises:
-        ConfigurationError: It is of held input, and the env takes several steps in a control period
-            or one without noise.
     """
     plant = certificate.plant
     against = system_differences(plant, problem.plant)
     if against and not system_differences(plant, problem.model):
         against = []
-    against = [*problem_differences(plant, problem), *against]
-    if isinstance(certificate, HeldCertificate):
-        period = held_period(problem)
-        if period != certificate.period:
-            ours, theirs = float(certificate.period), float(period)
-            against.append(f"the control period ({ours:g} s in place of {theirs:g} s)")
-    return against
+    return [*problem_differences(plant, problem), *against]
 
 
 def _paths(name: str) -> Iterator[Path]:
@@ -108,10 +75,10 @@ def _names() -> str:
     return ", ".join(sorted({path.stem for path in FOLDER.glob("*.json")})) or "none"
 
 
-def _loaded(path: Path) -> AnyCertificate:
+def _loaded(path: Path) -> BarrierCertificate:
     return _read(path, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=64)
-def _read(path: Path, changed: int) -> AnyCertificate:
+def _read(path: Path, changed: int) -> BarrierCertificate:
     return load_certificate(path)

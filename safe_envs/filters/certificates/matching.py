@@ -13,8 +13,7 @@ import sympy as sp
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
-from safe_envs.filters.certificates.certificate import Certificate, HeldCertificate, Plant
-from safe_envs.filters.certificates.held_step import held_period
+from safe_envs.filters.certificates.certificate import BarrierCertificate, Plant
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
 from safe_envs.registry import make_problem
@@ -134,7 +133,7 @@ class EnvDifference(NamedTuple):
     text: str
 
 
-def env_difference(certificate: Certificate) -> EnvDifference:
+def env_difference(certificate: BarrierCertificate) -> EnvDifference:
     """Compare the system of a certificate, which may be a stranger's, with that of its env.
 
     Args:
@@ -151,9 +150,6 @@ def env_difference(certificate: Certificate) -> EnvDifference:
         problem = make_problem(env_id, **options)
         part = difference(certificate.plant, plant_of(problem))
         of_model = bool(part) and not difference(certificate.plant, plant_of(problem, "model"))
-        if isinstance(certificate, HeldCertificate) and held_period(problem) != certificate.period:
-            told = f"the control period differs from that of {env_id} with its options"
-            return EnvDifference("differs", told)
     except (SafeEnvsError, TypeError, ValueError) as error:
         told = f"differs: there is no such env or no such system of it ({shortened(error)})"
         return EnvDifference("differs", f"the system {told}")

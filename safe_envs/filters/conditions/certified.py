@@ -16,15 +16,9 @@ from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.engine.qp.rounding import ROUNDING
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.filters.certificates.certificate import (
-    AnyCertificate,
-    BarrierCertificate,
-    Certificate,
-    HeldCertificate,
-)
+from safe_envs.filters.certificates.certificate import BarrierCertificate
 from safe_envs.filters.certificates.files import load_certificate
-from safe_envs.filters.certificates.held_step import HeldStep
-from safe_envs.filters.certificates.kept import Control, differences, is_kept, kept_certificate
+from safe_envs.filters.certificates.kept import differences, is_kept, kept_certificate
 from safe_envs.filters.certificates.matching import (
     PERIOD,
     exact_in,
@@ -47,7 +41,7 @@ class Places:
         domain: what is positive where the constraint has a meaning.
     """
 
-    def __init__(self, certificate: Certificate) -> None:
+    def __init__(self, certificate: BarrierCertificate) -> None:
         plant, psi = certificate.plant, certificate.psi
         self._z = tuple(sp.Symbol(f"z_{i}", real=True) for i in range(psi.n))
         ends = [tuple(sp.N(end, 17) for end in pair) for pair in plant.workspace]
@@ -71,9 +65,6 @@ class Places:
             *(self.at(barrier) for barrier in plant.barriers),
             *inside,
         )
-        if isinstance(certificate, HeldCertificate):
-            # It states nothing where a scaled state is not in [-1, 1].
-            self.domain += tuple(1 - sp.Abs(z) for z in self._nearest_z.values())
 
     def at(self, expression: sp.Expr) -> sp.Expr:
         """Return an expression of the certificate at the nearest state."""
@@ -103,7 +94,7 @@ class Places:
 def generator_parts(
     certificate: BarrierCertificate, model: ControlAffineSDE, places: Places
 ) -> tuple[tuple[sp.Expr, ...], sp.Expr]:
-    """Return a and b of the constraint a u + b >= 0 of continuous control.
+    """Return a and b of the constraint a u + b >= 0.
 
     Args:
         certificate: with psi, and the numbers a and m.
@@ -123,18 +114,6 @@ def generator_parts(
         sp.Add(*[effect[i, j] * slopes[i] for i in range(model.n)]) for j in range(model.m)
     )
     return coefficient, offset
-
-
-def held_parts(certificate: HeldCertificate, places: Places) -> tuple[tuple[sp.Expr, ...], sp.Expr]:
-    """Return a and b of the constraint a u + b >= 0 of held input; see `HeldStep.constraint`.
-
-    Args:
-        certificate: with psi, m and the control period.
-        places: where it is evaluated.
-    """
-    step = HeldStep(certificate.plant, certificate.psi, certificate.period)
-    coefficient, offset = step.constraint(certificate.shortfall)
-    return (places.at(coefficient),), places.at(offset)
 
 
 def _ito_parts(
@@ -173,10 +152,6 @@ _ADVICE = (
 class Certified(Condition):
     """A psi + a psi + m >= 0 where psi and all barriers are positive, with the generator A.
 
-    That is the constraint of a certificate of continuous control. That of one of held input says
-    E psi(X') >= psi - m of the state X' after a control period, with the chord of E psi(X') between
-    the bounds of the input in its place; see `HeldStep.constraint`.
-
     The barrier psi, a and m are those of a certificate. It is of all barriers at once: each of them
     gets this one constraint. Where psi or a barrier is not positive, and outside the workspace,
     there is no constraint, and the certificate says nothing: the filter executes the action that
@@ -193,7 +168,7 @@ class Certified(Condition):
     Source: the theorem of the certificate; see `BarrierCertificate`.
     """
 
-    certificate: AnyCertificate = field(hash=False)
+    certificate: BarrierCertificate = field(hash=False)
     file: str | None = None
     name = "certified"
     stochastic = True
@@ -202,15 +177,10 @@ class Certified(Condition):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not isinstance(self.certificate, BarrierCertificate | HeldCertificate):
+        if not isinstance(self.certificate, BarrierCertificate):
             raise ConfigurationError(
-                f"certificate = {shown(self.certificate)}; give a BarrierCertificate or a"
-                " HeldCertificate, or certified:file=FILE with a file of `safe-envs certify`"
-            )
-        if self._held and self.certificate.plant.policy:
-            raise ConfigurationError(
-                f"{self._described} is of one policy with held input, from which no constraint"
-                " follows; give one that is of every input"
+                f"certificate = {shown(self.certificate)}; give a BarrierCertificate, or"
+                " certified:file=FILE with a file of `safe-envs certify`"
             )
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError(
@@ -230,7 +200,6 @@ class Certified(Condition):
         cls,
         problem: SafetyProblem,
         file: str | None = None,
-        control: Control | None = None,
         **settings: Any,
     ) -> Certified:
         """Return the condition of a problem's certificate.
@@ -238,24 +207,13 @@ class Certified(Condition):
         Args:
             problem: which the certificate has to be of.
             file: of `safe-envs certify`; by default the certificate of this package is taken.
-            control: "held" for the certificate of this package for the env's own steps, by default
-                "continuous". A file says that itself.
             settings: further arguments of the condition.
 
         Raises:
             ConfigurationError: The file is no certificate or of another problem, or this package
                 has none of this problem.
         """
-        if control not in (None, "continuous", "held") or None not in (file, control):
-            raise ConfigurationError(
-                f"{cls.name} with control = {shown(control)} and file = {shown(file)}; give"
-                " control=held or control=continuous, or a file, which says it itself"
-            )
-        found = (
-            kept_certificate(problem, control or "continuous")
-            if file is None
-            else load_certificate(Path(file))
-        )
+        found = kept_certificate(problem) if file is None else load_certificate(Path(file))
         condition = cls(found, file, **settings)
         condition.require_fit(problem)
         return condition
@@ -276,9 +234,8 @@ class Certified(Condition):
         if self.file is not None:
             return {"file": self.file}
         if is_kept(self.certificate):
-            return {"control": "held"} if self._held else {}
+            return {}
         text = repr((self.certificate.plant, sorted(self.certificate.psi.coefficients.items())))
-        text += " held" if self._held else ""
         return {"sha256": hashlib.sha256(text.encode()).hexdigest()[:12]}
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
@@ -302,11 +259,7 @@ class Certified(Condition):
                 " the certificate, by knowledge = 'plant' or 'model'"
             )
         places = Places(certificate)
-        coefficient, offset = (
-            held_parts(certificate, places)
-            if isinstance(certificate, HeldCertificate)
-            else generator_parts(certificate, model, places)
-        )
+        coefficient, offset = generator_parts(certificate, model, places)
         return AffineConstraint(
             coefficient,
             offset,
@@ -314,10 +267,6 @@ class Certified(Condition):
             demand=sp.Integer(0),
             domain=places.domain,
         )
-
-    @property
-    def _held(self) -> bool:
-        return isinstance(self.certificate, HeldCertificate)
 
     @property
     def _described(self) -> str:

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 from safe_envs.dynamics.lie import generator, lie_derivative_f, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import (
+    HELD_CERTIFICATES,
     ConfigurationError,
     SafeEnvsError,
     nearest,
@@ -236,7 +237,7 @@ def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
         # What the file holds is no text.
         parameters.pop("learned", None)
         parameters.pop("certificate", None)
-    texts = ["file"] * _reads_file(condition) + ["control"] * issubclass(condition, Certified)
+    texts = ["file"] * _reads_file(condition)
     names = list(dict.fromkeys([*parameters, *texts]))
     given: dict[str, Any] = {}
     for setting in part.settings:
@@ -244,7 +245,8 @@ def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
         if key in given:
             raise ConfigurationError(f"filter {shown(part.text)} names {shown(key)} twice")
         if key not in names:
-            hint = _hint(key, names, given)
+            old = key == "control" and issubclass(condition, Certified)
+            hint = HELD_CERTIFICATES if old else _hint(key, names, given)
             raise ConfigurationError(f"filter {part.name} has no parameter {shown(key)}; {hint}")
         given[key] = value if key in texts else _value(part.text, parameters[key], value)
     return condition, given

@@ -26,7 +26,7 @@ from safe_envs.scripts.options.console import Quiet, UsageError, quietly, run, w
 
 PANELS: dict[str, str] = {
     "What": (
-        "system filter-spec policy trust algo method all against data state degree held rate"
+        "system filter-spec policy trust algo method all against data state degree rate"
         " x lines backend address"
     ),
     "Time, start and bounds": "dt substeps horizon start input-bounds rate-limit barrier",
@@ -38,7 +38,7 @@ PANELS: dict[str, str] = {
         "n-timesteps set action intervention-penalty promise-curriculum curriculum-part cost-limit"
         " violation-limit eval-freq eval-episodes resume train"
     ),
-    "Tables and proofs": "best closed-loop bounds leaving cells inputs table spec check prices arb",
+    "Tables and proofs": "best closed-loop bounds leaving cells inputs table spec check prices",
     "Statistics": (
         "episodes attained seed seeds repeats confidence refine monitoring rare particles"
         " repetitions simulate states"

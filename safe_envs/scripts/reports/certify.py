@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -17,17 +17,10 @@ from safe_envs.agents.evaluation.statistics import percent
 from safe_envs.agents.evaluation.table import describe_system
 from safe_envs.agents.jobs.store import package_versions
 from safe_envs.errors import shortened
-from safe_envs.filters.certificates.certificate import (
-    AnyCertificate,
-    BarrierCertificate,
-    CheckResult,
-    HeldCertificate,
-)
+from safe_envs.filters.certificates.certificate import BarrierCertificate, CheckResult
 from safe_envs.filters.certificates.matching import EnvDifference
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.proofs.certify import Certification
-from safe_envs.proofs.held import stated_bound
-from safe_envs.proofs.held_synthesis import HeldAttempt, HeldCertification
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import print_rows
 from safe_envs.text import number_at_least, number_at_most, percent_at_least, percent_at_most
@@ -237,149 +230,27 @@ def _numbers(certificate: BarrierCertificate | None) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldCertifyAnswer:
-    """What was found for an env with held input.
-
-    Attributes:
-        title: of the env.
-        config: what was asked for, as JSON.
-        problem: of the env.
-        found: the certificate, and what was tried.
-        out: file of the certificate, if one was asked for.
-    """
-
-    title: str
-    config: dict[str, Any]
-    problem: SafetyProblem
-    found: HeldCertification
-    out: Path | None
-
-    def document(self) -> dict[str, Any]:
-        """Return all as JSON-able data."""
-        found, certificate = self.found, self.found.certificate
-        numbers = {}
-        if certificate is not None:
-            names = ("supremum", "shortfall", "sag", "tail", "period", "steps")
-            numbers = {name: float(getattr(certificate, name)) for name in names}
-            numbers["degree"] = certificate.psi.degree
-        return {
-            "config": self.config,
-            "versions": package_versions(),
-            "proved": found.mean if certificate else None,
-            "proved_margin": found.margin if certificate else None,
-            "starts": found.starts,
-            **numbers,
-            "degrees": [_attempt(a) for a in found.attempts],
-            "seconds": found.seconds,
-            "file": None if self.out is None or certificate is None else str(self.out),
-        }
-
-    def print_on(self, console: Console) -> None:
-        """Print the degrees, the certificate, and what was not found.
-
-        Args:
-            console: to print on.
-        """
-        told = (
-            " | barrier certificate of held input for every policy under psi's constraint"
-            f" | start {self.problem.start}\n{describe_system(self.problem)}"
-        )
-        say(console, Text.assemble((self.title, "bold"), told))
-        titles = ("degree", "coeffi\u00adcients", "linear program", "sampled", "proved", "boxes")
-        rows = []
-        for a in self.found.attempts:
-            b = a.bound
-            cells = (
-                str(a.degree),
-                str(a.members),
-                percent(None if a.program is None else max(0.0, a.program)),
-                percent(None if a.program is None else a.sampled),
-                proved_cell(None if b is None else a.proved, b.reason if b else ""),
-                f"{b.boxes:,}" if b else "-",
-                f"{a.seconds:.1f}",
-            )
-            rows.append(cells)
-        console.print()
-        print_rows(console, "r", (*titles, "seconds"), rows)
-        console.print()
-        for line in self._lines():
-            say(console, line)
-        if self.found.certificate is not None:
-            say_written(console, self.out)
-
-    def _lines(self) -> list[str]:
-        found, c = self.found, self.found.certificate
-        notes = [
-            f"Note: degree {a.degree} is undecided: {a.bound.reason}."
-            for a in found.attempts
-            if a.bound is not None and a.bound.reason
-        ]
-        none = [str(a.degree) for a in found.attempts if a.sampled <= 0.0]
-        if none:
-            notes.append(
-                f"Note: no barrier of degree {', '.join(none)} has a bound above 0 at the sampled"
-                " states. That says nothing of other degrees, or of other functions."
-            )
-        if c is None:
-            return ["No bound above 0 is proved.", *notes]
-        lost = (c.shortfall + c.sag + c.tail) * c.steps
-        parts = (c.shortfall, c.sag, c.tail, c.supremum)
-        m1, m2, e, top = (number_at_most(v, 3) for v in parts)
-        lines = [
-            f"Proved: P(safe and in the workspace for {c.steps} steps of {float(c.period):g} s)"
-            f" {proved_mean(found.mean, found.margin, found.starts)}",
-            f"psi of degree {c.psi.degree}, c = {top}; in a step it falls by at most m1 + m2 + e ="
-            f" {m1} + {m2} + {e}, which costs {number_at_most(100 * lost, 2)} % of c = 1",
-            f"found and proved in {found.seconds:.3g} s",
-        ]
-        return [*lines, *notes]
-
-
-def _attempt(a: HeldAttempt) -> dict[str, Any]:
-    b = a.bound
-    return {
-        "degree": a.degree,
-        "coefficients": a.members,
-        "program": a.program,
-        "sampled": None if a.program is None else a.sampled,
-        "proved": None if b is None or b.reason else a.proved,
-        "reason": (b.reason or None) if b else None,
-        "boxes": b.boxes if b else None,
-        "seconds": a.seconds,
-    }
-
-
-_BY = {
-    "intervals": "branch and bound with first-order forms",
-    "balls": "ball arithmetic of Arb",
-    "judge": "the program that found its numbers, branch and bound with outward rounding",
-}
-
-
-@dataclass(frozen=True, eq=False)
 class CheckAnswer:
     """What was found of the certificate of a file.
 
     Attributes:
         file: its name.
         certificate: what it states.
-        found: results of the checks, by name.
+        found: by the checker.
         env: whether its system is that of the env that it names.
         starts: states to tell the bound of.
     """
 
     file: str
-    certificate: AnyCertificate
-    found: Mapping[str, CheckResult]
+    certificate: BarrierCertificate
+    found: CheckResult
     env: EnvDifference
     starts: Sequence[Sequence[float]]
 
     @property
     def word(self) -> str:
-        """What is said of the certificate: checked only where every check says so."""
-        words = [result.word for result in self.found.values()]
-        words += ["refuted"] if self.env.word == "differs" else []
-        return next((word for word in ("refuted", "undecided") if word in words), "checked")
+        """What is said of the certificate: refuted too where its env has another system."""
+        return "refuted" if self.env.word == "differs" else self.found.word
 
     def bounds(self) -> list[float | None]:
         """Return the bound at each start, rounded down; 0 outside of G, None unless checked."""
@@ -393,26 +264,13 @@ class CheckAnswer:
             ranges = zip(start, plant.workspace, strict=True)
             within = all(float(low) < x < float(high) for x, (low, high) in ranges)
             inside = within and all(float(v) > 0 for v in values)
-            x = np.array([start], dtype=float)
-            at = (
-                stated_bound(c).held_bounds_at(x, c.steps)
-                if isinstance(c, HeldCertificate)
-                else c.bounds_at(x)
-            )
-            bounds.append(max(0.0, float(at[0]) - 1e-9) if inside else 0.0)
+            bound = float(c.bounds_at(np.array([start], dtype=float))[0])
+            bounds.append(max(0.0, bound - 1e-9) if inside else 0.0)
         return bounds
 
     def document(self) -> dict[str, Any]:
         """Return all as JSON-able data."""
         c = self.certificate
-        parts = {
-            name: {
-                "word": result.word,
-                "boxes": result.boxes,
-                "statements": [part.as_dict() for part in result.parts],
-            }
-            for name, result in self.found.items()
-        }
         bounds = zip(self.starts, self.bounds(), strict=True)
         return {
             "file": self.file,
@@ -420,36 +278,26 @@ class CheckAnswer:
             "options": c.options,
             "env": self.env._asdict(),
             "degree": c.psi.degree,
-            "input": "held" if isinstance(c, HeldCertificate) else "continuous",
             "control": "policy" if c.plant.policy else "constraint",
             **{name: float(v) for name, v in _stated_numbers(c).items()},
             "word": self.word,
-            "checks": parts,
+            "boxes": self.found.boxes,
+            "statements": [part.as_dict() for part in self.found.parts],
             "bounds": [{"state": list(start), "bound": bound} for start, bound in bounds],
         }
 
 
-def _stated_numbers(c: AnyCertificate) -> dict[str, Any]:
-    if isinstance(c, HeldCertificate):
-        own = {"m": c.shortfall, "sag": c.sag, "tail": c.tail, "c": c.supremum}
-        return own | {"period": c.period, "steps": c.steps}
+def _stated_numbers(c: BarrierCertificate) -> dict[str, Any]:
     return {"a": c.rate, "m": c.shortfall, "c": c.supremum, "horizon": c.horizon}
 
 
 def _number_text(name: str, value: Any) -> str:
     """Return a number of a certificate, on the side on which the certificate states less."""
-    if name in ("period", "steps"):
-        return f"{float(value):.9g}"
     return (number_at_least if name == "horizon" else number_at_most)(value, 9)
 
 
-def _formula(c: AnyCertificate) -> str:
+def _formula(c: BarrierCertificate) -> str:
     """Return the bound that a certificate states."""
-    if isinstance(c, HeldCertificate):
-        return (
-            "P(safe and in the workspace at all control instants) >="
-            " [psi(x) - steps (m + sag + tail)]/c"
-        )
     spent = "m (1 - e^(-a T))/a" if c.rate else "m T"
     weight = "psi(x) e^(-a T)" if c.rate else "psi(x)"
     return f"P(safe for T, or until the workspace is left) >= [{weight} - {spent}]/c"
@@ -471,18 +319,16 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
     told = ", ".join(f"{name} = {_number_text(name, v)}" for name, v in _stated_numbers(c).items())
     say(console, f"It states, with {told}: {_formula(c)}")
     say(console, answer.env.text)
-    for name, result in answer.found.items():
-        say(console, f"\nBy {_BY[name]}:")
-        rows = []
-        for part in result.parts:
-            at = "" if part.state is None else f"at ({', '.join(f'{x:.6g}' for x in part.state)})"
-            note = "; ".join(text for text in (at, part.reason) if text)
-            boxes = f"{part.boxes:,}" if part.boxes else ""
-            seconds = f"{part.seconds:.2f}" if part.seconds else ""
-            rows.append((part.name, part.word, boxes, seconds, note))
-        console.print()
-        print_rows(console, "plrrp", ("statement", "word", "boxes", "seconds", ""), rows)
-        console.print()
+    rows = []
+    for part in answer.found.parts:
+        at = "" if part.state is None else f"at ({', '.join(f'{x:.6g}' for x in part.state)})"
+        note = "; ".join(text for text in (at, part.reason) if text)
+        boxes = f"{part.boxes:,}" if part.boxes else ""
+        seconds = f"{part.seconds:.2f}" if part.seconds else ""
+        rows.append((part.name, part.word, boxes, seconds, note))
+    console.print()
+    print_rows(console, "plrrp", ("statement", "word", "boxes", "seconds", ""), rows)
+    console.print()
     if answer.starts:
         rows = []
         for start, bound in zip(answer.starts, answer.bounds(), strict=True):
@@ -493,9 +339,4 @@ def print_check(console: Console, answer: CheckAnswer) -> None:
         print_rows(console, "pr", (names, "bound"), rows)
         console.print()
     proof = "a proof of its bound" if answer.word == "checked" else "no proof of its bound"
-    held = (
-        f"for input that is held for {float(c.period):g} s"
-        if isinstance(c, HeldCertificate)
-        else ""
-    )
-    say(console, f"{answer.word}: the certificate is {proof}, {held or 'for continuous control'}")
+    say(console, f"{answer.word}: the certificate is {proof}, for continuous control")

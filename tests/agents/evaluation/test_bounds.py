@@ -6,7 +6,6 @@ import gc
 import math
 import weakref
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -18,10 +17,8 @@ from safe_envs.agents.evaluation.bounds import (
     FilteredPolicy,
     closed_loop_bound,
     compute_closed_loop,
-    held_certificate_bound,
     together,
 )
-from safe_envs.agents.evaluation.episodes import VisitedStates
 from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.signals import Variable
@@ -30,10 +27,11 @@ from safe_envs.values import closed_loop
 from safe_envs.values.promise_filter import PromiseSettings, promise_filter_for, why_not_of_plant
 from safe_envs.values.solve import solve
 from safe_envs.values.tables import ValueSettings, save_table
-from safe_envs.wrappers import SZCBF, Certified, parse_conditions
+from safe_envs.wrappers import parse_conditions
 from tests.conftest import problem_of
-from tests.filters.certificates.held_examples import SCALAR, scalar_certificate, with_numbers
 from tests.oracles.carts import cart, cart_problem, v
+
+SCALAR = "safe_envs/Scalar-v0"
 
 
 def test_bounds_of_continuous_control_are_the_closed_forms_or_say_why_not():
@@ -60,11 +58,11 @@ def test_bounds_of_continuous_control_are_the_closed_forms_or_say_why_not():
     ):
         assert row.continuous_bound is None
         assert fragment in row.continuous_note
-    # None of these has a table or a certificate of the env's own steps.
+    # None of these has a table of the env's own steps.
     notes = {row.filter: row.held_note for row in (bare, scbf)}
     assert [row.held_bound for row in (bare, scbf, unasked)] == [None] * 3
     assert "no filter" in notes["none"]
-    assert "neither a table nor a certificate" in notes["scbf"]
+    assert "no table of the env's own step" in notes["scbf"]
 
 
 def test_a_bound_is_the_mean_over_the_starts():
@@ -282,36 +280,6 @@ def test_with_knowledge_of_the_plant_a_wrong_model_does_no_harm():
     (believed,) = guarded(problem, knowledge="model")
     assert (known.safety_rate, known.held_bound) == (1.0, 1.0)
     assert believed.safety_rate < 0.1
-
-
-CERTIFIED = problem_of(SCALAR, horizon=0.5)
-
-
-def held_bound(certificate, *more, problem=CERTIFIED):
-    conditions = (Certified(certificate), *more)
-    return held_certificate_bound(FilteredPolicy(problem, conditions, "model", "random"))
-
-
-def test_a_proved_certificate_has_a_bound_at_each_start_and_others_a_reason():
-    found = held_bound(scalar_certificate())
-    assert (found.why_none, found.word) == ("", "proved")
-    at = found.at(np.array([[0.0], [0.7], [0.99], [1.4]]))
-    assert 0.5 < at[1] < at[0] < 1.0
-    assert at[2:].tolist() == [0.0, 0.0]
-    longer = held_bound(scalar_certificate(), problem=problem_of(SCALAR)).at(np.zeros((1, 1)))
-    assert longer < at[0]
-    louder = problem_of(SCALAR, horizon=0.5, noise=0.3)
-    for bound, fragment in (
-        (held_bound(scalar_certificate(), SZCBF((1.0,))), "other conditions"),
-        (held_bound(with_numbers(shortfall=Fraction(1, 10**7))), "is not proved"),
-        (held_bound(scalar_certificate(), problem=louder), "differs from the system"),
-    ):
-        assert fragment in bound.why_none
-    # A psi above c contradicts it.
-    x, none = np.array([[0.1]]), np.empty(0)
-    visited = VisitedStates.of(np.empty((0, 1)), np.empty((0, 1)), none, x, np.array([0.9]))
-    assert found.contradiction(visited) == ""
-    assert "psi" in held_bound(with_numbers(supremum=Fraction(1, 2))).contradiction(visited)
 
 
 @pytest.fixture
