@@ -65,8 +65,6 @@ from safe_envs.proofs.safe_set import (
     Formulas,
     draw_starts,
     in_workspace,
-    largest,
-    sample,
     workspace_of,
 )
 from safe_envs.text import number_at_least, number_at_most
@@ -89,7 +87,8 @@ def stage_bound(
         rate: a >= 0 in 1/s.
         shortfall: m >= 0 in the units of b per s.
 
-    Source: Doob's optional stopping; for m = 0 thesis Prop. 4.2.5 and 4.2.8.
+    Source: Doob's optional stopping; for m = 0 thesis Prop. 4.2.8, and Prop. 4.2.5 without the
+        misprint of Eq. (4.16), which has e^(-c T), false for a > c.
     """
     b, c = np.asarray(b, dtype=np.float64), np.asarray(c, dtype=np.float64)
     # (1 - e^(-a T))/a without the loss of digits at small a T; T itself in the limit.
@@ -99,71 +98,6 @@ def stage_bound(
     with np.errstate(divide="ignore", invalid="ignore"):
         bound = np.where((b > 0.0) & (c > 0.0) & np.isfinite(c), left / c, 0.0)
     return np.clip(bound, 0.0, 1.0)
-
-
-def proposition_4_2_8(h: ArrayLike, c: float) -> np.ndarray:
-    """Return h/c, a bound for ever.
-
-    Hypotheses: relative degree 1; A h >= 0 on all of C, so that the condition can be met everywhere
-        on it; c = sup h over C is finite, which the thesis does not ask for.
-
-    Args:
-        h: value of the barrier at the start.
-        c: supremum of h over C.
-
-    Source: thesis Prop. 4.2.8.
-    """
-    return stage_bound(h, c)
-
-
-def proposition_4_2_5(h: ArrayLike, c: float, k: float, horizon: float) -> np.ndarray:
-    """Return (h/c) e^(-k T).
-
-    Hypotheses: relative degree 1; A h >= -k h on all of C; c = sup h over C is finite.
-
-    Args:
-        h: value of the barrier at the start.
-        c: supremum of h over C.
-        k: rate in 1/s.
-        horizon: T in s.
-
-    Source: thesis Prop. 4.2.5, corrected: Eq. (4.16) and (4.17) have e^(-c T), see
-        `proposition_4_2_5_printed`.
-    """
-    return stage_bound(h, c, horizon, rate=k)
-
-
-def proposition_4_2_5_printed(h: ArrayLike, c: float, horizon: float) -> np.ndarray:
-    """Return the printed (h/c) e^(-c T), which is false for k > c.
-
-    Its exponent has the units of h times s. For Brownian motion of variance s^2 t on (0, pi) and
-    h = sin(x), A h = -k h with k = s^2/2 and c = 1: the probability of staying is about
-    (4/pi) h e^(-k T), which falls below h e^(-T) if k > 1.
-
-    Args:
-        h: value of the barrier at the start.
-        c: supremum of h over C.
-        horizon: T in s.
-
-    Source: thesis Eq. (4.16).
-    """
-    return stage_bound(h, c, horizon, rate=c)
-
-
-def shortfall_repaired(h: ArrayLike, c: float, shortfall: float, horizon: float) -> np.ndarray:
-    """Return (h - m T)/c: Prop. 4.2.8 where A h >= 0 cannot be met everywhere.
-
-    Hypotheses: relative degree 1; A h >= -m on all of C; c = sup h over C is finite.
-
-    Args:
-        h: value of the barrier at the start.
-        c: supremum of h over C.
-        shortfall: m, by which the condition is violated at worst, in the units of h per s.
-        horizon: T in s.
-
-    Source: submartingale h + m t, see the head of this module.
-    """
-    return stage_bound(h, c, horizon, shortfall=shortfall)
 
 
 def union_bound(
@@ -194,50 +128,17 @@ def union_bound(
     Returns:
         Bounds, shape (...).
 
-    Source: union bound over the exits of the b_j, in place of the product of thesis Thm. 4.2.10.
+    Source: union bound over the exits of the b_j. The product of the b_j/c_j, thesis Thm. 4.2.10,
+        has no valid proof for r >= 2: Eq. (4.23) conditions on the future, and simulated systems
+        fall below the product.
     """
-    stages = _stages(b, c, horizon, rates, shortfalls)
-    return np.clip(sum(stages) - (len(stages) - 1), 0.0, 1.0)
-
-
-def theorem_4_2_10_printed(
-    b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rates: Sequence[float] | None = None
-) -> np.ndarray:
-    """Return the printed product of b_j/c_j, or its zeroing form; it has no valid proof for r >= 2.
-
-    Its proof takes P(b_j stays positive | b_(j+1) stays positive) for at least b_j/c_j, Eq. (4.23).
-    That conditions on the future: the paths on which b_(j+1) stays positive are not those of the
-    unconditioned process, for which b_j is a submartingale. Simulated systems fall below the
-    product. For r = 1 it is Prop. 4.2.8 or 4.2.5.
-
-    Args:
-        b: b_0..b_(r-1) at the starts, shape (..., r).
-        c: c_0..c_(r-1), suprema over the intersection of the {b_j >= 0}, shape (r,). The thesis
-            takes them over each C_j alone, where they may be infinite.
-        horizon: T in s; infinite for ever.
-        rates: a_1..a_r in 1/s; zeros by default.
-
-    Returns:
-        Products, shape (...).
-
-    Source: thesis Thm. 4.2.10, with j = 0..r-1.
-    """
-    return np.prod(_stages(b, c, horizon, rates, None), axis=0)
-
-
-def _stages(
-    b: ArrayLike,
-    c: ArrayLike,
-    horizon: float,
-    rates: Sequence[float] | None,
-    shortfalls: Sequence[float] | None,
-) -> list[np.ndarray]:
     values, suprema = np.asarray(b, dtype=np.float64), np.asarray(c, dtype=np.float64)
     count = values.shape[-1]
-    settings = zip(rates or (0.0,) * count, shortfalls or (0.0,) * count, strict=True)
-    return [
-        stage_bound(values[..., j], suprema[j], horizon, a, m) for j, (a, m) in enumerate(settings)
-    ]
+    numbers = zip(rates or (0.0,) * count, shortfalls or (0.0,) * count, strict=True)
+    kept = (
+        stage_bound(values[..., j], suprema[j], horizon, a, m) for j, (a, m) in enumerate(numbers)
+    )
+    return np.clip(sum(kept) - (count - 1), 0.0, 1.0)
 
 
 Status = Literal[
@@ -356,66 +257,31 @@ class Candidate(NamedTuple):
         name: of it.
         values: at the starts, shape (B,).
         forever: whether it is of all times.
-        gap: what its proof lacks even where its hypotheses hold; may be empty.
         allows_shortfall: whether the conditions may be violated somewhere.
     """
 
     name: str
     values: np.ndarray
     forever: bool = False
-    gap: str = ""
     allows_shortfall: bool = False
 
 
-def of_order_one(h: np.ndarray, stages: Stages, horizon: float) -> list[Candidate]:
-    """Return the results for one barrier of relative degree 1.
-
-    Args:
-        h: values of the barrier at the starts, shape (B,).
-        stages: of the barrier.
-        horizon: T in s.
-    """
-    (k,), (c,) = stages.rates, stages.suprema
-    if not k:
-        return [Candidate("Prop. 4.2.8: h/c, for ever", proposition_4_2_8(h, c), True)]
-    # For k <= c the misprinted exponent is merely larger than it has to be.
-    false = f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" * (k > c)
-    return [
-        Candidate(
-            "Prop. 4.2.5, printed formula: (h/c) e^(-c T)",
-            proposition_4_2_5_printed(h, c, horizon),
-            gap=false,
-        ),
-        Candidate("Prop. 4.2.5, corrected: (h/c) e^(-k T)", proposition_4_2_5(h, c, k, horizon)),
-    ]
-
-
-def of_stages(b: np.ndarray, stages: Stages, horizon: float, several: bool) -> list[Candidate]:
-    """Return the printed product, for a single barrier, and the union over the stages.
+def without_shortfall(b: np.ndarray, stages: Stages, horizon: float) -> Candidate:
+    """Return the result for conditions that can be met everywhere, under noise.
 
     Args:
         b: values of all chain functions at the starts, shape (B, sum of the r).
         stages: of all barriers.
         horizon: T in s.
-        several: whether there is more than one barrier.
     """
-    forever = not any(stages.rates)
-    time, length = (math.inf, "for ever") if forever else (horizon, "up to T")
-    union = Candidate(
-        f"union over the stages{' of all barriers' * several}, {length}",
-        union_bound(b, stages.suprema, time, stages.rates),
-        forever,
-    )
-    if several:
-        return [union]
-    name = (
-        "Thm. 4.2.10, printed formula: product of b_j/c_j"
-        if forever
-        else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
-    )
-    product = theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
-    gap = "its proof conditions on the future"
-    return [Candidate(f"{name}, {length}", product, forever, gap), union]
+    forever, several = not any(stages.rates), stages.barriers > 1
+    values = union_bound(b, stages.suprema, math.inf if forever else horizon, stages.rates)
+    if len(stages.rates) == 1:
+        corrected = "Prop. 4.2.5, corrected: (h/c) e^(-k T)"
+        return Candidate("Prop. 4.2.8: h/c, for ever" if forever else corrected, values, forever)
+    length = "for ever" if forever else "up to T"
+    name = f"union over the stages{' of all barriers' * several}, {length}"
+    return Candidate(name, values, forever)
 
 
 def holds_up_to_a_time(formulas: Formulas, stages: Stages) -> bool:
@@ -434,30 +300,32 @@ def candidates_for(
 ) -> list[Candidate]:
     """Return the results that suit conditions; the last one has the weakest hypotheses.
 
+    One that needs the conditions to be met everywhere is left out where they cannot be, if another
+    result allows for that.
+
     Args:
         formulas: of the conditions.
         b: values of all chain functions at the starts, shape (B, sum of the r).
         stages: of all barriers.
         horizon: T in s.
-        shortfall: m, for the name of a result.
+        shortfall: m.
     """
-    if formulas.certain:
-        name = "no noise: no path leaves"
-        name = "Prop. 4.2.2: safe with probability 1" if formulas.noisy else name
-        found = [Candidate(name, (b > 0.0).all(axis=1).astype(float), True)]
+    repaired: list[Candidate] = []
+    if not formulas.certain:
+        plain = without_shortfall(b, stages, horizon)
+        if any(stages.shortfalls):
+            values = union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
+            name = f"repaired for the shortfall m {shortfall.text('=', '>=')}, up to T"
+            repaired = [Candidate(name, values, allows_shortfall=True)]
+    else:
+        sure = "Prop. 4.2.2: safe with probability 1"
+        name = sure if formulas.noisy else "no noise: no path leaves"
+        plain = Candidate(name, (b > 0.0).all(axis=1).astype(float), True)
         if any(stages.shortfalls) and holds_up_to_a_time(formulas, stages):
             name = "no noise, in spite of the shortfall: safe up to T"
-            found.append(Candidate(name, surely_safe(stages, b, horizon), allows_shortfall=True))
-        return found
-    if b.shape[1] == 1:
-        found = of_order_one(b[:, 0], stages, horizon)
-    else:
-        found = of_stages(b, stages, horizon, stages.barriers > 1)
-    if any(stages.shortfalls):
-        values = union_bound(b, stages.suprema, horizon, stages.rates, stages.shortfalls)
-        name = f"repaired for the shortfall m {shortfall.text('=', '>=')}, up to T"
-        found.append(Candidate(name, values, allows_shortfall=True))
-    return found
+            values = surely_safe(stages, b, horizon)
+            repaired = [Candidate(name, values, allows_shortfall=True)]
+    return repaired if repaired and shortfall.found else [plain, *repaired]
 
 
 def surely_safe(stages: Stages, b: np.ndarray, horizon: float) -> np.ndarray:
@@ -1243,9 +1111,6 @@ class CertificateGuarantee:
             0.0,
         )
 
-    def best_start(self, seed: int = 0) -> None:
-        """Return None: no printed formula has to be tried where it is largest."""
-
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
@@ -1298,7 +1163,6 @@ def _inside_domain(certificate: BarrierCertificate, x: np.ndarray) -> np.ndarray
 NOTHING = "it is 0 at these starts up to this horizon"
 """What there is to say of a bound that is 0."""
 
-_SAMPLES = 2048
 _STARTS = 1024
 _EMPTY = "the sets C_j have no state in common"
 
@@ -1511,7 +1375,7 @@ class ChainGuarantee:
         """Return the mean of a result over the starts, with what is against it."""
         infeasible = "" if candidate.allows_shortfall else self._infeasible
         broken = [*failures(self.analysis), *filter(None, [infeasible])]
-        unproved = [*self._unverified, *filter(None, [candidate.gap])]
+        unproved = self._unverified
         status, open_ = self._status(candidate, bool(broken), bool(unproved))
         values = candidate.values
         reason = "; ".join([*broken, *unproved, *filter(None, [open_]), *partly])
@@ -1531,25 +1395,3 @@ class ChainGuarantee:
     def _infeasible(self) -> str:
         """Where the conditions cannot be met, in words; may be empty."""
         return infeasible(self.analysis, self.shortfall)
-
-    def best_start(self, seed: int = 0) -> np.ndarray | None:
-        """Return the state (n,) where the printed bound is largest; None without such a bound.
-
-        Args:
-            seed: of the search.
-        """
-        formulas, analysis = self.formulas, self.analysis
-        if (
-            analysis.invariant_set is None
-            or formulas.certain
-            or no_bound(formulas)
-            or self._unbounded
-        ):
-            return None
-        level, region, rng = formulas.invariant_level, analysis.region, np.random.default_rng(seed)
-        points = sample("the intersection of the C_j", level, region, _SAMPLES, rng).points
-
-        def printed(x: np.ndarray) -> np.ndarray:
-            return theorem_4_2_10_printed(formulas.chain(x), self.stages.suprema)
-
-        return largest(printed, points, region, rng)[1]

@@ -38,9 +38,7 @@ def verify(
         ),
     ] = "nominal",
     trust: text_options.Trust = False,
-    episodes: Annotated[
-        int, typer.Option(help="Episodes of the simulation, from each start.")
-    ] = 500,
+    episodes: Annotated[int, typer.Option(help="Episodes of the simulation.")] = 500,
     seed: text_options.Seed = 0,
     simulate: Annotated[
         bool,

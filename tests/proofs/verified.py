@@ -97,11 +97,6 @@ def estimated(env_id, text=None, **options):
     return made_bound(problem, text or problem.filter)
 
 
-def by_name(bounds, part):
-    (found,) = [b for b in bounds if part in b.name]
-    return found
-
-
 def system_in_a_box(count=1, high=5.0, noise=0.6, half_width=1.0):
     """dx_i = u_i dt + s x_i dW_i with h_i = 1 - x_i^2: the bound h/c is attained."""
     x, u = sp.symbols(f"x_1:{count + 1}", real=True), sp.symbols(f"u_1:{count + 1}", real=True)

@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from safe_envs import ControlAffineSDE, SafetyFilter, SafetyProblem, define_problem
 from safe_envs.agents import make_problem, rate_interval
 from safe_envs.agents.evaluation.episodes import episode_seed
-from safe_envs.proofs.guarantees import proposition_4_2_8
+from safe_envs.proofs.guarantees import stage_bound
 from safe_envs.scripts.figures.style import COLORS, add_legend, labelled
 from safe_envs.wrappers import parse_conditions
 from thesis.artefact import Claim, Number, Outcome, Sample, settings
@@ -52,7 +52,7 @@ def compute(sample: Sample) -> tuple[Outcome, Any]:
         each.number(f"SCBF where h/c is attained, x_0 = {start:g}")
         for start, each in zip(STARTS, attained, strict=True)
     ]
-    bounds = [float(proposition_4_2_8(1.0 - start**2, 1.0)) for start in STARTS]
+    bounds = [float(stage_bound(1.0 - start**2, 1.0)) for start in STARTS]
     closed = [safe_up_to(start, SCALAR.horizon, SCALAR.step) for start in STARTS]
     outcome = Outcome(
         numbers=[

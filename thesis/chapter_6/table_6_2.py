@@ -14,7 +14,7 @@ from safe_envs.agents.evaluation.bounds import by_rate
 from safe_envs.filters.learning.generator import learn_generator
 from safe_envs.filters.learning.models.posterior import Posterior
 from safe_envs.proofs.feasibility import verify
-from safe_envs.proofs.guarantees import proposition_4_2_8, shortfall_repaired
+from safe_envs.proofs.guarantees import stage_bound
 from safe_envs.wrappers import SCBF
 from thesis.artefact import Claim, Number, Outcome, Sample, settings, texts
 from thesis.chapter_6 import bayes
@@ -109,8 +109,8 @@ def compute(sample: Sample) -> tuple[Outcome, None]:
                 measure(problem, "scbf", *size),
                 measure(problem, "ddscbf", *size, generators),
                 measure(problem, "bayesian-scbf", *size, systems),
-                100 * float(proposition_4_2_8(h, supremum)),
-                100 * float(shortfall_repaired(h, supremum, shortfall, problem.horizon)),
+                100 * float(stage_bound(h, supremum)),
+                100 * float(stage_bound(h, supremum, problem.horizon, shortfall=shortfall)),
             )
         )
     others = {}

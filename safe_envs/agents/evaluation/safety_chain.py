@@ -145,8 +145,6 @@ def measure(
 ) -> list[MeasuredSafety]:
     """Simulate a policy under the conditions, and compare its safety with the bounds.
 
-    The starts are the problem's, and the one where the printed bound is largest.
-
     The horizons are the problem's times 1, 2, 5, ..., up to 20 or, if there is noise and a bound
     that is for ever, 500, as far as the simulation stays short. A bound is contradicted where the
     upper end of a one-sided exact interval lies below it by more than its own error, an interval so
@@ -156,32 +154,18 @@ def measure(
     Args:
         verification: of the conditions.
         policy: as for `evaluate`.
-        episodes: for each start.
+        episodes: how many.
         seed: of all randomness.
         engine: as for `evaluate`.
         progress: called with the part of the work that is done, from 0 to 1.
 
     Returns:
-        A measurement for each start, with the bounds that it contradicts.
+        The measurement, with the bounds that it contradicts.
 
     Raises:
         ConfigurationError: as `evaluate`.
     """
-    problem = verification.problem
-    best = verification.guarantee.best_start(seed)
-    worlds = [(f"the start {problem.start!r}", problem)]
-    if best is not None:
-        worlds.append(
-            (
-                "the start found where the printed bound is largest",
-                problem.configured(start=best.tolist()),
-            )
-        )
-    found = []
-    for i, (name, world) in enumerate(worlds):
-        part = progress_of_part(progress, i / len(worlds), 1.0 / len(worlds))
-        found.append(_measure(verification, name, world, policy, episodes, seed, engine, part))
-    return _all_compared(found)
+    return _all_compared([_measure(verification, policy, episodes, seed, engine, progress)])
 
 
 def starts_of(problem: SafetyProblem, seed: int = 0) -> np.ndarray:
@@ -196,15 +180,14 @@ def starts_of(problem: SafetyProblem, seed: int = 0) -> np.ndarray:
 
 def _measure(
     verification: Verification,
-    name: str,
-    world: SafetyProblem,
     policy: Any,
     episodes: int,
     seed: int,
     engine: str,
     progress: Progress | None,
 ) -> MeasuredSafety:
-    formulas, starts = verification.formulas, starts_of(world, seed)
+    world, formulas = verification.problem, verification.formulas
+    starts = starts_of(world, seed)
     lasting = formulas.noisy and any(
         b.forever and b.value
         for b in verification.guarantee.applicable_bounds(starts, world.duration)
@@ -230,7 +213,7 @@ def _measure(
         visited += answer.visited[answer.rows[0].filter]
         repeats, done = answer.is_deterministic, done + run[-1]
     return MeasuredSafety(
-        name,
+        f"the start {world.start!r}",
         starts[0] if len(starts) == 1 else None,
         episodes,
         repeats,

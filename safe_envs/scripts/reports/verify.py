@@ -196,7 +196,7 @@ def print_bounds(console: Console, answer: VerifyAnswer) -> None:
     if any(_in_brackets(bound) for bound in bounds):
         say(
             console,
-            "In brackets: the value of a formula whose hypotheses fail here, or whose proof does;"
+            "In brackets: the value of a formula whose hypotheses fail here or are not established;"
             " that is no bound.",
         )
 

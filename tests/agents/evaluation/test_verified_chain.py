@@ -160,53 +160,27 @@ def short(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
-    from_start, at_best = measured(CUBIC_DISK)
-    assert from_start.start == "the start 'uniform'"
-    assert from_start.state is None
-    assert [h.time for h in from_start.horizons] == pytest.approx([1.0, 20.0], abs=0.011)
-    np.testing.assert_allclose(at_best.state, 0.0, atol=1e-3)
-    assert contradicted(from_start) == set()
-    assert contradicted(at_best) == {"Prop. 4.2.8: h/c, for ever"}
-    for horizon in (*from_start.horizons, *at_best.horizons):
+def test_the_proved_bound_of_the_cubic_disk_holds():
+    (found,) = measured(CUBIC_DISK)
+    assert (found.start, found.state) == ("the start 'uniform'", None)
+    assert [h.time for h in found.horizons] == pytest.approx([1.0, 20.0], abs=0.011)
+    assert contradicted(found) == set()
+    for horizon in found.horizons:
         assert horizon.ci_low <= horizon.rate == horizon.safe / 200 <= horizon.ci_high
-        (proved,) = [b.value for b in horizon.bounds if b.status == "proved"]
-        assert proved <= horizon.ci_high
-
-
-@pytest.mark.oracle
-def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch):
-    monkeypatch.setattr(of, "_MULTIPLES", (1,))
-    monkeypatch.setattr(of, "_LONG_MULTIPLES", (30,))
-    # With the default noise of .2 it takes four times as long.
-    _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4, dt=0.1)
-    first, last = at_best.horizons
-    assert (first.time, last.time) == (5.0, 150.0)
-    assert first.contradicted == ()
-    (product,) = [b for b in last.bounds if "product" in b.name]
-    # Radially inwards at the distance rho: b_0 = r^2 - rho^2 and b_1 = 2 v rho - 2 sigma^2, with r
-    # = 3 and v = 2.
-    rho = np.linspace(0.0, 3.0, 100_001)
-    largest = ((9 - rho**2) * (4 * rho - 0.32)).max() / ((9 - 0.08**2) * 11.68)
-    # The suprema are proved, to 1e-3 of them.
-    assert largest * (1 - 2e-3) <= product.value <= largest * (1 + 1e-9)
-    assert last.ci_high < product.value
-    assert product.name in last.contradicted
-    assert not any("repaired" in name for name in contradicted(at_best))
+        (bound,) = horizon.bounds
+        assert bound.status == "proved"
+        assert bound.value <= horizon.ci_high
 
 
 @pytest.mark.oracle
 @pytest.mark.usefixtures("short")
 def test_the_bounds_of_the_pendulum_hold():
-    measurements = measured("safe_envs/Pendulum-v0")
-    assert len(measurements) == 2
-    assert not any(contradicted(m) for m in measurements)
+    (found,) = measured("safe_envs/Pendulum-v0")
+    assert not contradicted(found)
     # The best input is worth 0 along a line of states, which no box is narrow enough for; but that
     # it misses the condition by a tiny number at most is proved.
-    found = {
-        (b.name.split()[0], b.status) for m in measurements for h in m.horizons for b in h.bounds
-    }
-    assert found == {("Prop.", "estimated"), ("repaired", "proved")}
+    words = {(b.name.split()[0], b.status) for h in found.horizons for b in h.bounds}
+    assert words == {("Prop.", "estimated"), ("repaired", "proved")}
 
 
 @pytest.mark.oracle
