@@ -21,7 +21,6 @@ from tests.proofs.verified import (
     STOCHASTIC,
     estimated,
     findings,
-    hurry,
     made,
     made_bound,
     problem_with,
@@ -117,6 +116,7 @@ def test_leaving_the_workspace_counts_as_it_is_evaluated():
         ([x], (-math.inf, 2.0), 2.0, ""),
     ],
 )
+@pytest.mark.usefixtures("whole_search")
 def test_a_supremum_is_infinite_only_where_nothing_ends_it(barriers, ends, highest, growth):
     problem = problem_with([0 * x], barriers, ranges=(ends,), noise=(0.1,))
     found = made(problem, samples=256).barriers[0]
@@ -160,13 +160,10 @@ def test_bounds_of_several_barriers_are_put_together_by_the_union():
     ("env_id", "text", "options", "note"),
     [
         (STOCHASTIC, "hocbf", {}, "ignores the noise"),
-        (DUBINS, "hocbf", {}, "differs from the plant in v"),
-        (CUBIC_DISK, "srcbf", {}, "unbounded control towards the edge"),
         (CUBIC_DISK, "scbf", {"model": {"sigma_1": 0.0}}, "differs from the plant in sigma_1"),
     ],
 )
-def test_what_has_no_bound_says_why(env_id, text, options, note, monkeypatch):
-    hurry(monkeypatch)
+def test_what_has_no_bound_says_why(env_id, text, options, note):
     bound = estimated(env_id, text, **options)
     assert note in bound.note
     starts = starts_of(problem_of(env_id), 4)
@@ -236,8 +233,7 @@ def test_no_box_holds_an_srcbf_under_noise(width, scale):
     ("noise", "kept"),
     [(1 - x**2, True), (sp.sqrt(1 - x**2), True), ((1 - x**2) ** sp.Rational(1, 4), False)],
 )
-def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept, monkeypatch):
-    hurry(monkeypatch)
+def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
     # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least
     # like h.
     problem = problem_with([0 * x], [1 - x**2], noise=(noise,), input_bounds=(-1e6, 1e6))
@@ -279,8 +275,7 @@ def test_a_range_that_was_chosen_establishes_nothing():
     assert guarantee.note == reason
 
 
-def test_conditions_that_share_several_inputs_have_no_bound(monkeypatch):
-    hurry(monkeypatch)
+def test_conditions_that_share_several_inputs_have_no_bound():
     problem = system_in_a_box(count=2)
     x_1, x_2 = problem.plant.states
     coupled = replace(

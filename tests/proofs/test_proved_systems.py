@@ -16,7 +16,7 @@ from tests.oracles.random_systems import (
     random_system,
     rates,
 )
-from tests.proofs.verified import hurry, made_bound
+from tests.proofs.verified import made_bound
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
 
@@ -25,7 +25,7 @@ COMPARISONS = 20 * (SYSTEMS + len(NASTY))
 ERROR = 0.01 / COMPARISONS
 """Of one comparison, so that all true bounds pass together with a probability of 99 %."""
 
-TELLING = (3, 4, 6, 7, 10, 17, 20, 30)
+TELLING = (3, 7, 17, 20, 30)
 """Random systems with a proved bound that is not far below the rate, or of relative degree two."""
 
 
@@ -71,8 +71,7 @@ def test_what_has_no_derivatives_is_refused(name):
 
 
 @pytest.mark.parametrize("name", UNPROVED)
-def test_the_judge_does_not_rely_on_the_search_for_kinks_and_poles(name, monkeypatch):
-    hurry(monkeypatch)
+def test_the_judge_does_not_rely_on_the_search_for_kinks_and_poles(name):
     problem, text = NASTY[name]()
     proof = made_bound(problem, text).proof
     verdicts = [proof.smooth, proof.continuous]

@@ -19,7 +19,6 @@ from tests.proofs.verified import (
     DUBINS,
     STOCHASTIC,
     findings,
-    hurry,
     made,
     made_bound,
     problem_with,
@@ -34,8 +33,7 @@ pytestmark = pytest.mark.slow
 STATUSES = {"proved", "estimated", "withheld", "hypothesis fails", "no bound", "not established"}
 
 
-def test_every_env_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
-    hurry(monkeypatch)
+def test_every_env_is_verified_and_has_a_bound_or_a_note(env_id):
     problem = problem_of(env_id, **({"num_obstacles": 2} if "DubinsObstacles" in env_id else {}))
     found = made(problem, problem.filter, samples=128)
     assert len(found.barriers) == len(problem.barriers)
@@ -61,8 +59,9 @@ def test_every_env_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
     assert found.guarantee.note is None or not values.any()
 
 
+@pytest.mark.usefixtures("whole_search")
 def test_radial_headings_leave_the_dubins_disk_without_control():
-    (barrier,) = (found := findings(DUBINS)).barriers
+    (barrier,) = (found := made(problem_of(DUBINS), "hocbf")).barriers
     x_1, x_2, theta = barrier.control_authority_at
     assert barrier.degree == 2
     # The search follows the ridge of radial headings to where the authority is 0.
@@ -181,8 +180,7 @@ def test_a_condition_that_is_just_met_is_met():
     assert found.safe_set.infeasible == found.safe_set.shortfall == 0.0
 
 
-def test_states_where_a_condition_is_undefined_are_reported(monkeypatch):
-    hurry(monkeypatch)
+def test_states_where_a_condition_is_undefined_are_reported():
     problem = problem_with([-sp.sqrt(x)], [1 - x**2], noise=(0.05,))
     found = made(problem, samples=1024)
     assert found.undefined == pytest.approx(0.5, abs=0.01)
@@ -225,9 +223,8 @@ def test_the_invariant_set_is_a_part_of_the_safe_set(slowest, rates, share):
     assert found.safe_set.share == pytest.approx(0.5, abs=0.005)
 
 
-def test_a_tiny_safe_set_is_found_as_a_whole(monkeypatch):
+def test_a_tiny_safe_set_is_found_as_a_whole():
     # A h_i >= 0 cannot be met for 2 |u| < s^2 |x_i|, which is the outer half of each state's range.
-    hurry(monkeypatch)
     problem = system_in_a_box(count=2, half_width=0.004, high=0.5 * 0.6**2 * 0.002)
     problem = replace(problem, starts={"middle": Start.at((0.0, 0.0))})
     found = made(problem, samples=256).safe_set
@@ -279,8 +276,7 @@ def test_the_search_follows_a_ridge_to_a_corner():
         (sp.sin(y**2), False),
     ],
 )
-def test_only_waves_are_searched_over_one_turn(expression, periodic, monkeypatch):
-    hurry(monkeypatch)
+def test_only_waves_are_searched_over_one_turn(expression, periodic):
     problem = problem_with(
         [0 * x, 1 + 0 * y],
         [3 - x**2 - expression / 10],
@@ -321,8 +317,7 @@ KINK, POLE = "twice differentiable", "a pole"
         (1 - x**2 + sp.log(x + 4), ""),
     ],
 )
-def test_a_kink_or_pole_in_the_safe_set_leaves_no_bound_under_noise(barrier, rough, monkeypatch):
-    hurry(monkeypatch)
+def test_a_kink_or_pole_in_the_safe_set_leaves_no_bound_under_noise(barrier, rough):
     bound = made_bound(problem_with([0 * x], [barrier], noise=(0.3,)), "szcbf:alpha=0.1")
     told = (bound.note or "") + (bound.remark if not rough else "")
     assert (rough in told) if rough else not (KINK in told or POLE in told)
@@ -343,8 +338,7 @@ def test_what_comes_near_a_kink_or_pole_only_is_left_to_the_judge(near):
     assert (bound.note, bound.proof.regular) == (None, True)
 
 
-def test_without_noise_a_kink_is_no_matter_and_a_pole_is(monkeypatch):
-    hurry(monkeypatch)
+def test_without_noise_a_kink_is_no_matter_and_a_pole_is():
     root = (x**2 + 1e-4) ** sp.Rational(1, 4) * (1 - x) ** sp.Rational(3, 2)
     for drift, barrier, pole in (
         (root, 1 - x**2, None),
@@ -358,8 +352,7 @@ def test_without_noise_a_kink_is_no_matter_and_a_pole_is(monkeypatch):
         assert bool(guarantee.note) == bool(pole)
 
 
-def test_results_depend_on_the_seed_alone(monkeypatch):
-    hurry(monkeypatch)
+def test_results_depend_on_the_seed_alone():
     problem = problem_of(CUBIC_DISK)
     first, again, other = (made(problem, samples=256, seed=seed).safe_set for seed in (1, 1, 2))
     assert (first.infeasible, first.points) == (again.infeasible, again.points)
