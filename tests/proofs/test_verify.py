@@ -311,7 +311,7 @@ KINK, POLE = "twice differentiable", "a pole"
         (5 + sp.sec(x), POLE),
         (5 + sp.csc(x), POLE),
         (5 + sp.atan2(x - 1, -2), POLE),
-        (1 - x**2 - sp.Abs(x) ** 3 + sp.tanh(x) * sp.exp(x) * 2**x / 100, ""),
+        (1 - x**2 - sp.Abs(x) ** 3 + sp.tanh(x) * 2**x / 100, ""),
         # Beyond the edge of C, and beyond the workspace, nothing matters.
         (sp.sqrt((x + 1) ** 2 + 1e-9) - 0.5 - (x - 2) ** 2 / 4, ""),
         (1 - x**2 + sp.log(x + 4), ""),
