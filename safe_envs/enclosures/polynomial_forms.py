@@ -20,8 +20,6 @@ from safe_envs.enclosures.intervals import Interval
 _UNIT = 2.0**-53
 _WIDEST = 1e6
 """Boxes that reach further, in scaled variables, are not expanded about."""
-_MANY = 8
-"""Derivatives from which on their forms are found together, a little wider but much sooner."""
 
 Order = tuple[int, ...]
 
@@ -68,20 +66,14 @@ class ExpandedPolynomial:
         # What the scaled variables are computed from, relative to which they are rounded.
         entering = (np.abs(mid.T) + rad.T + np.abs(self._center)) / self._scale
         size = float(np.where(far[:, None], 0.0, entering).max(initial=1.0))
-        expanded = self._about(center)
-        if len(orders) > _MANY:
-            errors = [2.0 * self._error(order, reach, size) for order in orders]
-            return self._together(expanded, width, orders, errors, far)
+        count = len(center)
+        expanded = _moved(
+            np.broadcast_to(self._coefficients, (count, *self._coefficients.shape)), center
+        )
         return [
             self._form(expanded, width, order, self._error(order, reach, size), far)
             for order in orders
         ]
-
-    def _about(self, center: np.ndarray) -> np.ndarray:
-        """Return the coefficients about points, shape (B, d_1 + 1, ..., d_n + 1)."""
-        return _moved(
-            np.broadcast_to(self._coefficients, (len(center), *self._coefficients.shape)), center
-        )
 
     def _form(
         self, expanded: np.ndarray, width: np.ndarray, order: Order, error: float, far: np.ndarray
@@ -122,43 +114,6 @@ class ExpandedPolynomial:
         radius = np.where(far, np.inf, size * MORE + error)
         unknown = Interval(np.full(boxes, -np.inf), np.full(boxes, np.inf))
         return with_range(center, slopes, radius, unknown, np.ones(boxes, dtype=bool))
-
-    def _together(
-        self,
-        expanded: np.ndarray,
-        width: np.ndarray,
-        orders: Sequence[Order],
-        errors: Sequence[float],
-        far: np.ndarray,
-    ) -> list[Form]:
-        """Return the forms of many derivatives at the cost of few.
-
-        With coefficients c about the middle, the derivative of order k has the coefficients
-        k! binomial(k + j, k) c_(k + j). The sums over j of their absolute values times width^j are
-        those of |c| expanded about the width, for all k at once. What is left of a sum without its
-        constant and linear terms is the radius; its rounding is less than that of the sum, which
-        the errors allow for.
-        """
-        n, boxes = len(self._scale), len(width)
-        sums = _moved(np.abs(expanded), width)
-        unknown = Interval(np.full(boxes, -np.inf), np.full(boxes, np.inf))
-        smooth, found = np.ones(boxes, dtype=bool), []
-        for order, error in zip(orders, errors, strict=True):
-            factor = math.prod(
-                math.factorial(e) / s**e for e, s in zip(order, self._scale.tolist(), strict=True)
-            )
-            center, slopes, size = np.zeros(boxes), np.zeros((n, boxes)), np.zeros(boxes)
-            if all(e < d for e, d in zip(order, self._coefficients.shape, strict=True)):
-                center = factor * expanded[(slice(None), *order)]
-                size = factor * sums[(slice(None), *order)] - np.abs(center)
-                for i, e in enumerate(order):
-                    if e + 1 < self._coefficients.shape[i]:
-                        place = (slice(None), *order[:i], e + 1, *order[i + 1 :])
-                        slopes[i] = factor * (e + 1) * expanded[place] * width[:, i]
-                        size -= np.abs(slopes[i])
-            radius = np.where(far, np.inf, np.maximum(size, 0.0) * MORE + error)
-            found.append(with_range(center, slopes, radius, unknown, smooth))
-        return found
 
     def _error(self, order: Order, reach: float, size: float) -> float:
         """Return what rounding may have changed a derivative by on a box.

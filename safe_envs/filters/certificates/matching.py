@@ -19,7 +19,8 @@ from safe_envs.problem.signals import Variable
 from safe_envs.registry import make_problem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
 
-_TURN = 2 * sp.pi
+PERIOD = 2 * sp.pi
+"""Of an angle."""
 
 
 def plant_of(
@@ -87,7 +88,7 @@ def _ends(state: Variable, used: Sequence[sp.Expr]) -> tuple[sp.Expr, sp.Expr]:
         return _rational(state.low), _rational(state.high)
     x = state.symbol
     endless = math.isinf(state.low) and math.isinf(state.high)
-    if endless and all(e.subs(x, x + _TURN) == e for e in used):
+    if endless and all(e.subs(x, x + PERIOD) == e for e in used):
         return -sp.pi, sp.pi
     raise ConfigurationError(
         f"the state {x} is unbounded and the system does not repeat in it, so that no box holds the"
@@ -157,15 +158,6 @@ def env_difference(certificate: BarrierCertificate) -> EnvDifference:
         return EnvDifference("same", f"the system is exactly that of {env_id} with its options")
     own = f"the {part} differs from that of {env_id} with its options"
     return EnvDifference("differs", own + (", it is the model's" if of_model else ""))
-
-
-PERIOD = 2 * sp.pi
-"""Of an angle."""
-
-
-def is_one_period(ends: tuple[sp.Expr, sp.Expr]) -> bool:
-    """Return whether the ends of a state are those of one turn of an angle."""
-    return ends[1] - ends[0] == PERIOD
 
 
 def system_differences(plant: Plant, system: ControlAffineSDE) -> list[str]:

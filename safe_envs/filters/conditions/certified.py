@@ -23,7 +23,6 @@ from safe_envs.filters.certificates.matching import (
     PERIOD,
     exact_in,
     is_among,
-    is_one_period,
     system_differences,
 )
 from safe_envs.filters.conditions.base import FIRST_ORDER, AffineConstraint, Condition
@@ -49,7 +48,7 @@ class Places:
         self._nearest_z: dict[Any, Any] = {}
         inside = []
         for i, (x, (low, high)) in enumerate(zip(psi.states, ends, strict=True)):
-            if is_one_period(plant.workspace[i]):
+            if plant.angles[i]:
                 place = low + sp.Mod(x - low, PERIOD.evalf(17))
             else:
                 place = sp.Max(low, sp.Min(x, high))
