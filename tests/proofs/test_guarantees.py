@@ -283,7 +283,7 @@ def test_conditions_that_share_several_inputs_have_no_bound():
         barriers=(Barrier(1 - x_1**2 - x_2**2 / 2, "h_1"), Barrier(1 - x_2**2 - x_1**2 / 2, "h_2")),
     )
     reason = "the shortfall of several conditions together is not established"
-    guarantee = made_bound(coupled)
+    guarantee = made_bound(coupled, seconds=1.0)
     assert guarantee.note == reason
     bounds = guarantee.applicable_bounds(np.array([[0.1, 0.1]]), 1.0)
     assert all(reason in b.reason and b.status not in HOLDING for b in bounds)

@@ -120,27 +120,6 @@ def test_what_has_no_bound_is_refused(cubic, posterior):
             posterior_guarantee(problem, conditions)
 
 
-def test_an_unbounded_set_has_none(cubic):
-    posterior = identify(cubic, starts=100, repetitions=20, degree=3)
-    problem = problem_of("safe_envs/CubicSDE-v0")
-    # Its noise varies with the state: no intervals of sigma are known.
-    varying = identify(problem, starts=100, repetitions=20, degree=3, diffusion_degree=2)
-    with pytest.raises(ConfigurationError, match="constant noise"):
-        posterior_guarantee(problem, [BayesianSCBF(varying, simultaneous=0.9)])
-    # The same set with the noise of the disk, which is constant.
-    parabola = replace(cubic, barriers=problem.barriers)
-    endless = replace(
-        parabola, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in cubic.states)
-    )
-    with pytest.raises(ConfigurationError, match="beyond"):
-        posterior_guarantee(endless, [BayesianSCBF(posterior, simultaneous=0.9)])
-    # To leave a workspace ends an episode, so that h counts inside of it only: 1 - x_1 - x_2^2 is
-    # largest at x_1 = -2.
-    assert posterior_guarantee(
-        parabola, [BayesianSCBF(posterior, simultaneous=0.9)]
-    ).supremum == pytest.approx(3.0, rel=1e-9)
-
-
 @pytest.mark.parametrize("identifications", [1, pytest.param(12, marks=pytest.mark.oracle)])
 def test_the_bound_is_below_what_happens(cubic, identifications):
     """From one start, with identifications that know little; a shorter search finds less of the
@@ -180,6 +159,28 @@ def unstable(rate=3, noise=0.05, **options):
         nominal=0,
         **options,
     )
+
+
+def test_an_unbounded_set_has_none():
+    problem = problem_of("safe_envs/CubicSDE-v0")
+    # Its noise varies with the state: no intervals of sigma are known.
+    varying = identify(problem, starts=100, repetitions=20, degree=3, diffusion_degree=2)
+    with pytest.raises(ConfigurationError, match="constant noise"):
+        posterior_guarantee(problem, [BayesianSCBF(varying, simultaneous=0.9)])
+    problem = unstable(dt=0.01)
+    (x,) = problem.plant.states
+    condition = BayesianSCBF(
+        identify(problem, starts=50, repetitions=20, degree=1), simultaneous=0.9
+    )
+    half_line = replace(problem, barriers=(Barrier(1 - x, "h"),))
+    endless = replace(
+        half_line, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in problem.states)
+    )
+    with pytest.raises(ConfigurationError, match="beyond"):
+        posterior_guarantee(endless, [condition])
+    # To leave a workspace ends an episode, so that h counts inside of it only: at most 3 at -2.
+    supremum = posterior_guarantee(half_line, [condition]).supremum
+    assert supremum == pytest.approx(3.0, rel=1e-9)
 
 
 def test_the_bound_is_of_the_posterior_and_grows_with_what_it_knows():
