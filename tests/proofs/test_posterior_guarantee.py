@@ -121,9 +121,10 @@ def test_what_has_no_bound_is_refused(cubic, posterior):
 
 
 @pytest.mark.parametrize("identifications", [1, pytest.param(12, marks=pytest.mark.oracle)])
-def test_the_bound_is_below_what_happens(cubic, identifications):
+def test_the_bound_is_below_what_happens(cubic, monkeypatch, identifications):
     """From one start, with identifications that know little; a shorter search finds less of the
     shortfall, and promises more."""
+    hurry(monkeypatch)
     envs, horizon, promised = 100, 0.5, []
     for seed in range(identifications):
         condition = BayesianSCBF(

@@ -19,6 +19,7 @@ from tests.proofs.verified import (
     DUBINS,
     STOCHASTIC,
     findings,
+    hurry,
     made,
     made_bound,
     problem_with,
@@ -33,7 +34,8 @@ pytestmark = pytest.mark.slow
 STATUSES = {"proved", "estimated", "withheld", "hypothesis fails", "no bound", "not established"}
 
 
-def test_every_env_is_verified_and_has_a_bound_or_a_note(env_id):
+def test_every_env_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
+    hurry(monkeypatch)
     problem = problem_of(env_id, **({"num_obstacles": 2} if "DubinsObstacles" in env_id else {}))
     found = made(problem, problem.filter, samples=128)
     assert len(found.barriers) == len(problem.barriers)
