@@ -175,11 +175,6 @@ export Pendulum-v0 --filter scbf --out c --name 'a b' | a b
 export Pendulum-v0 --out no/such/c | no/such
 export Pendulum-v0 --out c --states 0 | states
 export DubinsDisk-v0 --filter backup --out c | simulates plans
-frontier Quadrotor-v0 | coordinates
-frontier Scalar-v0 --cells 10x10 | cells
-frontier Scalar-v0 --leaving no | violation, safe
-frontier Scalar-v0 --policy missing.zip | no such file
-frontier Scalar-v0 --episodes 0 | episodes
 render Scalar-v0 --out r.png --seed -1 | --seed = -1
 render CubicSDEDisk-v0 --out run.gif --json run.gif | would overwrite the file of --out run.gif
 render CubicSDEDisk-v0 --out run.gif --learned run.gif | would overwrite

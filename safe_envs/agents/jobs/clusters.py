@@ -1,8 +1,7 @@
-"""joblib's backends for Dask and Ray, which report the loss of a worker to joblib."""
+"""joblib's backend for Dask, which reports the loss of a worker to joblib."""
 
 from __future__ import annotations
 
-import logging
 import re
 import socket
 import threading
@@ -24,9 +23,6 @@ _LOOK = 5.0
 
 _MOST_LOOKS = 60
 """Looks in a row without workers after which to give up."""
-
-_RETRIES = 2
-"""How often Ray starts a job again whose worker ended; Dask has a setting of its own for this."""
 
 
 class TaskLostError(Exception):
@@ -142,37 +138,9 @@ def _watch(
             give_up(ConfigurationError(f"{message}, and start again: what was computed is kept"))
 
 
-@contextmanager
-def ray_settings(address: str) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of `joblib.Parallel` for a Ray cluster.
-
-    Raises:
-        ConfigurationError: it cannot be reached.
-    """
-    import ray
-    from ray.util.joblib.ray_backend import RayBackend
-
-    class Ray(RayBackend):
-        supports_return_generator = True
-
-    try:
-        _require_listener(address)
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except (OSError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigurationError(
-            f"no Ray cluster answers at {address} ({reason}); start one by: ray start --head"
-        ) from error
-    try:
-        remote = {"max_restarts": -1, "max_task_retries": _RETRIES}
-        yield {"backend": Ray(ray_remote_args=remote), "n_jobs": -1}
-    finally:
-        ray.shutdown()
-
-
 def _require_listener(address: str) -> None:
     """Raise OSError unless something listens at HOST:PORT, and ValueError for another form."""
-    # The clients of the clusters would try for minutes.
+    # Dask's client would try for minutes.
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and "/" not in host):
         raise ValueError("this is not of the form HOST:PORT")

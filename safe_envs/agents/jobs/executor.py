@@ -1,4 +1,4 @@
-"""The runner of independent jobs: in processes of this machine, on a Dask or a Ray cluster."""
+"""The runner of independent jobs: in processes of this machine, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import cloudpickle
 
-from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings, ray_settings
+from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings
 from safe_envs.agents.jobs.job import Job, JobOutcome, outcome_of
 from safe_envs.errors import (
     ConfigurationError,
@@ -102,11 +102,11 @@ def _unpacked(function: Callable[..., Any], sent: bytes, part: Any) -> Any:
     return function(cloudpickle.loads(sent), part)
 
 
-BACKENDS = ("local", "dask", "ray")
+BACKENDS = ("local", "dask")
 
 _MOST_LOSSES = 3
-"""How often processes of this machine may end before jobs are computed one by one; clusters retry
-by themselves."""
+"""How often processes of this machine may end before jobs are computed one by one; Dask retries by
+itself."""
 
 _MOST_TRIED = 5
 """How many jobs are tried, one by one, before none is taken to be computable."""
@@ -129,12 +129,12 @@ class Backend:
 
     Attributes:
         backend: one of `BACKENDS`.
-        address: of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
+        address: of a Dask scheduler, tcp://HOST:PORT.
         jobs: number of processes of this machine, for "local"; a cluster uses all its workers.
 
     Raises:
-        ConfigurationError: the backend is unknown, an address is missing or does not apply, or a
-            package is not installed.
+        ConfigurationError: the backend is unknown, an address is missing or does not apply, or Dask
+            is not installed.
     """
 
     backend: str = "local"
@@ -143,20 +143,23 @@ class Backend:
 
     def __post_init__(self) -> None:
         require_whole("jobs", self.jobs, 1)
+        if self.backend == "ray":
+            raise ConfigurationError(
+                "backend = 'ray' is gone; use dask, or local processes of this machine"
+            )
         if self.backend not in BACKENDS:
             raise ConfigurationError(
                 f"backend = {self.backend!r}; {nearest(self.backend, BACKENDS)}"
             )
         if (self.address is None) != (self.backend == "local"):
             wrong = (
-                "needs the address of its cluster"
+                "needs the address of its scheduler"
                 if self.address is None
-                else "takes no address; name dask or ray as the backend"
+                else "takes no address; name dask as the backend"
             )
             raise ConfigurationError(f"backend {self.backend} {wrong}")
-        package = {"dask": "distributed", "ray": "ray"}.get(self.backend)
-        if package is not None and find_spec(package) is None:
-            raise ConfigurationError(f"{package} is not installed; {install_extra(self.backend)}")
+        if self.backend == "dask" and find_spec("distributed") is None:
+            raise ConfigurationError(f"distributed is not installed; {install_extra('dask')}")
 
 
 def run(
@@ -287,9 +290,6 @@ def _settings(
         # A single job, too, has a process of its own where several are allowed.
         jobs = 1 if backend.jobs == 1 else max(2, min(backend.jobs, count))
         yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
-    elif backend.backend == "dask":
-        with dask_settings(str(backend.address), report) as settings:
-            yield settings
     else:
-        with ray_settings(str(backend.address)) as settings:
+        with dask_settings(str(backend.address), report) as settings:
             yield settings

@@ -39,14 +39,12 @@ COMMANDS = {
     "verification of a line": "verify Scalar-v0 --no-simulate",
     "best": "best Pendulum-v0 --cells 20x16 --inputs 3 --episodes 0",
     "best over a line": "best Scalar-v0 --inputs 3 --episodes 0",
-    "frontier": "frontier Pendulum-v0 --episodes 10 --cells 20x16 --attained 2",
     "identification": "identify CubicSDE-v0 --method bayesian --set degree=3",
 }
 FUNCTIONS = {
     "evaluate": "evaluation:plot_evaluation",
     "verify": "verify:plot_verification",
     "best": "best:plot_attainable",
-    "frontier": "frontier:plot_frontier",
     "identify": "identify:draw",
 }
 
@@ -128,7 +126,7 @@ def test_equal_figures_are_equal_files_with_truetype_fonts(tmp_path):
         assert b"/FontType 3" not in found[suffix]
 
 
-@pytest.mark.parametrize("kind", ["evaluation", "verification", "best", "frontier", "log"])
+@pytest.mark.parametrize("kind", ["evaluation", "verification", "best", "log"])
 def test_a_figure_that_is_written_twice_is_the_same_file(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     figure = figure_of(kind, "double")

@@ -33,6 +33,7 @@ def rows_of(**values: Any) -> list[dict[str, Any]]:
             "ci_high": high,
         }
         row |= {"config": '{"title": "mine"}', "row": '{"learning": null}'}
+        row |= {"error": None, "return_mean": float(k)}
     return rows
 
 
@@ -79,11 +80,11 @@ def test_the_band_of_seeds_that_learned_anew_is_over_what_they_learned_too():
     assert _rate(same) == (6 / 60, *rate_interval(6, 60))
 
 
-def test_what_no_cell_has_yet_is_drawn_as_the_envs_own(tmp_path: Path):
+def test_what_no_cell_has_yet_is_drawn_as_the_envs_own():
     rows = [{**row, "start": None} for row in rows_of(noise=[0.1, 0.2])]
     layout = Layout.of(rows, ("noise", "start"))
     assert layout == Layout("noise", "start", ())
-    assert draw(rows, layout, tmp_path / "rates.svg") == 0
+    assert figure_of(rows, layout)[1] == 0
 
 
 @pytest.mark.parametrize(
@@ -98,17 +99,48 @@ def test_a_picture_of_each_kind(
     tmp_path: Path, swept: tuple[str, ...], given: tuple[str, ...], panels: tuple[str, ...]
 ):
     path = tmp_path / "rates.svg"
-    assert draw(ROWS, Layout.of(ROWS, swept, *given), path) == 0
+    assert draw(ROWS, swept, path, "double", *given) == f"The picture: {path}"
     text = path.read_text()
     assert all(panel in text for panel in panels)
 
 
 def test_panels_without_room_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sweep, "_MOST_PANELS", 3)
-    layout = Layout("dt", "noise", ("filter", "seed"))
-    assert draw(ROWS, layout, tmp_path / "rates.svg") == 5
-    assert "filter = none, seed = 2" in (text := (tmp_path / "rates.svg").read_text())
-    assert "seed = 3" not in text
+    rows = rows_of(filter=FILTERS, noise=[0.3, 0.1], dt=[0.1, 0.2], start=[*"abcd"])
+    swept, path = ("filter", "noise", "dt", "start"), tmp_path / "rates.svg"
+    assert "without 5 of its panels" in draw(rows, swept, path, "double", "dt", "noise")
+    assert "filter = none, start = c" in (text := path.read_text())
+    assert "start = d" not in text
+
+
+PROMISES = ("none", "promise:p=0.9", "promise:p=0.99")
+
+
+@pytest.mark.parametrize(
+    ("given", "layout"),
+    [
+        ({"env": ["one", "two"]}, Layout(None, "filter", ("env",), returns=True)),
+        ({"noise": [0.1, 0.2]}, Layout("noise", "filter", ())),
+    ],
+)
+def test_promises_at_several_p_are_compared_by_return_over_violations(given, layout):
+    rows = rows_of(filter=PROMISES, seed=[0, 1], **given)
+    assert Layout.of(rows, ("filter", "seed", *given)) == layout
+    assert not Layout.of(rows, ("filter", "seed", *given), "filter").returns
+
+
+@pytest.mark.parametrize("size", list(WIDTHS))
+def test_a_point_is_the_pooled_return_over_the_pooled_violations(size: str):
+    rows = rows_of(filter=PROMISES, seed=[0, 1])
+    figure, _ = figure_of(rows, Layout.of(rows, ("filter", "seed")), size)
+    (axes,) = figure.axes
+    found = [tuple(each.lines[0].get_xydata()[0]) for each in axes.containers]
+    assert found == [
+        pytest.approx((1 - (one["safe"] + other["safe"]) / 40, one["return_mean"] + 0.5))
+        for one, other in zip(rows[::2], rows[1::2], strict=True)
+    ]
+    assert axes.get_legend_handles_labels()[1] == list(PROMISES)
+    assert unreadable(*figure_texts(figure)) == []
 
 
 MANY = {
