@@ -230,6 +230,12 @@ def drawable(h: np.ndarray) -> np.ndarray:
     return np.maximum(h, -2.0 * known.max(initial=1.0))
 
 
+def runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the one after the last place of each run of True."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
+
+
 _UNDATED: dict[str, dict[str, Any]] = {
     "pdf": {"CreationDate": None},
     "svg": {"Date": None},

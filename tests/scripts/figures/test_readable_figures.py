@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
@@ -45,7 +45,7 @@ FUNCTIONS = {
     "evaluate": "evaluation:plot_evaluation",
     "verify": "verify:plot_verification",
     "best": "best:plot_attainable",
-    "identify": "identify:draw",
+    "identify": "identify:plot_identification",
 }
 
 
@@ -64,10 +64,6 @@ def figure_maker(kind: str) -> Callable[[str], Figure]:
         cli.main()
     assert not ended.value.code
     given, settings = called.call_args
-    if function == "draw":
-        *given, _, size = given
-        assert size == "double"
-        return partial(module.figure_of, *given)
     *given, _ = given
     assert settings.pop("size") == "double"
     return lambda size: getattr(module, function)(*given, size=size, **settings)
