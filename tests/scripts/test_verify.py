@@ -109,9 +109,10 @@ def test_a_rate_above_what_is_attainable_withholds_it(verify, monkeypatch):
         ("ACC-v0", "sup h over C <= 1000.01, proved|inside|proved, but empty"),
         ("StochasticDubins-v0", "c_0 <= 9.0|proved; c_1 <= 11.9|conditions on the future"),
         ("StochasticDubins-v0 --filter hocbf", "hocbf ignores the noise"),
-        (
+        pytest.param(
             "DubinsDisk-v0",
             "theta over a period of 2 pi|the model differs from the plant in v|has no effect",
+            marks=pytest.mark.oracle,
         ),
         (
             "DubinsDisk-v0 --start thesis --knowledge plant",

@@ -11,7 +11,6 @@ import pytest
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.scripts.figures import sweep
 from safe_envs.scripts.figures.sweep import Layout, _rate, draw, figure_of
-from safe_envs.scripts.options.evaluation_options import WIDTHS
 from tests.readable import figure_texts, unreadable
 
 pytestmark = pytest.mark.slow
@@ -90,8 +89,7 @@ def test_what_no_cell_has_yet_is_drawn_as_the_envs_own():
 @pytest.mark.parametrize(
     ("swept", "given", "panels"),
     [
-        (SWEPT, (), ("dt = 0.1", "dt = 0.2")),
-        (SWEPT, ("filter", "noise"), ("dt = 0.1",)),
+        (SWEPT, ("filter", "noise"), ("dt = 0.1", "dt = 0.2")),
         (("seed",), (), ("mine: safety rate",)),
     ],
 )
@@ -129,10 +127,9 @@ def test_promises_at_several_p_are_compared_by_return_over_violations(given, lay
     assert not Layout.of(rows, ("filter", "seed", *given), "filter").returns
 
 
-@pytest.mark.parametrize("size", list(WIDTHS))
-def test_a_point_is_the_pooled_return_over_the_pooled_violations(size: str):
+def test_a_point_is_the_pooled_return_over_the_pooled_violations():
     rows = rows_of(filter=PROMISES, seed=[0, 1])
-    figure, _ = figure_of(rows, Layout.of(rows, ("filter", "seed")), size)
+    figure, _ = figure_of(rows, Layout.of(rows, ("filter", "seed")), "single")
     (axes,) = figure.axes
     found = [tuple(each.lines[0].get_xydata()[0]) for each in axes.containers]
     assert found == [
@@ -161,10 +158,13 @@ MANY = {
 }
 
 
-@pytest.mark.parametrize("size", list(WIDTHS))
 @pytest.mark.parametrize(
-    ("names", "swept"),
-    [("short", ("filter",)), ("long", ("filter", "noise")), ("short", ("filter", "noise", "dt"))],
+    ("names", "swept", "size"),
+    [
+        ("short", ("filter",), "single"),
+        ("long", ("filter", "noise"), "single"),
+        ("short", ("filter", "noise", "dt"), "double"),
+    ],
 )
 def test_eight_filters_can_be_read_and_told_apart(names: str, swept: tuple[str, ...], size: str):
     values = {"filter": MANY[names], "noise": [0.1, 0.2, 0.3], "dt": [0.1, 0.2]}
