@@ -63,10 +63,8 @@ evaluate Scalar-v0 --input-bounds 2,1 | input_bounds
 evaluate Scalar-v0 --input-bounds 0,1 --input-bounds 0,1 | input_bounds
 evaluate Scalar-v0 --start 1,2 | start has 2 numbers
 evaluate Scalar-v0 --start 1_0 | '1_0'
-evaluate StochasticDubins-v0 --start inwrd | did you mean 'inward'
 evaluate StochasticDubins-v0 --start 99,0,0 | outside the workspace
 evaluate Scalar-v0 --noise -1 | noise = -1
-evaluate Scalar-v0 --noise ٣ | '٣'
 evaluate Scalar-v0 --seed 1_0 | '1_0'
 evaluate Scalar-v0 --confidence 95 | confidence = 95
 evaluate Scalar-v0 --dt 0 | dt = 0
@@ -109,58 +107,44 @@ best Quadrotor-v0 | 12 coordinates
 best Scalar-v0 --cells 4x | --cells
 best Scalar-v0 --cells 40x40 --episodes 0 | cells
 best Scalar-v0 --leaving violations | did you mean 'violation'
-best Scalar-v0 --inputs 1 | inputs = 1
-best Scalar-v0 --table no/where.npz | no/where.npz
 best Scalar-v0 --plot x.txt | 'txt'
 best Scalar-v0 --measurement default | --measurement
 certify Quadrotor-v0 | 12 states
-certify Scalar-v0 --degree 0 | degree = 0
 certify Scalar-v0 --degree 6 --rate -1 | rate
 certify Scalar-v0 --degree 6 --policy random | random
 certify Scalar-v0 --held --policy nominal | --policy
 certify Scalar-v0 --held --substeps 2 | substeps = 2
 certify Scalar-v0 --degree 6 --out a.json --json a.json | two files
 certify Scalar-v0 --degree 6 --seed -1 | seed
-check | FILE
 check none.json | none.json
 check bad.json | JSON
 check changed.json | sha256
 check psi.json --state 0 | 2
-check psi.json --state 0,x | --state
 check psi.json --seconds 0 | seconds = 0
-check psi.json --json no/where.json | no/where.json
 check psi.json --json psi.json | would overwrite
 export Scalar-v0 --filter promise:p=0.9 --horizon 0.1 --out c --float32 | double precision
 export Scalar-v0 --filter promise:p=0.9 --horizon 0.1 --out c --objective clf | objective
 export Pendulum-v0 --filter scbf --out c --name 'a b' | a b
 export Pendulum-v0 --out no/such/c | no/such
-export Pendulum-v0 --out c --states 0 | states
 export DubinsDisk-v0 --filter backup --out c | simulates plans
 render Scalar-v0 --out r.png --seed -1 | --seed = -1
-render CubicSDEDisk-v0 --out run.gif --json run.gif | would overwrite the file of --out run.gif
-render CubicSDEDisk-v0 --out run.png --compare none,foo | 'foo'
 render CubicSDEDisk-v0 --out run.png --filter scbf --compare none | one of them
 render CubicSDEDisk-v0 --out run.avi | '.avi'
-render CubicSDEDisk-v0 --out missing/run.png | missing
+render CubicSDEDisk-v0 --out run.gif --json run.gif | would overwrite the file of --out run.gif
 study nothing Scalar-v0 --out found | filters-in-training
-study filters-in-training Nothing-v0 --out found | Nothing-v0
 study filters-in-training Scalar-v0 --against A3C --out found | A3C
 leaderboard ACC-v0 --all --out board | one of the two
 leaderboard ACC-v0 --algo pp --out board | did you mean
-leaderboard Scaler-v0 --out board | did you mean
 leaderboard ACC-v0 --page none.md --out board | none.md
 leaderboard Scalar-v0 --out . | earlier version
 leaderboard Scalar-v0 --out b --page deep.json | deep.json
 sweep pipe --out found | pipe
 sweep-report . | sweep
-demo --episodes 0 | --episodes = 0
 demo --folder own.py | own.py
 train Scalar-v0 --algo dqn --out run | dqn
 train Scalar-v0 --algo ppo --out own.py | own.py
 train Scalar-v0 --algo ppo --resume --out run | no training
-train Scalar-v0 --algo ppo --filter sbf --out run | sbf
 train Scalar-v0 --algo ppo --filter scbf --filter cbf --out run | one filter
-train Scalar-v0 --algo ppo --n-timesteps 0 --out run | n_timesteps = 0
 train Scalar-v0 --algo ppo --intervention-penalty 1 --out run | penalty
 train Scalar-v0 --algo sac --action best --out run | 'best'
 train Scalar-v0 --algo ppo --promise-curriculum 0.5 --out run | promise
@@ -174,15 +158,11 @@ train Scalar-v0 --algo ppo --out run --set gamma | gamma
 train Scalar-v0 --algo ppo --out run --set 'gamma=[1' | YAML
 train Scalar-v0 --algo ppo --out run --set gamma=2020-13-45 | '2020-13-45'
 train Scalar-v0 --algo ppo --out run --set n_steps=NESTED | nested
-identify Scalar-v0 --out l.npz | --method
 identify Scalar-v0 --method bayes --out l.npz | did you mean 'bayesian'
 identify Scalar-v0 --method bayesian --out l.npz --set start=1 | did you mean 'starts'
-identify Scalar-v0 --method bayesian --out l.npz --set degree | NAME=VALUE
 identify Scalar-v0 --method bayesian --out l.npz --set prior=wide | 'wide'
-identify Scalar-v0 --method bayesian --out l.npz --set degree=1.5 | degree
 identify DubinsDisk-v0 --method learned-hocbf --out l.npz --set hidden=8,wide | hidden
 identify Scalar-v0 --method ddscbf --out l.npz --set way=3 | '3'
-identify CubicSDEDisk-v0 --method bayesian --out l.npz --data missing.npz | missing.npz
 identify CubicSDEDisk-v0 --method bayesian --out l.npz --data damaged.npz | damaged.npz
 identify CubicSDEDisk-v0 --method bayesian --out l.npz --data other.npz | another problem
 identify CubicSDEDisk-v0 --method bayesian --out l.npz --data other.npz --set starts=1 | starts
@@ -191,12 +171,7 @@ identify Pendulum-v0 --method ddscbf --out l.npz --data model.npz | model.npz
 identify DubinsDisk-v0 --method learned-hocbf --out l.npz --data other.npz | --data
 identify --system own.py:problem --method bayesian --out l.npz | workspace
 verify CubicSDEDisk-v0 --filter none | 'none'
-verify CubicSDEDisk-v0 --filter '' | ''
-verify CubicSDEDisk-v0 --filter hocbf:alpha=1,2 | relative degree 1
 verify CubicSDEDisk-v0 --knowledge guess | guess
-verify CubicSDEDisk-v0 --episodes 0 | episodes = 0
-verify CubicSDEDisk-v0 --policy missing.zip --no-simulate | no such file
-verify CubicSDEDisk-v0 --plot found.xyz | xyz
 """
 LONG = {"LONG": "x" * 100_000, "DIGITS": "9" * 5000, "NESTED": "[" * 3000}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from rich.console import Console
 
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.attainable import chained
-from safe_envs.agents.evaluation.bounds import judged
 from safe_envs.agents.evaluation.results import EvaluationRow
 from safe_envs.scripts.reports.evaluation import print_evaluation
 from tests.agents.evaluation.made_up import attainable
@@ -175,50 +173,6 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
 def line_of(text, name):
     """Return the row of a filter in a table."""
     return next(line for line in text.splitlines() if line.startswith(f"{name} "))
-
-
-def test_bounds_are_shown_where_there_are_any():
-    answer = evaluate(
-        DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5
-    )
-
-    def printed(*changes):
-        console = Console(width=200, file=io.StringIO())
-        rows = [replace(row, **change) for row, change in zip(answer.rows, changes, strict=True)]
-        print_evaluation(console, replace(answer, rows=rows))
-        return console.file.getvalue()
-
-    nothing = {
-        "continuous_bound": None,
-        "continuous_word": "none",
-        "continuous_note": "it ignores the noise",
-    }
-    given = {"continuous_bound": 0.4929, "continuous_word": "estimated", "continuous_note": ""}
-    bounded = printed({}, nothing, given)
-    assert " 49.2 % est. " in line_of(bounded, "scbf")
-    assert not re.search("≥|>=|guaranteed", bounded.replace("{b_j >= 0}", ""))
-    assert "\nbound, held input: none of these has one\n" in bounded
-    assert "] 0 - " in " ".join(line_of(bounded, "hocbf").split())
-    assert "] 0 - " in " ".join(line_of(bounded, "none").split())
-    assert "Note: no bound, continuous control, for hocbf: it ignores the noise\n" in bounded
-    proved = printed({}, nothing, {**given, "continuous_word": "proved"})
-    assert " >= 49.2 % " in line_of(proved, "scbf")
-    assert "est.: " not in proved
-    assert proved.count("Note: continuous control, >=: proved at these starts") == 1
-    held = {"held_bound": 0.4929, "held_word": "proved", "held_note": "of a certificate"}
-    chain = printed({}, {**nothing, **held, "held_word": "computed"}, {**nothing, **held})
-    assert line_of(chain, "hocbf").split()[1:4] == ["49.2", "%", "comp."]
-    assert line_of(chain, "scbf").split()[1:4] == [">=", "49.2", "%"]
-    assert "Note: held input, scbf: proved, of a certificate\n" in chain
-    assert chain.count("bound, held input <= safe <= attainable") == 1
-    refuted = judged(replace(answer.rows[2], **{**given, "continuous_bound": 0.999}), 0.98, 0.98)
-    below = printed({}, nothing, vars(refuted))
-    assert (
-        "Note: no bound, continuous control, for scbf: withheld: the interval of the measured rate"
-        " ends at 98.0 %, below 99.9 %" in below
-    )
-    assert "] 0 withheld " in " ".join(line_of(below, "scbf").split())
-    assert "est.: " not in below
 
 
 def test_the_columns_read_as_a_chain():
