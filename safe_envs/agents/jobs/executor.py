@@ -8,18 +8,17 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, cast
 
 import cloudpickle
 
-from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings
-from safe_envs.agents.jobs.job import Job, JobOutcome, outcome_of
+from safe_envs.agents.jobs.clusters import dask_outcomes
+from safe_envs.agents.jobs.job import Job, JobOutcome, LossError, outcome_of
 from safe_envs.errors import (
     ConfigurationError,
-    SafeEnvsError,
     WorkersLostError,
     install_extra,
     nearest,
@@ -115,14 +114,6 @@ _IDLE = 30
 """Seconds after which a process of this machine ends that has nothing to do."""
 
 
-class _LossError(Exception):
-    """A worker ended, which may have been computing `jobs`."""
-
-    def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
-        super().__init__(reason)
-        self.jobs = jobs
-
-
 @dataclass(frozen=True)
 class Backend:
     """Where to compute.
@@ -205,14 +196,14 @@ def run(
                 try:
                     take(list(missing.values()))
                     break
-                except _LossError:
+                except LossError:
                     if not left:
                         raise
-        except _LossError as loss:
+        except LossError as loss:
             under_way = [job for job in loss.jobs if job.key in missing] if any_computed else []
             # A job that was alone need not be tried again; Dask names one of several.
             was_alone = len(under_way) == 1 and backend.backend != "dask"
-            error: _LossError | None = loss
+            error: LossError | None = loss
             for job in under_way or _spread(list(missing.values())):
                 error = loss if was_alone else _alone(job, take)
                 if error is not None:
@@ -229,11 +220,11 @@ def run(
                 ) from error
 
 
-def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> _LossError | None:
+def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> LossError | None:
     """Compute a job while no other is computed; return how its worker ended, if it did."""
     try:
         take([job])
-    except _LossError as error:
+    except LossError as error:
         return error
     return None
 
@@ -248,9 +239,12 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 def _outcomes(
     jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[JobOutcome, None, None]:
-    """Yield outcomes in the order of completion; raise _LossError where a worker ends."""
+    """Yield outcomes in the order of completion; raise LossError where a worker ends."""
     from joblib import Parallel, delayed
 
+    if backend.backend == "dask":
+        yield from dask_outcomes(jobs, str(backend.address), report)
+        return
     begun: list[Job] = []
 
     def tasks() -> Iterator[Any]:
@@ -258,38 +252,22 @@ def _outcomes(
             begun.append(job)
             yield delayed(outcome_of)(job)
 
-    with _settings(backend, len(jobs), report) as settings:
-        # One job is one task, so that each outcome is kept as soon as it exists.
-        parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
-        with (
-            closing(cast("Generator[JobOutcome, None, None]", parallel(tasks()))) as outcomes,
-            warnings.catch_warnings(),
-        ):
-            # joblib warns of tasks that nobody waits for, which closing this early intends.
-            warnings.simplefilter("ignore", UserWarning)
-            try:
-                yield from outcomes
-            except SafeEnvsError:
-                raise
-            except TaskLostError as error:
-                raise _LossError(_reason(error.reason), error.jobs) from error
-            except Exception as error:  # those of jobs are in their outcomes
-                raise _LossError(_reason(error), begun) from error
-
-
-def _reason(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
-
-
-@contextmanager
-def _settings(
-    backend: Backend, count: int, report: Callable[[str], None]
-) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of joblib for a backend, connected as long as the context lasts."""
-    if backend.backend == "local":
-        # A single job, too, has a process of its own where several are allowed.
-        jobs = 1 if backend.jobs == 1 else max(2, min(backend.jobs, count))
-        yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
-    else:
-        with dask_settings(str(backend.address), report) as settings:
-            yield settings
+    # A single job, too, has a process of its own where several are allowed.
+    processes = 1 if backend.jobs == 1 else max(2, min(backend.jobs, len(jobs)))
+    # One job is one task, so that each outcome is kept as soon as it exists.
+    parallel = Parallel(
+        processes,
+        backend=local_processes(_IDLE),
+        return_as="generator_unordered",
+        batch_size=1,  # pyright: ignore[reportArgumentType]
+    )
+    with (
+        closing(cast("Generator[JobOutcome, None, None]", parallel(tasks()))) as outcomes,
+        warnings.catch_warnings(),
+    ):
+        # joblib warns of tasks that nobody waits for, which closing this early intends.
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            yield from outcomes
+        except Exception as error:  # those of jobs are in their outcomes
+            raise LossError(error, begun) from error

@@ -19,7 +19,7 @@ import pytest
 
 from safe_envs.agents.jobs import clusters, executor
 from safe_envs.agents.jobs.executor import Backend, run
-from safe_envs.agents.jobs.job import Job, JobOutcome
+from safe_envs.agents.jobs.job import Job, JobOutcome, LossError
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow
@@ -81,7 +81,7 @@ def test_a_killed_worker_and_a_failing_job_cost_no_other(tmp_path: Path):
 
 
 JOBS = [Task(str(k)) for k in range(8)]
-ENDED = "the process that computed it ended: it went away"
+ENDED = "the process that computed it ended: OSError: it went away"
 
 
 class Pretended:
@@ -101,7 +101,7 @@ class Pretended:
         for k in range(0, len(jobs), 2):
             pair = jobs[k : k + 2]
             if self._ends({int(job.key) for job in pair}):
-                raise executor._LossError("it went away", jobs[: k + 2])
+                raise LossError(OSError("it went away"), jobs[: k + 2])
             yield from (JobOutcome(job.key, None, None, 0.0) for job in pair)
 
 
@@ -176,20 +176,17 @@ class Scheduler:
 
 
 def test_a_scheduler_that_has_lost_its_workers(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(clusters, "_LOOK", 0.001)
     monkeypatch.setattr(clusters, "_MOST_LOOKS", 3)
-    told, raised, ended = [], [], threading.Event()
-
-    def give_up(error: Exception) -> None:
-        raised.append(error)
-        ended.set()
-
+    told, looks = [], 0
     scheduler: Any = Scheduler(1, 0, OSError("busy"), 0, 1, 0, 0, 0)
-    clusters._watch(scheduler, "tcp://HOST:PORT", told.append, give_up, ended)
+    for expected in (0, 1, 1, 2, 0, 1, 2):
+        looks = clusters.looked(scheduler, "tcp://HOST:PORT", looks, told.append)
+        assert looks == expected
+    with pytest.raises(ConfigurationError, match="has had no workers"):
+        clusters.looked(scheduler, "tcp://HOST:PORT", looks, told.append)
     # Once each time that they went.
     assert len(told) == 2
     assert all("tcp://HOST:PORT has no workers" in each for each in told)
-    assert [type(each) for each in raised] == [ConfigurationError]
 
 
 @contextmanager
