@@ -242,16 +242,13 @@ def _draw_returns(
     """Draw a point of mean return over violations for each filter; cells of seeds are one point."""
     for k, kind in enumerate(_values(everything, str(layout.lines))):
         of_kind = _at(rows, layout.lines, kind)
-        rate = _rate(of_kind)
-        if rate is None:
-            continue
-        safe, low, high = rate
+        # What a panel lacks is in the legend all the same, which is that of the first panel.
+        safe, low, high = _rate(of_kind) or (math.nan, math.nan, math.nan)
+        returns = np.array([row["return_mean"] for row in of_kind] or [math.nan], dtype=float)
+        weights = [row["episodes"] for row in of_kind] or [1]
         axes.errorbar(
             1.0 - safe,
-            np.average(
-                [row["return_mean"] for row in of_kind],
-                weights=[row["episodes"] for row in of_kind],
-            ),
+            np.average(returns, weights=weights),
             xerr=[[high - safe], [safe - low]],
             color=WARM if is_unfiltered(kind) else COLORS[k % len(COLORS)],
             marker=mark_of(k),

@@ -138,6 +138,10 @@ def test_a_point_is_the_pooled_return_over_the_pooled_violations():
     ]
     assert axes.get_legend_handles_labels()[1] == list(PROMISES)
     assert unreadable(*figure_texts(figure)) == []
+    # A cell that one panel lacks stays in the legend, which is that of the first one.
+    rows = rows_of(env=["one", "two"], filter=PROMISES)[1:]
+    figure, _ = figure_of(rows, Layout.of(rows, ("env", "filter")), "double")
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [*PROMISES[1:], "none"]
 
 
 MANY = {
