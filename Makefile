@@ -2,7 +2,7 @@
 # make test        run the test suite
 # make check       run its quick part, after every edit
 # make oracle      run the long comparisons, with exact solutions and with stored results
-# make clusters    run sweeps on local Dask and Ray clusters
+# make clusters    run sweeps on a local Dask cluster
 # make mutants     check that the tests fail on faulty versions of the code
 # make golden      compare the output of commands and envs with stored results, when refactoring
 # make lint        check style, formatting, types and the layers of imports

@@ -7,14 +7,12 @@ does not.
 
 from safe_envs.scripts.figures.best import plot_attainable
 from safe_envs.scripts.figures.evaluation import plot_evaluation
-from safe_envs.scripts.figures.frontier import plot_frontier
 from safe_envs.scripts.figures.log import plot_log
 from safe_envs.scripts.figures.verify import plot_verification
 
 __all__ = [
     "plot_attainable",
     "plot_evaluation",
-    "plot_frontier",
     "plot_log",
     "plot_verification",
 ]

@@ -91,12 +91,6 @@ COMMANDS = tuple(
             "Check the certificate in a file: what it states, and whether that is so.",
         ),
         (
-            "frontier",
-            _PROVE,
-            "frontier:frontier",
-            "Print the largest returns that can be had at each risk, next to those of filters.",
-        ),
-        (
             "export",
             _SHOW,
             "export:export",
@@ -128,6 +122,8 @@ COMMANDS = tuple(
 """All commands, in the order of the help."""
 
 MOVED = {
+    "frontier": "`safe-envs sweep examples/frontier.yaml --out DIR --plot FILE`, over filters"
+    " promise:p=... at several p",
     "reproduce": "`python -m thesis` or `make thesis` in a checkout",
     "benchmark": "`python -m benchmarks` or `make benchmark` in a checkout",
 }

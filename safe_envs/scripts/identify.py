@@ -110,9 +110,9 @@ def identify(
     print_report(stdout(), found)
     write_result(json, found.document)
     if plot is not None:
-        from safe_envs.scripts.figures.identify import draw
+        from safe_envs.scripts.figures.identify import plot_identification
 
-        draw(found, plot, size)
+        plot_identification(found, plot, size=size)
 
 
 def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Transitions:

@@ -85,9 +85,8 @@ def leaderboard(
         typer.Option(
             "--best",
             help=(
-                "Compute the best attainable safety of each env, and the largest return at each"
-                " probability of a violation. Otherwise only results of this command that were"
-                " computed before are shown."
+                "Compute the best attainable safety of each env. Otherwise only results of this"
+                " command that were computed before are shown."
             ),
         ),
     ] = False,
@@ -183,7 +182,6 @@ def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
     from safe_envs.agents.training.leaderboard import (
         attainable_of,
         entry_of,
-        frontiers_of,
         safety_over_envs,
     )
     from safe_envs.scripts.reports.leaderboard import LeaderboardReport
@@ -194,14 +192,11 @@ def _report(found: Any, out: Path, best: bool) -> LeaderboardReport:
     ]
     with progress_bar("Best attainable safety") as tell:
         known = attainable_of(study.env_ids, out, best, tell or (lambda _: None))
-    with progress_bar("Largest returns") as tell:
-        frontiers = frontiers_of(study.env_ids, out, best, tell or (lambda _: None))
     return LeaderboardReport(
         found,
         tuple(entry for entry in entries if entry is not None),
         safety_over_envs(found),
         known,
-        frontiers,
     )
 
 
@@ -215,9 +210,8 @@ def _draw(report: LeaderboardReport, folder: Path) -> None:
     for env_id in study.env_ids:
         rows = [row for row in report.found.rows if row.env_id == env_id]
         if rows:
-            frontier = report.frontiers.get(env_id)
             path = _picture(folder, env_id)
-            draw(short_name(env_id), report.of(env_id), rows, frontier, variants, path)
+            draw(short_name(env_id), report.of(env_id), rows, variants, path)
 
 
 def _picture(folder: Path, env_id: str) -> Path:

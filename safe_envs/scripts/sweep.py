@@ -12,7 +12,6 @@ from safe_envs.scripts.options import early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
-    require_result,
     run_jobs,
     say,
     stdout,
@@ -44,20 +43,23 @@ def sweep(
     backend: Annotated[
         str,
         typer.Option(
-            metavar="local|dask|ray",
-            help="Who computes: this machine, or the workers of a cluster.",
+            metavar="local|dask",
+            help="Who computes: this machine, or the workers of a Dask cluster.",
         ),
     ] = "local",
     address: Annotated[
         str | None,
         typer.Option(
             metavar="ADDR",
-            help="Of the cluster: tcp://HOST:PORT of a Dask scheduler, HOST:PORT of Ray.",
+            help="Of the Dask scheduler: tcp://HOST:PORT.",
         ),
     ] = None,
     trust: text_options.Trust = False,
     engine: text_options.Engine = "auto",
     json: Json = None,
+    plot: Annotated[
+        Path | None, text_options.plot_option("Draw what sweep-report draws of the cells")
+    ] = None,
 ) -> None:
     """Evaluate each cell of a sweep: one env, filter, policy, seed and set of parameters.
 
@@ -72,7 +74,7 @@ def sweep(
     from safe_envs.agents.sweeps.store import Store
     from safe_envs.scripts.reports.sweep import failures_text, sweep_document
 
-    require_result(json)
+    text_options.require_outputs(json, plot, inputs=[("SPEC", spec)])
     if jobs is not None and backend != "local":
         raise ConfigurationError(
             f"--jobs {jobs} is of this machine; with --backend {backend} all workers of the cluster"
@@ -97,6 +99,11 @@ def sweep(
         )
         say(stdout(), f"Note: {hidden}; give each sweep a folder of its own.")
     counts = {"cells": len(found.cells), "done": done, "before": before}
+    if plot is not None:
+        from safe_envs.agents.sweeps.store import read
+        from safe_envs.scripts.figures.sweep import draw
+
+        say(stdout(), draw(read(out).to_pylist(), found.swept, plot))
     write_result(json, lambda: {**counts, **sweep_document(found, failures)})
     if failures:
         raise ConfigurationError(failures_text(found, failures))

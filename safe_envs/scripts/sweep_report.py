@@ -62,10 +62,11 @@ def sweep_report(
 
     Every combination of the settings that are neither across nor lines has a panel. Seeds are
     pooled: their episodes are independent. If each seed learned its filter again, the band is
-    over what was learned too.
+    over what was learned too. Where promise filters at several p are the only numbers that were
+    swept, the mean return is drawn over the violations.
     """
     from safe_envs.agents.sweeps.store import read, read_index
-    from safe_envs.scripts.figures.sweep import Layout, draw
+    from safe_envs.scripts.figures.sweep import draw
     from safe_envs.scripts.reports.sweep import print_cells, report_document
 
     path = plot or folder / _PICTURE
@@ -83,18 +84,8 @@ def sweep_report(
             raise ConfigurationError(f"{option} {name}: it was not swept; {advice}")
     if x is not None and x == lines:
         raise ConfigurationError(f"--x and --lines are both {x}; name two settings")
-    done = [row for row in rows if row["error"] is None]
     print_cells(stdout(), index, rows, worst)
-    if done:
-        layout = Layout.of(done, swept, x, lines)
-        hidden = draw(done, layout, path, size)
-        picture = f"The picture: {path}" + (
-            f" (without {hidden} of its panels, which are too many; sweep less, or choose --x and"
-            " --lines)" * bool(hidden)
-        )
-    else:
-        picture = "There is no picture, since no cell is done."
-    say(stdout(), f"\n{picture}")
+    say(stdout(), f"\n{draw(rows, swept, path, size, x, lines)}")
     write_result(json, lambda: report_document(index, rows, worst))
 
 

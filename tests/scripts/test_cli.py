@@ -37,15 +37,6 @@ def test_list_shows_every_id(safe_envs_command):
         assert env_id in out
 
 
-def test_help_names_the_commands(safe_envs_command):
-    status, out, _ = safe_envs_command("--help")
-    assert status == 0
-    for command in ("list", "evaluate", "verify", "demo"):
-        assert command in out
-    for command in ("evaluate", "verify", "demo"):
-        assert safe_envs_command(command, "--help")[0] == 0
-
-
 @pytest.mark.parametrize("command", cli.MOVED)
 @pytest.mark.parametrize("more", [(), ("--help",), ("all", "--quick")])
 def test_a_command_that_has_moved_says_where_to(safe_envs_command, command, more):

@@ -6,7 +6,6 @@ import pytest
 
 from tests.scripts.conftest import strictly
 
-DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--episodes", 12, "--horizon", 0.5, "--measurement", "default", "--estimator", "ekf")
 ROWS = ["scbf@state", "scbf", "scbf:belief=0.05"]
 
@@ -15,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("coarse_bounds")
 
 def test_a_filter_is_compared_at_states_estimates_and_beliefs(safe_envs_command, tmp_path):
     given = (*QUICK, "--json", tmp_path / "out.json")
-    status, out, _ = safe_envs_command("evaluate Pendulum-v0 --filter scbf", *given)
+    status, out, _ = safe_envs_command("evaluate Scalar-v0 --filter scbf", *given)
     assert status == 0
     document = strictly(tmp_path / "out.json")
     assert [row["filter"] for row in document["rows"]] == ROWS
@@ -33,7 +32,7 @@ def test_a_filter_is_compared_at_states_estimates_and_beliefs(safe_envs_command,
 
 def test_without_a_filter_nothing_intervenes_at_states_and_at_estimates(safe_envs_command):
     given = (*QUICK, "--no-bounds", "--json", "out.json")
-    status, out, _ = safe_envs_command("evaluate", DUBINS, "--filter none --filter scbf", *given)
+    status, out, _ = safe_envs_command("evaluate Scalar-v0 --filter none --filter scbf", *given)
     assert status == 0
     rows = strictly("out.json")["rows"]
     assert [(row["filter"], row["kind"]) for row in rows] == [

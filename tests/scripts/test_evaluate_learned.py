@@ -31,21 +31,6 @@ def learned(safe_envs_command, tmp_path):
     return tmp_path / "disk.npz"
 
 
-def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
-    status, out, err = evaluate("--filter scbf --filter bayesian-scbf --json out.json --timing")
-    assert (status, err) == (0, "")
-    document = strictly("out.json")
-    plain, row = document["rows"]
-    assert plain["learning"] is None
-    assert row["learning"]["transitions"] == 200_000
-    assert (row["learning"]["repeats"], row["learning"]["seeds"]) == (1, [0])
-    plainly, learned = (timed["learning_seconds"] for timed in document["timing"]["rows"])
-    assert plainly is None
-    assert f"{learned:.2f} s" in out
-    assert "bayesian-scbf was learned from 200,000 transitions." in out
-    assert "worst" not in out
-
-
 @pytest.mark.slow
 def test_a_file_is_used_in_its_place(evaluate, learned):
     filters = "--filter bayesian-scbf --filter bayesian-scbf:confidence=0.9"
@@ -75,11 +60,15 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
 @pytest.mark.slow
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
     filters = "--filter scbf --filter bayesian-scbf --filter bayesian-scbf:simultaneous=0.9"
-    status, out, err = evaluate(filters, "--repeats 2 --json out.json")
+    status, out, err = evaluate(filters, "--repeats 2 --timing --json out.json")
     assert (status, err) == (0, "")
     document = strictly("out.json")
     assert document["config"]["repeats"] == 2
-    _, row, robust = document["rows"]
+    plain, row, robust = document["rows"]
+    assert (plain["learning"], row["learning"]["transitions"]) == (None, 200_000)
+    unlearned, learned, _ = (timed["learning_seconds"] for timed in document["timing"]["rows"])
+    assert unlearned is None
+    assert f"{learned:.2f} s" in out
     assert f"{100 * min(row['learning']['rates']):.1f} %" in out
     assert row["episodes"] == 40
     bound = robust["posterior_bound"]

@@ -77,6 +77,6 @@ def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
     assert status == 0
     assert "horizon 0.2 s, monitored continuously" in out
     status, out, _ = safe_envs_command(
-        "evaluate Scalar-v0 --filter none --rare --monitoring continuous", *FEW
+        "evaluate Scalar-v0 --horizon 0.2 --filter none --rare --monitoring continuous", *FEW
     )
     assert "monitored continuously" in out

@@ -42,8 +42,9 @@ def spec(tmp_path: Path) -> Path:
 
 
 def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tmp_path: Path):
-    status, out, _ = safe_envs_command("sweep", spec, "--out done --jobs 1")
-    assert (status, out) == (0, "8 of 8 cells are in done.\n")
+    status, out, _ = safe_envs_command("sweep", spec, "--out done --jobs 1 --plot rates.svg")
+    assert (status, out) == (0, "8 of 8 cells are in done.\nThe picture: rates.svg\n")
+    assert "noise" in (tmp_path / "rates.svg").read_text()
     spec.write_text(SPEC.replace("[0, 1]", "[0, 1, 2]"))
     status, out, _ = safe_envs_command("sweep", spec, "--out done --jobs 1")
     assert (status, out) == (0, "12 of 12 cells are in done, of which 8 were there before.\n")

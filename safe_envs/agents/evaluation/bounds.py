@@ -150,7 +150,7 @@ _FORMULAS = ("nominal", "zero")
 class ClosedLoopBound(HeldInputBound):
     """What a table of a closed loop says of a controller, or of every policy under a filter.
 
-    It holds up to the horizon of the problem, as proposition 9 of the page on values proves.
+    It holds up to the horizon of the problem, as proposition 8 of the page on values proves.
 
     Args:
         table: of the closed loop; None where there is none.

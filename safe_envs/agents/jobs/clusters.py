@@ -1,16 +1,14 @@
-"""joblib's backends for Dask and Ray, which report the loss of a worker to joblib."""
+"""Jobs on the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
-import logging
 import re
 import socket
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+import time
+from collections.abc import Callable, Generator, Sequence
+from typing import TYPE_CHECKING
 
-from safe_envs.agents.jobs.job import Job
+from safe_envs.agents.jobs.job import Job, JobOutcome, LossError, outcome_of
 from safe_envs.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -19,71 +17,57 @@ if TYPE_CHECKING:
 _PATIENCE = 15
 """Seconds to wait for a scheduler, and for its first worker."""
 
+_POLL = 0.05
+"""Seconds between two looks at whether a job has ended."""
+
 _LOOK = 5.0
 """Seconds between two looks at whether a scheduler still has workers."""
 
 _MOST_LOOKS = 60
 """Looks in a row without workers after which to give up."""
 
-_RETRIES = 2
-"""How often Ray starts a job again whose worker ended; Dask has a setting of its own for this."""
 
-
-class TaskLostError(Exception):
-    """A task ended outside of its function, as with its worker.
-
-    Attributes:
-        reason: what the cluster reports.
-        jobs: those of the task.
-    """
-
-    def __init__(self, reason: BaseException, jobs: Sequence[Job]) -> None:
-        super().__init__(str(reason))
-        self.reason, self.jobs = reason, jobs
-
-
-@contextmanager
-def dask_settings(address: str, report: Callable[[str], None]) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of `joblib.Parallel` for a Dask scheduler.
+def dask_outcomes(
+    jobs: Sequence[Job], address: str, report: Callable[[str], None]
+) -> Generator[JobOutcome, None, None]:
+    """Yield outcomes in the order of completion.
 
     Args:
+        jobs: what to compute.
         address: of the scheduler.
-        report: receives a message when it has lost all its workers. If none come for minutes,
-            joblib raises ConfigurationError.
+        report: receives a message when it has lost all its workers.
 
     Raises:
-        ConfigurationError: there is no scheduler, or it has no workers.
+        ConfigurationError: there is no scheduler, it has no workers, or none come for minutes after
+            it has lost them.
+        LossError: a job ended outside of its function, as with its worker.
     """
+    from distributed import as_completed
+
+    with _connected(address) as client:
+        # All at once: workers that come later get some, too.
+        job_of = dict(zip(client.map(outcome_of, jobs, pure=False), jobs, strict=True))
+        ended = as_completed(job_of, loop=client.loop)
+        looks, next_look = 0, time.monotonic() + _LOOK
+        while not ended.is_empty():
+            if not ended.has_ready():
+                time.sleep(_POLL)
+                if time.monotonic() >= next_look:
+                    looks = looked(client, address, looks, report)
+                    next_look = time.monotonic() + _LOOK
+                continue
+            for future in ended.next_batch(block=False):
+                job = job_of.pop(future)
+                try:
+                    outcome = future.result()
+                except Exception as error:  # those of the job itself are in its outcome
+                    raise LossError(error, [job]) from error
+                yield outcome
+
+
+def _connected(address: str) -> Client:
+    """Return the client of a scheduler that has workers."""
     from distributed import Client
-    from joblib._dask import DaskDistributedBackend
-
-    class Dask(DaskDistributedBackend):
-        def __init__(self, client: Client) -> None:
-            super().__init__(client=client)
-            self._waiting: dict[Any, Callable[[Any], None]] = {}
-
-        def effective_n_jobs(self, n_jobs: int) -> int:
-            # joblib computes in this process where there is one worker.
-            return max(super().effective_n_jobs(n_jobs), 2)
-
-        def submit(self, func: Any, callback: Callable[[Any], None] | None = None) -> Any:
-            future = super().submit(func, callback)
-            if callback is not None:
-                self._waiting[future] = callback
-                future.add_done_callback(
-                    lambda done: self._end(done, [args[0] for _, args, _ in func.items])
-                )
-            return future
-
-        def _end(self, done: Any, jobs: Sequence[Job]) -> None:
-            callback, error = self._waiting.pop(done), done.exception()
-            if error is not None:
-                # joblib would never hear of a task that ended outside of its function.
-                callback(TaskLostError(error, jobs))
-
-        def give_up(self, error: Exception) -> None:
-            for callback in list(self._waiting.values())[:1]:
-                callback(error)
 
     try:
         _require_listener(re.sub("^(tcp|tls|ucx)://", "", address))
@@ -92,87 +76,53 @@ def dask_settings(address: str, report: Callable[[str], None]) -> Iterator[dict[
         raise ConfigurationError(
             f"no Dask scheduler answers at {address} ({error}); start one by: dask scheduler"
         ) from error
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=_PATIENCE)
-        except TimeoutError as error:
-            raise ConfigurationError(
-                f"the Dask scheduler at {address} has no workers; start some by: dask worker"
-                f" {address}"
-            ) from error
-        backend, ended = Dask(client), threading.Event()
-        watch = threading.Thread(
-            target=_watch, args=(client, address, report, backend.give_up, ended), daemon=True
-        )
-        watch.start()
-        try:
-            # All at once: workers that come later get some, too.
-            yield {"backend": backend, "n_jobs": -1, "pre_dispatch": "all"}
-        finally:
-            ended.set()
+    try:
+        client.wait_for_workers(1, timeout=_PATIENCE)
+    except TimeoutError as error:
+        client.close()
+        raise ConfigurationError(
+            f"the Dask scheduler at {address} has no workers; start some by: dask worker {address}"
+        ) from error
+    return client
 
 
-def _watch(
-    client: Client,
-    address: str,
-    report: Callable[[str], None],
-    give_up: Callable[[Exception], None],
-    ended: threading.Event,
-) -> None:
-    """Report once that a scheduler has no workers, and give up when none come."""
-    looks = 0
-    while not ended.wait(_LOOK):
-        try:
-            looks = 0 if client.nthreads() else looks + 1
-        except Exception:  # the end of the scheduler itself is reported with the tasks
-            continue
-        if ended.is_set():
-            return
-        if looks == 1:
-            report(
-                f"The Dask scheduler at {address} has no workers any more; waiting for some. Start"
-                f" them by: dask worker {address}"
-            )
-        if looks == _MOST_LOOKS:
-            minutes = _LOOK * _MOST_LOOKS / 60
-            message = (
-                f"the Dask scheduler at {address} has had no workers for {minutes:g} minutes; start"
-                f" some by: dask worker {address}"
-            )
-            give_up(ConfigurationError(f"{message}, and start again: what was computed is kept"))
+def looked(client: Client, address: str, looks: int, report: Callable[[str], None]) -> int:
+    """Look whether a scheduler has workers; report once that it has none.
 
+    Args:
+        client: of the scheduler.
+        address: of the scheduler.
+        looks: how often in a row it had none.
+        report: receives the message.
 
-@contextmanager
-def ray_settings(address: str) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of `joblib.Parallel` for a Ray cluster.
+    Returns:
+        How often in a row it has none now.
 
     Raises:
-        ConfigurationError: it cannot be reached.
+        ConfigurationError: it has had none for minutes.
     """
-    import ray
-    from ray.util.joblib.ray_backend import RayBackend
-
-    class Ray(RayBackend):
-        supports_return_generator = True
-
     try:
-        _require_listener(address)
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-    except (OSError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+        if client.nthreads():
+            return 0
+    except Exception:  # the end of the scheduler itself is reported with the jobs
+        return looks
+    if not looks:
+        report(
+            f"The Dask scheduler at {address} has no workers any more; waiting for some. Start"
+            f" them by: dask worker {address}"
+        )
+    if looks + 1 >= _MOST_LOOKS:
         raise ConfigurationError(
-            f"no Ray cluster answers at {address} ({reason}); start one by: ray start --head"
-        ) from error
-    try:
-        remote = {"max_restarts": -1, "max_task_retries": _RETRIES}
-        yield {"backend": Ray(ray_remote_args=remote), "n_jobs": -1}
-    finally:
-        ray.shutdown()
+            f"the Dask scheduler at {address} has had no workers for"
+            f" {_LOOK * _MOST_LOOKS / 60:g} minutes; start some by: dask worker {address}, and"
+            " start again: what was computed is kept"
+        )
+    return looks + 1
 
 
 def _require_listener(address: str) -> None:
     """Raise OSError unless something listens at HOST:PORT, and ValueError for another form."""
-    # The clients of the clusters would try for minutes.
+    # Dask's client would try for minutes.
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and "/" not in host):
         raise ValueError("this is not of the form HOST:PORT")

@@ -1,4 +1,4 @@
-"""The runner of independent jobs: in processes of this machine, on a Dask or a Ray cluster."""
+"""The runner of independent jobs: in processes of this machine, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, cast
 
 import cloudpickle
 
-from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings, ray_settings
-from safe_envs.agents.jobs.job import Job, JobOutcome, outcome_of
+from safe_envs.agents.jobs.clusters import dask_outcomes
+from safe_envs.agents.jobs.job import Job, JobOutcome, LossError, outcome_of
 from safe_envs.errors import (
     ConfigurationError,
-    SafeEnvsError,
     WorkersLostError,
     install_extra,
     nearest,
@@ -102,11 +101,11 @@ def _unpacked(function: Callable[..., Any], sent: bytes, part: Any) -> Any:
     return function(cloudpickle.loads(sent), part)
 
 
-BACKENDS = ("local", "dask", "ray")
+BACKENDS = ("local", "dask")
 
 _MOST_LOSSES = 3
-"""How often processes of this machine may end before jobs are computed one by one; clusters retry
-by themselves."""
+"""How often processes of this machine may end before jobs are computed one by one; Dask retries by
+itself."""
 
 _MOST_TRIED = 5
 """How many jobs are tried, one by one, before none is taken to be computable."""
@@ -115,26 +114,18 @@ _IDLE = 30
 """Seconds after which a process of this machine ends that has nothing to do."""
 
 
-class _LossError(Exception):
-    """A worker ended, which may have been computing `jobs`."""
-
-    def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
-        super().__init__(reason)
-        self.jobs = jobs
-
-
 @dataclass(frozen=True)
 class Backend:
     """Where to compute.
 
     Attributes:
         backend: one of `BACKENDS`.
-        address: of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
+        address: of a Dask scheduler, tcp://HOST:PORT.
         jobs: number of processes of this machine, for "local"; a cluster uses all its workers.
 
     Raises:
-        ConfigurationError: the backend is unknown, an address is missing or does not apply, or a
-            package is not installed.
+        ConfigurationError: the backend is unknown, an address is missing or does not apply, or Dask
+            is not installed.
     """
 
     backend: str = "local"
@@ -143,20 +134,23 @@ class Backend:
 
     def __post_init__(self) -> None:
         require_whole("jobs", self.jobs, 1)
+        if self.backend == "ray":
+            raise ConfigurationError(
+                "backend = 'ray' is gone; use dask, or local processes of this machine"
+            )
         if self.backend not in BACKENDS:
             raise ConfigurationError(
                 f"backend = {self.backend!r}; {nearest(self.backend, BACKENDS)}"
             )
         if (self.address is None) != (self.backend == "local"):
             wrong = (
-                "needs the address of its cluster"
+                "needs the address of its scheduler"
                 if self.address is None
-                else "takes no address; name dask or ray as the backend"
+                else "takes no address; name dask as the backend"
             )
             raise ConfigurationError(f"backend {self.backend} {wrong}")
-        package = {"dask": "distributed", "ray": "ray"}.get(self.backend)
-        if package is not None and find_spec(package) is None:
-            raise ConfigurationError(f"{package} is not installed; {install_extra(self.backend)}")
+        if self.backend == "dask" and find_spec("distributed") is None:
+            raise ConfigurationError(f"distributed is not installed; {install_extra('dask')}")
 
 
 def run(
@@ -202,14 +196,14 @@ def run(
                 try:
                     take(list(missing.values()))
                     break
-                except _LossError:
+                except LossError:
                     if not left:
                         raise
-        except _LossError as loss:
+        except LossError as loss:
             under_way = [job for job in loss.jobs if job.key in missing] if any_computed else []
             # A job that was alone need not be tried again; Dask names one of several.
             was_alone = len(under_way) == 1 and backend.backend != "dask"
-            error: _LossError | None = loss
+            error: LossError | None = loss
             for job in under_way or _spread(list(missing.values())):
                 error = loss if was_alone else _alone(job, take)
                 if error is not None:
@@ -226,11 +220,11 @@ def run(
                 ) from error
 
 
-def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> _LossError | None:
+def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> LossError | None:
     """Compute a job while no other is computed; return how its worker ended, if it did."""
     try:
         take([job])
-    except _LossError as error:
+    except LossError as error:
         return error
     return None
 
@@ -245,9 +239,12 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 def _outcomes(
     jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[JobOutcome, None, None]:
-    """Yield outcomes in the order of completion; raise _LossError where a worker ends."""
+    """Yield outcomes in the order of completion; raise LossError where a worker ends."""
     from joblib import Parallel, delayed
 
+    if backend.backend == "dask":
+        yield from dask_outcomes(jobs, str(backend.address), report)
+        return
     begun: list[Job] = []
 
     def tasks() -> Iterator[Any]:
@@ -255,41 +252,22 @@ def _outcomes(
             begun.append(job)
             yield delayed(outcome_of)(job)
 
-    with _settings(backend, len(jobs), report) as settings:
-        # One job is one task, so that each outcome is kept as soon as it exists.
-        parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
-        with (
-            closing(cast("Generator[JobOutcome, None, None]", parallel(tasks()))) as outcomes,
-            warnings.catch_warnings(),
-        ):
-            # joblib warns of tasks that nobody waits for, which closing this early intends.
-            warnings.simplefilter("ignore", UserWarning)
-            try:
-                yield from outcomes
-            except SafeEnvsError:
-                raise
-            except TaskLostError as error:
-                raise _LossError(_reason(error.reason), error.jobs) from error
-            except Exception as error:  # those of jobs are in their outcomes
-                raise _LossError(_reason(error), begun) from error
-
-
-def _reason(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
-
-
-@contextmanager
-def _settings(
-    backend: Backend, count: int, report: Callable[[str], None]
-) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of joblib for a backend, connected as long as the context lasts."""
-    if backend.backend == "local":
-        # A single job, too, has a process of its own where several are allowed.
-        jobs = 1 if backend.jobs == 1 else max(2, min(backend.jobs, count))
-        yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
-    elif backend.backend == "dask":
-        with dask_settings(str(backend.address), report) as settings:
-            yield settings
-    else:
-        with ray_settings(str(backend.address)) as settings:
-            yield settings
+    # A single job, too, has a process of its own where several are allowed.
+    processes = 1 if backend.jobs == 1 else max(2, min(backend.jobs, len(jobs)))
+    # One job is one task, so that each outcome is kept as soon as it exists.
+    parallel = Parallel(
+        processes,
+        backend=local_processes(_IDLE),
+        return_as="generator_unordered",
+        batch_size=1,  # pyright: ignore[reportArgumentType]
+    )
+    with (
+        closing(cast("Generator[JobOutcome, None, None]", parallel(tasks()))) as outcomes,
+        warnings.catch_warnings(),
+    ):
+        # joblib warns of tasks that nobody waits for, which closing this early intends.
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            yield from outcomes
+        except Exception as error:  # those of jobs are in their outcomes
+            raise LossError(error, begun) from error

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -76,6 +76,19 @@ class JobOutcome:
     result: Any
     error: str | None
     seconds: float
+
+
+class LossError(Exception):
+    """A worker ended, which may have been computing `jobs`.
+
+    Args:
+        error: by which it is known.
+        jobs: of the worker.
+    """
+
+    def __init__(self, error: BaseException, jobs: Sequence[Job]) -> None:
+        super().__init__(f"{type(error).__name__}: {error}".splitlines()[0].rstrip("."))
+        self.jobs = jobs
 
 
 def outcome_of(job: Job) -> JobOutcome:

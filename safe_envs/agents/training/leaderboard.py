@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from safe_envs.agents.evaluation.attainable import (
     best_for,
     evaluation_settings,
 )
-from safe_envs.agents.evaluation.frontier import Frontier
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.jobs.store import ResultStore, package_versions, reading
 from safe_envs.agents.training.hyperparameters import ALGORITHMS
@@ -27,7 +26,6 @@ from safe_envs.agents.training.study import (
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.systems import ENV_IDS
-from safe_envs.values.frontier import FrontierSettings, price_violations
 
 LIMIT = 0.01
 """Chance of a violation that the constrained agent and the promise filter are asked to keep."""
@@ -171,50 +169,6 @@ def safety_over_envs(found: StudyResult) -> dict[str, SeedEstimate]:
         if all(strata):
             safety[variant.name] = over_seeds(strata)
     return safety
-
-
-def frontiers_of(
-    env_ids: Sequence[str], out: Path, compute: bool, progress: Callable[[float], None]
-) -> dict[str, Mapping[str, list[float]]]:
-    """Return the largest returns at each chance of a violation, of the envs that have such a curve.
-
-    Args:
-        env_ids: full ids.
-        out: folder of the leaderboard, which keeps them.
-        compute: compute what is missing.
-        progress: receives the part of the work that is done, from 0 to 1.
-
-    Returns:
-        By id "violations" and "returns", as `Frontier.curve` tells them.
-
-    Raises:
-        ConfigurationError: the folder has a file that is damaged.
-    """
-    store, found = ResultStore(out / "frontiers"), {}
-    settings = FrontierSettings(policies=0, leaving="safe")
-    for k, env_id in enumerate(env_ids):
-        key = env_id.rpartition("/")[2]
-        configuration = {
-            "env_id": env_id,
-            "settings": asdict(settings),
-            "versions": package_versions(),
-        }
-        document = store.read(key, configuration)
-        if document is None and compute:
-            problem = make_problem(env_id)
-            try:
-                values = price_violations(
-                    problem, settings, lambda part, k=k: progress((k + part) / len(env_ids))
-                )
-            except ConfigurationError:
-                continue  # No grid serves it: `attainable_of` tells why.
-            chances, returns = Frontier(problem, values, [], [], {}, 0.95).curve()
-            document = {"violations": chances.tolist(), "returns": returns.tolist()}
-            store.keep(key, configuration, document)
-        if document is not None:
-            with reading(store.path(key)):
-                found[env_id] = {name: document[name] for name in ("violations", "returns")}
-    return found
 
 
 def attainable_of(

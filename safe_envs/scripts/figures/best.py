@@ -31,6 +31,7 @@ from safe_envs.scripts.figures.style import (
     labelled,
     mathematics,
     plain,
+    runs,
     wrapped,
 )
 from safe_envs.scripts.options.evaluation_options import DEFAULT_SIZE, width_of
@@ -68,24 +69,6 @@ def plot_attainable(
     Raises:
         ConfigurationError: The file cannot be written, or there is no such size.
     """
-    named = title or policy.problem.name
-    return finished(figure_of(found, policy, named, size), out)
-
-
-def figure_of(
-    found: AttainableSafety, policy: BestPolicy, named: str, size: str = DEFAULT_SIZE
-) -> StyledFigure:
-    """Return the figure of the value at the start of an episode.
-
-    Args:
-        found: to draw.
-        policy: with the table.
-        named: how the env is called.
-        size: as for `plot_attainable`.
-
-    Raises:
-        ConfigurationError: there is no such size.
-    """
     width = width_of(size)
     problem, table = policy.problem, policy.table
     shape, axes = table.grid.shape, table.grid.axes
@@ -113,14 +96,14 @@ def figure_of(
             f"{expression(name, unitless)} = {0.5 * (axis.edges[i] + axis.edges[i + 1]):.3g}"
             for name, axis, i in zip(found.coordinates[2:], axes[2:], middle, strict=True)
         ]
-        title = "Best attainable safety from each start"
-        title += f"; {', '.join(held)}" * bool(held)
-        panel.set_title(wrapped(figure, title, mpl.rcParams["axes.titlesize"], 0.75 * width))
+        heading = "Best attainable safety from each start"
+        heading += f"; {', '.join(held)}" * bool(held)
+        panel.set_title(wrapped(figure, heading, mpl.rcParams["axes.titlesize"], 0.75 * width))
         add_legend(figure, handles)
         said = f"from the starts {best_text(found)}" if found.lower is not None else "withheld"
-        title = plain(f"{named}: {said}", 200)
-        add_title(figure, f"{title}\n{mathematics(describe_system(problem))}")
-    return figure
+        heading = plain(f"{title or problem.name}: {said}", 200)
+        add_title(figure, f"{heading}\n{mathematics(describe_system(problem))}")
+    return finished(figure, out)
 
 
 def _draw_curve(panel: Axes, edges: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[Any]:
@@ -128,7 +111,7 @@ def _draw_curve(panel: Axes, edges: np.ndarray, lower: np.ndarray, upper: np.nda
     panel.stairs(upper, edges, baseline=lower, fill=True, color=COLORS[0], alpha=0.25)
     panel.stairs(lower, edges, baseline=None, color=COLORS[0], linewidth=1.2)
     panel.stairs(upper, edges, baseline=None, color=COLORS[0], linewidth=0.8, linestyle="--")
-    for start, end in _runs(lower >= LEVEL):
+    for start, end in runs(lower >= LEVEL):
         panel.axvspan(edges[start], edges[end], color=WARM, alpha=0.15, linewidth=0)
     panel.axhline(LEVEL, color=QUIET, linewidth=0.6, linestyle=":")
     panel.set_ylim(-0.02, 1.02)
@@ -177,9 +160,3 @@ def _draw_plane(
         Line2D([], [], color=WARM, linewidth=1.0, linestyle="--", label="at most there (upper)"),
         Patch(color=UNSAFE, label="0 %"),
     ]
-
-
-def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and the one after the last place of each run of True."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))

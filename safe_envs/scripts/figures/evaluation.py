@@ -176,19 +176,6 @@ def plot_evaluation(
         raise ConfigurationError(
             "the evaluation recorded no trajectories to draw; evaluate with record=True"
         )
-    return finished(figure_of(evaluation, size), out)
-
-
-def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> StyledFigure:
-    """Return the figure of an evaluation that recorded trajectories.
-
-    Args:
-        evaluation: to draw.
-        size: as for `plot_evaluation`.
-
-    Raises:
-        ConfigurationError: there is no such size.
-    """
     problem, config = evaluation.problem, evaluation.config
     width, looks = width_of(size), _looks(evaluation)
     with mpl.rc_context(STYLE):
@@ -214,7 +201,7 @@ def figure_of(evaluation: Evaluation, size: str = DEFAULT_SIZE) -> StyledFigure:
         add_legend(figure, [*handles, unsafe, *_handles_of(evaluation, episodes, panels)])
         title = f"{evaluation.title}, {_policy_name(Path(config['policy']['name']))} policy"
         add_title(figure, f"{plain(title, 200)}\n{mathematics(describe_system(problem))}")
-    return figure
+    return finished(figure, out)
 
 
 def _first_episodes(evaluation: Evaluation, looks: _Looks, most: int) -> dict[str, LogPanels]:

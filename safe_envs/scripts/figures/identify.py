@@ -9,7 +9,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -20,12 +19,13 @@ from safe_envs.scripts.figures.style import (
     COLORS,
     STYLE,
     WARM,
+    StyledFigure,
     add_legend,
     add_title,
+    finished,
     labelled,
     mathematics,
     plain,
-    save,
     symbol,
     unit_text,
     wrapped,
@@ -59,27 +59,21 @@ _SAMPLES_HANDLE = Patch(color=COLORS[1], alpha=0.6, label="samples of the poster
 _TRUTH_HANDLE = Line2D([], [], color=_TRUTH, linewidth=1.1, label="truth")
 
 
-def draw(found: IdentifyAnswer, path: Path, size: str = DEFAULT_SIZE) -> None:
-    """Draw an identification, and write the picture whole or not at all.
+def plot_identification(
+    found: IdentifyAnswer, out: Path | str | None = None, *, size: str = DEFAULT_SIZE
+) -> StyledFigure:
+    """Draw an identification.
 
     Args:
         found: what to draw; of many functions those of the largest truth are shown.
-        path: of the picture; its suffix is the format.
+        out: file of the picture; its suffix is the format: .png, .pdf or .svg.
         size: "single" or "double", in columns of a paper.
-    """
-    with mpl.rc_context(STYLE):
-        save(figure_of(found, size), path)
 
-
-def figure_of(found: IdentifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
-    """Return the figure of an identification.
-
-    Args:
-        found: what to draw; of many functions those of the largest truth are shown.
-        size: as for `draw`.
+    Returns:
+        The figure, which a notebook shows.
 
     Raises:
-        ConfigurationError: there is no such size.
+        ConfigurationError: The file cannot be written, or there is no such size.
     """
     width = width_of(size)
     levels = _levels(found)
@@ -92,7 +86,7 @@ def figure_of(found: IdentifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
     across = max(math.ceil(count / down), 1)
     with mpl.rc_context(STYLE):
         side = min(width / across, _HIGHEST)
-        figure = Figure(figsize=(width, 1.0 + side * down))
+        figure = StyledFigure(figsize=(width, 1.0 + side * down))
         axes = list(figure.subplots(down, across, squeeze=False).flat)
         tallest = 0
         handles: dict[Line2D | Patch, None] = {}
@@ -117,7 +111,7 @@ def figure_of(found: IdentifyAnswer, size: str = DEFAULT_SIZE) -> Figure:
         )
         title = plain(f"{found.title}, {found.learned.method}{left}", 200)
         add_title(figure, f"{title}\n{mathematics(found.setup)}")
-    return figure
+    return finished(figure, out)
 
 
 def _levels(found: IdentifyAnswer) -> dict[str, tuple[int, Function]]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
 
 from safe_envs.agents.training.leaderboard import LeaderboardEntry
 from safe_envs.agents.training.study import StudyRow
@@ -20,6 +17,7 @@ from safe_envs.scripts.figures.style import (
     WARM,
     add_legend,
     save,
+    scale_violations,
 )
 from safe_envs.scripts.options.evaluation_options import WIDTHS
 
@@ -34,16 +32,11 @@ _LOOKS = (
 )
 """Colours and markers in the order of the variants; none depends on its colour alone."""
 
-_LEAST = 1e-4
-_MARGIN = 0.06
-"""Of the range of the returns, below and above it."""
-
 
 def draw(
     title: str,
     entries: Sequence[LeaderboardEntry],
     rows: Sequence[StudyRow],
-    frontier: Mapping[str, list[float]] | None,
     variants: Sequence[str],
     path: Path,
 ) -> None:
@@ -53,7 +46,6 @@ def draw(
         title: name of the env.
         entries: its variants.
         rows: all agents of them.
-        frontier: "violations" and "returns" of the curve; None where there is none.
         variants: of the leaderboard: a variant looks alike on all envs.
         path: of the picture; its suffix is the format.
     """
@@ -61,16 +53,6 @@ def draw(
         # One column, which is about as wide as a phone: letters keep their size there.
         figure = Figure(figsize=(WIDTHS["single"], 3.3))
         axes = figure.add_subplot()
-        low, high = _range_of_returns(entries, rows, frontier)
-        if frontier is not None:
-            axes.plot(
-                frontier["violations"],
-                np.clip(frontier["returns"], low, None),
-                color="#000000",
-                linewidth=1.2,
-                label="largest return, computed",
-                zorder=1,
-            )
         for entry in entries:
             color, marker = _LOOKS[variants.index(entry.variant) % len(_LOOKS)]
             of_variant = [row for row in rows if row.variant == entry.variant]
@@ -85,10 +67,9 @@ def draw(
                 zorder=2,
             )
             _draw_entry(axes, entry, color, marker)
-        _scale(axes, entries, rows, frontier)
-        axes.set_ylim(low, high)
-        axes.set(xlabel="episodes with a violation", ylabel="mean return", title=title)
-        axes.grid(alpha=0.25, linewidth=0.6)
+        scale_violations(axes, [1.0 - row.safety_rate for row in rows])
+        axes.margins(y=0.06)
+        axes.set(ylabel="mean return", title=title)
         add_legend(figure, axes.get_legend_handles_labels()[0], most=2)
         save(figure, path)
 
@@ -110,36 +91,3 @@ def _draw_entry(axes: Axes, entry: LeaderboardEntry, color: str, marker: str) ->
         label=entry.variant,
         zorder=3,
     )
-
-
-def _range_of_returns(
-    entries: Sequence[LeaderboardEntry],
-    rows: Sequence[StudyRow],
-    frontier: Mapping[str, list[float]] | None,
-) -> tuple[float, float]:
-    """Return the range of the axis of returns: what agents have, and the curve above them."""
-    names = {entry.variant for entry in entries}
-    found = [row.return_mean for row in rows if row.variant in names]
-    top = max([*found, *(frontier["returns"] if frontier is not None else ())])
-    margin = _MARGIN * (top - min(found)) or 1.0
-    return min(found) - margin, top + margin
-
-
-def _scale(
-    axes: Axes,
-    entries: Sequence[LeaderboardEntry],
-    rows: Sequence[StudyRow],
-    frontier: Mapping[str, list[float]] | None,
-) -> None:
-    """Show chances of all sizes, and 0."""
-    names = {entry.variant for entry in entries}
-    found = [1.0 - row.safety_rate for row in rows if row.variant in names]
-    found += list(frontier["violations"][:1]) if frontier is not None else []
-    least = min((chance for chance in found if chance > _LEAST), default=0.1)
-    threshold = 10.0 ** min(math.floor(math.log10(least)), -1)
-    axes.set_xscale("symlog", linthresh=threshold)
-    axes.set_xlim(-0.15 * threshold, 1.6)
-    exponents = range(round(math.log10(threshold)), 1)
-    axes.set_xticks([0.0, *(10.0**k for k in exponents)])
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100.0 * value:g} %"))
-    axes.xaxis.set_minor_locator(NullLocator())

@@ -32,6 +32,7 @@ from safe_envs.scripts.figures.style import (
     labelled,
     plain,
     quantity,
+    runs,
     symbol,
 )
 from safe_envs.scripts.options.evaluation_options import DEFAULT_SIZE, width_of
@@ -252,7 +253,7 @@ class LogPanels:
         infeasible = ~self._log.feasible
         intervened = self._log.intervention & ~infeasible
         for flags, style in ((intervened, _INTERVENTION), (infeasible, _INFEASIBLE)):
-            spans = [(self._t[i], self._ends[k - 1]) for i, k in _runs(flags)]
+            spans = [(self._t[i], self._ends[k - 1]) for i, k in runs(flags)]
             corners = [[(a, 0.0), (b, 0.0), (b, 1.0), (a, 1.0)] for a, b in spans]
             marks = PolyCollection(
                 corners, transform=panel.get_xaxis_transform(), zorder=0, **style
@@ -290,12 +291,6 @@ def _range(*values: Any) -> tuple[float, float]:
 def _room(wanted: float, bottom: float, top: float) -> float:
     """Return room below and above a range, as much as floats need at least."""
     return max(wanted, 1e-6 * max(abs(bottom), abs(top)), 1e-12)
-
-
-def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and the one after the last place of each run of True."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
 
 
 _HEIGHT = 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, NullLocator
 from matplotlib.transforms import Bbox
 
 from safe_envs.errors import ConfigurationError, shortened
@@ -104,6 +106,9 @@ _MOST_COLUMNS = 4
 _LEGEND_HEIGHT = 0.6
 """In inches, of a legend with three lines: the figure grows by what a taller one needs."""
 
+_LEAST_SHARE = 1e-4
+"""Smaller shares of violations lie next to 0."""
+
 _MARGIN = 0.1
 """In inches, at both sides of the titles and legends together."""
 
@@ -114,14 +119,27 @@ def look(i: int) -> dict[str, Any]:
     return {"color": COLORS[place], "linestyle": DASHES[(place + turn) % len(DASHES)]}
 
 
-def mark_of(i: int, marks: Sequence[str] = MARKERS) -> str:
-    """Return the mark of the i-th line or point, another one where its colour comes again.
+def mark_of(i: int) -> str:
+    """Return the mark of the i-th line or point, another one where its colour comes again."""
+    return MARKERS[(i + i // len(COLORS)) % len(MARKERS)]
+
+
+def scale_violations(axes: Axes, shares: Sequence[float]) -> None:
+    """Show shares of episodes with a violation across: of all sizes, and 0.
 
     Args:
-        i: place among the lines or points.
-        marks: to choose from.
+        axes: of the panel.
+        shares: that are drawn, from 0 to 1.
     """
-    return marks[(i + i // len(COLORS)) % len(marks)]
+    least = min((share for share in shares if share > _LEAST_SHARE), default=0.1)
+    threshold = 10.0 ** min(math.floor(math.log10(least)), -1)
+    axes.set_xscale("symlog", linthresh=threshold)
+    axes.set_xlim(-0.15 * threshold, 1.6)
+    axes.set_xticks([0.0, *(10.0**k for k in range(round(math.log10(threshold)), 1))])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100.0 * value:g} %"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("episodes with a violation")
+    axes.grid(alpha=0.25, linewidth=0.6)
 
 
 def wrapped(figure: Figure, text: str, size: float, room: float | None = None) -> str:
@@ -210,6 +228,12 @@ def drawable(h: np.ndarray) -> np.ndarray:
     """
     known = np.abs(h[np.isfinite(h)])
     return np.maximum(h, -2.0 * known.max(initial=1.0))
+
+
+def runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and the one after the last place of each run of True."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return list(zip(ends[::2].tolist(), ends[1::2].tolist(), strict=True))
 
 
 _UNDATED: dict[str, dict[str, Any]] = {

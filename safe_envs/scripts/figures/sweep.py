@@ -29,12 +29,14 @@ from safe_envs.scripts.figures.style import (
     mark_of,
     plain,
     save,
+    scale_violations,
     symbol,
     wrapped,
 )
 from safe_envs.scripts.options.evaluation_options import DEFAULT_SIZE, width_of
 
 _SEED = "seed"
+_PROMISE = "promise:"
 _MOST_PANELS = 12
 _COLUMNS = {"single": 1, "double": 3}
 
@@ -54,14 +56,17 @@ class Layout:
     """The place of each swept setting.
 
     Attributes:
-        x: across; None where nothing but seeds was swept.
+        x: across; None where nothing but seeds was swept, or violations are across.
         lines: a line for each of its values; None for a single one.
         panels: a panel for each combination of their values.
+        returns: draw a point of mean return over violations for each value of `lines`, in place of
+            safety rates.
     """
 
     x: str | None
     lines: str | None
     panels: tuple[str, ...]
+    returns: bool = False
 
     @classmethod
     def of(
@@ -72,6 +77,9 @@ class Layout:
         lines: str | None = None,
     ) -> Layout:
         """Choose the places of settings that are not given.
+
+        Promise filters at several p are swept to choose a p: unless a number was swept too, or a
+        place is given, the mean return is drawn over the violations.
 
         Args:
             rows: of the cells.
@@ -88,6 +96,12 @@ class Layout:
             if name not in (x, lines) and (name != _SEED or _SEED in (x, lines))
         ]
 
+        if x is lines is None and "filter" in rest:
+            promises = {row["filter"] for row in rows if row["filter"].startswith(_PROMISE)}
+            others = tuple(name for name in rest if name != "filter")
+            if len(promises) > 1 and not any(_is_numeric(rows, name) for name in others):
+                return cls(None, "filter", others, returns=True)
+
         def variety(name: str) -> tuple[bool, int]:
             return _is_numeric(rows, name), len(_values(rows, name))
 
@@ -100,31 +114,46 @@ class Layout:
         return cls(x, lines, tuple(rest))
 
 
-def draw(rows: Sequence[Row], layout: Layout, path: Path, size: str = DEFAULT_SIZE) -> int:
+def draw(
+    rows: Sequence[Row],
+    swept: Sequence[str],
+    path: Path,
+    size: str = DEFAULT_SIZE,
+    x: str | None = None,
+    lines: str | None = None,
+) -> str:
     """Draw cells that are done, and write the picture whole or not at all.
 
     Args:
         rows: of `safe_envs.agents.sweeps.store.read`.
-        layout: places of the settings.
+        swept: names of the settings.
         path: of the picture.
         size: "single" or "double", in columns of a paper.
+        x: as for `Layout.of`.
+        lines: likewise.
 
     Returns:
-        The number of panels without room.
+        A sentence that says where the picture is, and what it lacks.
 
     Raises:
         ConfigurationError: the picture cannot be written, or there is no such size.
     """
-    figure, left = figure_of(rows, layout, size)
+    done = [row for row in rows if row["error"] is None]
+    if not done:
+        return "There is no picture, since no cell is done."
+    figure, hidden = figure_of(done, Layout.of(done, swept, x, lines), size)
     save(figure, path)
-    return left
+    return f"The picture: {path}" + (
+        f" (without {hidden} of its panels, which are too many; sweep less, or choose --x and"
+        " --lines)" * bool(hidden)
+    )
 
 
 def figure_of(rows: Sequence[Row], layout: Layout, size: str = DEFAULT_SIZE) -> tuple[Figure, int]:
     """Return the figure of cells that are done, and the number of panels without room.
 
     Args:
-        rows: as for `draw`.
+        rows: of the cells, as for `draw`.
         layout: places of the settings.
         size: as for `draw`.
 
@@ -138,23 +167,31 @@ def figure_of(rows: Sequence[Row], layout: Layout, size: str = DEFAULT_SIZE) -> 
     count = math.ceil(len(shown) / columns)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, 0.9 + (2.6 if count == 1 else 2.1) * count))
-        grid = figure.subplots(count, columns, sharey=True, squeeze=False)
+        # Returns of different envs have nothing in common.
+        grid = figure.subplots(count, columns, sharey=not layout.returns, squeeze=False)
+        draw_panel = _draw_returns if layout.returns else _draw_panel
+        what = "mean return" if layout.returns else labelled("safe", "%")
         for k, axes in enumerate(grid.flat):
             if k >= len(shown):
                 axes.set_visible(False)
                 continue
             chosen = [row for row in rows if tuple(row[name] for name in layout.panels) == shown[k]]
-            _draw_panel(axes, chosen, layout, rows)
+            draw_panel(axes, chosen, layout, rows)
             title = _title(layout.panels, shown[k])
             room = 0.85 * width / columns
             axes.set_title(wrapped(figure, title, mpl.rcParams["axes.titlesize"], room))
-            axes.set_ylabel(labelled("safe", "%") if k % columns == 0 else "")
+            axes.set_ylabel(what if k % columns == 0 else "")
         if layout.x is not None and not _is_numeric(rows, layout.x):
             _turn_labels(figure, grid, width / columns)
         handles, labels = grid.flat[0].get_legend_handles_labels()
         if labels:
             add_legend(figure, handles)
-        add_title(figure, f"{_common(rows)}safety rate, with its pointwise 95 % band")
+        drawn = (
+            "mean return over violations, with their 95 % intervals"
+            if layout.returns
+            else "safety rate, with its pointwise 95 % band"
+        )
+        add_title(figure, f"{_common(rows)}{drawn}")
     return figure, len(combinations) - len(shown)
 
 
@@ -197,6 +234,31 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
             list(position.values()), ["" if layout.x is None else _text(place) for place in places]
         )
     axes.set_ylim(-3, 103)
+
+
+def _draw_returns(
+    axes: Axes, rows: Sequence[Row], layout: Layout, everything: Sequence[Row]
+) -> None:
+    """Draw a point of mean return over violations for each filter; cells of seeds are one point."""
+    for k, kind in enumerate(_values(everything, str(layout.lines))):
+        of_kind = _at(rows, layout.lines, kind)
+        # What a panel lacks is in the legend all the same, which is that of the first panel.
+        safe, low, high = _rate(of_kind) or (math.nan, math.nan, math.nan)
+        returns = np.array([row["return_mean"] for row in of_kind] or [math.nan], dtype=float)
+        weights = [row["episodes"] for row in of_kind] or [1]
+        axes.errorbar(
+            1.0 - safe,
+            np.average(returns, weights=weights),
+            xerr=[[high - safe], [safe - low]],
+            color=WARM if is_unfiltered(kind) else COLORS[k % len(COLORS)],
+            marker=mark_of(k),
+            markersize=5,
+            elinewidth=0.9,
+            capsize=2,
+            linestyle="none",
+            label=_text(kind),
+        )
+    scale_violations(axes, [1.0 - end for row in rows for end in (row["ci_low"], row["ci_high"])])
 
 
 def _turn_labels(figure: Figure, grid: np.ndarray, room: float) -> None:

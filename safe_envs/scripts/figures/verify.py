@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,32 +46,8 @@ _SHOWN_STARTS = 200
 _NEAREST = 500
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnVerification:
-    """A verification with what is drawn with it.
-
-    Attributes:
-        verification: where the conditions can be met.
-        starts: to mark, shape (B, n).
-        title: name of the env.
-    """
-
-    verification: Verification
-    starts: np.ndarray
-    title: str
-
-
-def window(answer: DrawnVerification, indices: Sequence[int]) -> np.ndarray:
-    """Return limits that show C within the workspace, or what happens in it if it has no end.
-
-    Args:
-        answer: to draw.
-        indices: of the states along the axes.
-
-    Returns:
-        Low and high limits, shape (len(indices), 2).
-    """
-    found = answer.verification
+def _window(found: Verification, starts: np.ndarray, indices: Sequence[int]) -> np.ndarray:
+    """Return limits along states, shape (n, 2), that show C, or what happens in it if it is cut."""
     region, level = found.region, found.formulas.barrier_level
     points = region.draw(14, np.random.default_rng(0))
     inside = points[level(points) >= 0.0]
@@ -80,40 +55,25 @@ def window(answer: DrawnVerification, indices: Sequence[int]) -> np.ndarray:
         return np.stack([region.low, region.high], axis=1)[list(indices)]
     if found.beyond:
         nearest = points[np.argsort(abs(level(points)))[: len(points) // _NEAREST]]
-        inside = np.concatenate([answer.starts, found.part.worst[None], nearest])
+        inside = np.concatenate([starts, found.part.worst[None], nearest])
     low, high = inside.min(axis=0), inside.max(axis=0)
     room = 0.12 * (high - low) + 1e-3 * (region.high - region.low)
     low, high = np.maximum(region.low, low - room), np.minimum(region.high, high + room)
     return np.stack([low, high], axis=1)[list(indices)]
 
 
-def infeasible(
+def _infeasible(
     formulas: Formulas, x: np.ndarray, level: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Return at which states no action meets the conditions.
-
-    Args:
-        formulas: of the conditions.
-        x: states, shape (B, n).
-        level: >= 0 in the set that is looked at.
-
-    Returns:
-        1 where a condition is violated, 0 where none is, NaN outside the set; shape (B,).
-    """
+    """Return 1 where no action meets the conditions, 0 where one does, NaN where `level` is < 0."""
     found, inside = np.full(len(x), np.nan), level(x) >= 0.0
     if inside.any():
         found[inside] = formulas.shortfall(x[inside]) > 0.0
     return found
 
 
-def mark_states(axes: Axes, starts: tuple[np.ndarray, np.ndarray], worst: Sequence[float]) -> None:
-    """Mark the starts and the worst state.
-
-    Args:
-        axes: to draw on; their limits stay.
-        starts: coordinates along both axes, shape (B,) each.
-        worst: coordinates along both axes.
-    """
+def _mark_states(axes: Axes, starts: tuple[np.ndarray, np.ndarray], worst: Sequence[float]) -> None:
+    """Mark the starts and the worst state, by coordinates along both axes, whose limits stay."""
     limits = {"xlim": axes.get_xlim(), "ylim": axes.get_ylim()}
     shown = [coordinates[:_SHOWN_STARTS] for coordinates in starts]
     size = 1.8 if len(shown[0]) > 1 else 4
@@ -123,35 +83,21 @@ def mark_states(axes: Axes, starts: tuple[np.ndarray, np.ndarray], worst: Sequen
     axes.set(**limits)
 
 
-def axis_label(problem: SafetyProblem, i: int) -> str:
-    """Return the label of an axis along a state.
-
-    Args:
-        problem: with the states.
-        i: index of the state.
-
-    Returns:
-        The name with the unit.
-    """
+def _axis_label(problem: SafetyProblem, i: int) -> str:
     return quantity(problem.states[i].symbol.name, problem.states[i].unit)
 
 
-def draw_line(axes: Axes, answer: DrawnVerification) -> None:
-    """Draw h and the chain over the only state of a problem.
-
-    Args:
-        axes: to draw on.
-        answer: to draw.
-    """
-    formulas, starts = answer.verification.formulas, answer.starts
-    (low, high), *_ = window(answer, [0])
+def _draw_line(axes: Axes, found: Verification, starts: np.ndarray) -> None:
+    """Draw h and the chain over the only state of a problem."""
+    formulas = found.formulas
+    (low, high), *_ = _window(found, starts, [0])
     x = np.linspace(low, high, 1000)[:, None]
     chain = formulas.chain(x)
     axes.plot(x[:, 0], chain[:, 0], color="black", linewidth=1.1)
     for j in range(1, chain.shape[1]):
         axes.plot(x[:, 0], chain[:, j], color=COLORS[j - 1], linestyle=DASHES[j])
     axes.axhline(0.0, color="black", linewidth=0.6)
-    violated = infeasible(formulas, x, formulas.barrier_level) == 1.0
+    violated = _infeasible(formulas, x, formulas.barrier_level) == 1.0
     for where, color, alpha in ((chain[:, 0] < 0.0, UNSAFE, 0.5), (violated, INFEASIBLE, 0.6)):
         axes.fill_between(
             x[:, 0],
@@ -165,9 +111,9 @@ def draw_line(axes: Axes, answer: DrawnVerification) -> None:
         )
     axes.set_xlim(low, high)
     heights = formulas.chain(starts)[:, 0]
-    mark_states(axes, (starts[:, 0], heights), (answer.verification.part.worst[0], 0.0))
+    _mark_states(axes, (starts[:, 0], heights), (found.part.worst[0], 0.0))
     title = "$h$" + ", and where no action meets the condition" * bool(violated.any())
-    axes.set(xlabel=axis_label(answer.verification.problem, 0), ylabel="$h$", title=title)
+    axes.set(xlabel=_axis_label(found.problem, 0), ylabel="$h$", title=title)
 
 
 _GRID = 300
@@ -177,28 +123,22 @@ _LISTED = 3
 _LEVELS = (0.2, 0.4, 0.6, 0.8)
 
 
-def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
+def _draw_slice(axes: Axes, found: Verification, starts: np.ndarray) -> ContourSet | None:
     """Draw h, the chain and where no action meets the conditions, in the plane of the worst state.
 
-    Args:
-        axes: to draw on.
-        answer: to draw.
-
-    Returns:
-        The contours of h inside the safe set, for `write_levels`; None without any.
+    The contours of h inside the safe set are returned, for `write_levels`.
     """
     lines = None
-    found = answer.verification
     problem, worst = found.problem, found.part.worst
     formulas, plane = found.formulas, _plane(problem)
-    grid, x = _states_over(answer, plane, worst, _GRID)
+    grid, x = _states_over(found, starts, plane, _GRID)
     chain = formulas.chain(x)
     h = drawable(np.nan_to_num(chain[:, formulas.barriers].min(axis=1), nan=-np.inf))
 
     def shaped(values: np.ndarray) -> np.ndarray:
         return values.reshape(grid[0].shape)
 
-    violated = shaped(infeasible(formulas, x, formulas.barrier_level))
+    violated = shaped(_infeasible(formulas, x, formulas.barrier_level))
     axes.contourf(*grid, violated, levels=[0.5, 2.0], colors=[INFEASIBLE], alpha=0.6, zorder=1)
     axes.contourf(*grid, shaped(h), levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.5, zorder=0)
     axes.contour(*grid, shaped(h), levels=[0.0], colors="black", linewidths=1.1, zorder=3)
@@ -211,8 +151,9 @@ def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
             style = {"colors": COLORS[j - stage.start - 1], "linestyles": [DASHES[j - stage.start]]}
             inside = np.where(shaped(h) >= 0.0, shaped(chain[:, j]), np.nan)
             axes.contour(*grid, inside, levels=[0.0], zorder=3, **style)
-    starts = answer.starts[:, plane[0]], answer.starts[:, plane[1]]
-    mark_states(axes, starts, (worst[plane[0]], worst[plane[1]]))
+    _mark_states(
+        axes, (starts[:, plane[0]], starts[:, plane[1]]), (worst[plane[0]], worst[plane[1]])
+    )
     _label(axes, problem, plane)
     others = [
         f"{symbol(s.symbol.name)} = {worst[i] + 0.0:.3g}"
@@ -225,27 +166,20 @@ def draw_slice(axes: Axes, answer: DrawnVerification) -> ContourSet | None:
     return lines
 
 
-def draw_shares(figure: Figure, axes: Axes, answer: DrawnVerification) -> None:
-    """Draw for which share of the other states no action meets the conditions.
-
-    Args:
-        figure: with the axes, for the colour bar.
-        axes: to draw on.
-        answer: to draw.
-    """
-    found = answer.verification
+def _draw_shares(figure: Figure, axes: Axes, found: Verification, starts: np.ndarray) -> None:
+    """Draw for which share of the other states no action meets the conditions."""
     problem = found.problem
     formulas, plane = found.formulas, _plane(problem)
     # Several conditions take a solver: a coarser picture of a tenth of the states.
     coarser = len(formulas.stages) > 1
     count = _COARSE // 2 if coarser else _COARSE
-    grid, states = _states_over(answer, plane, found.part.worst, count)
+    grid, states = _states_over(found, starts, plane, count)
     inside, violated = np.zeros(len(states)), np.zeros(len(states))
     for values in _others(found, 2 ** (_OTHERS_LOG2 - 2 * coarser)):
         x = np.tile(values, (len(states), 1))
         x[:, plane] = states[:, plane]
         inside += formulas.invariant_level(x) >= 0.0
-        violated += infeasible(formulas, x, formulas.invariant_level) == 1.0
+        violated += _infeasible(formulas, x, formulas.invariant_level) == 1.0
     with np.errstate(invalid="ignore"):
         share = np.where(inside > 0, 100.0 * violated / inside, np.nan).reshape(grid[0].shape)
     top = max(float(np.nanmax(share)) if np.isfinite(share).any() else 0.0, 1.0)
@@ -268,12 +202,12 @@ def _plane(problem: SafetyProblem) -> tuple[int, int]:
 
 
 def _states_over(
-    answer: DrawnVerification, plane: tuple[int, int], state: np.ndarray, count: int
+    found: Verification, starts: np.ndarray, plane: tuple[int, int], count: int
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return a grid over a plane, and its states, with the other coordinates of a state."""
-    ticks = [np.linspace(low, high, count) for low, high in window(answer, plane)]
+    """Return a grid over a plane, and its states, with the other coordinates of the worst state."""
+    ticks = [np.linspace(low, high, count) for low, high in _window(found, starts, plane)]
     grid = np.meshgrid(*ticks)
-    x = np.tile(state, (grid[0].size, 1))
+    x = np.tile(found.part.worst, (grid[0].size, 1))
     x[:, plane[0]], x[:, plane[1]] = grid[0].ravel(), grid[1].ravel()
     return list(grid), x
 
@@ -294,7 +228,7 @@ def _others(found: Verification, count: int) -> np.ndarray:
 
 def _label(axes: Axes, problem: SafetyProblem, plane: tuple[int, int]) -> None:
     across, up = plane
-    axes.set(xlabel=axis_label(problem, across), ylabel=axis_label(problem, up))
+    axes.set(xlabel=_axis_label(problem, across), ylabel=_axis_label(problem, up))
     if problem.states[across].unit == problem.states[up].unit:
         axes.set_aspect("equal")
 
@@ -325,23 +259,8 @@ def plot_verification(
     Raises:
         ConfigurationError: The file cannot be written, or there is no such size.
     """
-    problem = found.problem
-    marked = starts_of(problem) if starts is None else starts
-    drawn = DrawnVerification(found, marked, title or problem.name)
-    return finished(figure_of(drawn, size), out)
-
-
-def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> StyledFigure:
-    """Return the figure of a verification.
-
-    Args:
-        answer: to draw.
-        size: as for `plot_verification`.
-
-    Raises:
-        ConfigurationError: there is no such size.
-    """
-    problem, width = answer.verification.problem, width_of(size)
+    problem, width = found.problem, width_of(size)
+    starts = starts_of(problem) if starts is None else starts
     several = problem.plant.n > 2
     with mpl.rc_context(STYLE):
         aside = several and size == "double"
@@ -352,22 +271,20 @@ def figure_of(answer: DrawnVerification, size: str = DEFAULT_SIZE) -> StyledFigu
         panels = list(figure.subplots(*shape, squeeze=False).flat)
         lines = None
         if problem.plant.n == 1:
-            draw_line(panels[0], answer)
+            _draw_line(panels[0], found, starts)
         else:
-            lines = draw_slice(panels[0], answer)
+            lines = _draw_slice(panels[0], found, starts)
         if several:
-            draw_shares(figure, panels[1], answer)
-        add_legend(figure, _legend(answer, lines))
-        filter_text = spec_of(answer.verification.formulas.conditions)
-        title = plain(f"{answer.title}, {filter_text}", 200)
-        add_title(figure, f"{title}\n{mathematics(describe_system(problem))}")
+            _draw_shares(figure, panels[1], found, starts)
+        add_legend(figure, _legend(found, lines))
+        heading = plain(f"{title or problem.name}, {spec_of(found.formulas.conditions)}", 200)
+        add_title(figure, f"{heading}\n{mathematics(describe_system(problem))}")
         if lines is not None:
             write_levels(figure, panels[0], lines)
-    return figure
+    return finished(figure, out)
 
 
-def _legend(answer: DrawnVerification, lines: ContourSet | None) -> list[Patch | Line2D]:
-    found = answer.verification
+def _legend(found: Verification, lines: ContourSet | None) -> list[Patch | Line2D]:
     handles: list[Patch | Line2D] = []
     if found.safe_set.shortfall > 0.0 or found.part.shortfall > 0.0:
         handles.append(Patch(color=INFEASIBLE, alpha=0.6, label="no action meets the condition"))

@@ -36,11 +36,11 @@ PANELS: dict[str, str] = {
     ),
     "Training": (
         "n-timesteps set action intervention-penalty promise-curriculum curriculum-part cost-limit"
-        " violation-limit eval-freq eval-episodes resume train"
+        " violation-limit eval-freq eval-episodes resume"
     ),
     "Tables and proofs": "best closed-loop bounds leaving cells inputs table spec check prices",
     "Statistics": (
-        "episodes attained seed seeds repeats confidence refine monitoring rare particles"
+        "episodes seed seeds repeats confidence refine monitoring rare particles"
         " repetitions simulate states"
     ),
     "Speed": "num-envs jobs engine threads quick seconds",
@@ -91,10 +91,6 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "safe-envs certify CubicSDE-v0 --policy nominal --degree 6",
     ),
     "check": ("safe-envs check certificate.json --state 0.5",),
-    "frontier": (
-        "safe-envs frontier Scalar-v0",
-        "safe-envs frontier Scalar-v0 --filter promise:p=0.9 --plot frontier.pdf",
-    ),
     "export": (
         "safe-envs export StochasticDubins-v0 --out filter",
         "safe-envs export Pendulum-v0 --filter hocbf --float32 --compare --out filter",

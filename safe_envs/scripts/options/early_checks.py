@@ -68,13 +68,6 @@ def known_policy(name: str) -> str:
     return name
 
 
-def known_policies(names: list[str] | None) -> list[str] | None:
-    """Return the values of --policy; see `known_policy`."""
-    for name in names or ():
-        known_policy(name)
-    return names
-
-
 def known_envs(env_ids: list[str] | None) -> list[str] | None:
     """Return the ids of envs if there are all of them.
 

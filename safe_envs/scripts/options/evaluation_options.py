@@ -283,12 +283,11 @@ Table = Annotated[
 _MOST_DIGITS = 9
 
 
-def cells_of(text: str | None, example: str = "400x100") -> tuple[int, ...] | None:
+def cells_of(text: str | None) -> tuple[int, ...] | None:
     """Return the numbers of cells of a text such as 400x100; None for none.
 
     Args:
         text: as given.
-        example: of such a text, for messages.
 
     Raises:
         ConfigurationError: It is no such text.
@@ -299,7 +298,7 @@ def cells_of(text: str | None, example: str = "400x100") -> tuple[int, ...] | No
     if not all(part.isascii() and part.isdigit() and len(part) <= _MOST_DIGITS for part in parts):
         raise ConfigurationError(
             f"--cells {shown(text)}; give a whole number for each coordinate, of at most"
-            f" {_MOST_DIGITS} digits, such as {example}"
+            f" {_MOST_DIGITS} digits, such as 400x100"
         )
     return tuple(int(part) for part in parts)
 

@@ -36,14 +36,12 @@ class LeaderboardReport:
         entries: of each variant on each env, in their order.
         over_envs: safety over all envs, by variant.
         best: the best attainable safety of each env, or why there is none, as far as is known.
-        frontiers: largest returns at each chance of a violation, by env.
     """
 
     found: StudyResult
     entries: tuple[LeaderboardEntry, ...]
     over_envs: Mapping[str, SeedEstimate]
     best: Mapping[str, AttainableSafety | str]
-    frontiers: Mapping[str, Mapping[str, list[float]]]
 
     def of(self, env_id: str) -> list[LeaderboardEntry]:
         """Return the entries of an env."""
@@ -81,7 +79,6 @@ class LeaderboardReport:
                 key: each if isinstance(each, str) else each.as_dict()
                 for key, each in self.best.items()
             },
-            "frontiers": dict(self.frontiers),
             "missing": self.found.reasons(),
         }
 

@@ -1,15 +1,12 @@
-"""Jobs in processes, some of which end in the middle: of this machine, of Dask, and of Ray."""
+"""Jobs in processes, some of which end in the middle: of this machine, and of Dask."""
 
 from __future__ import annotations
 
 import json
 import os
-import secrets
 import signal
-import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +19,7 @@ import pytest
 
 from safe_envs.agents.jobs import clusters, executor
 from safe_envs.agents.jobs.executor import Backend, run
-from safe_envs.agents.jobs.job import Job, JobOutcome
+from safe_envs.agents.jobs.job import Job, JobOutcome, LossError
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow
@@ -84,7 +81,7 @@ def test_a_killed_worker_and_a_failing_job_cost_no_other(tmp_path: Path):
 
 
 JOBS = [Task(str(k)) for k in range(8)]
-ENDED = "the process that computed it ended: it went away"
+ENDED = "the process that computed it ended: OSError: it went away"
 
 
 class Pretended:
@@ -104,7 +101,7 @@ class Pretended:
         for k in range(0, len(jobs), 2):
             pair = jobs[k : k + 2]
             if self._ends({int(job.key) for job in pair}):
-                raise executor._LossError("it went away", jobs[: k + 2])
+                raise LossError(OSError("it went away"), jobs[: k + 2])
             yield from (JobOutcome(job.key, None, None, 0.0) for job in pair)
 
 
@@ -140,7 +137,8 @@ def test_workers_that_end_whatever_they_compute(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     ("arguments", "fragment"),
     [
-        (("rai", "127.0.0.1:1"), "'ray'"),
+        (("dsk", "127.0.0.1:1"), "'dask'"),
+        (("ray", "127.0.0.1:1"), "use dask"),
         (("dask",), "address"),
         (("local", "127.0.0.1:1"), "address"),
         (("local", None, 0), "jobs = 0"),
@@ -157,16 +155,10 @@ def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch)
         Backend("dask", "tcp://127.0.0.1:1")
 
 
-@pytest.mark.parametrize(
-    ("backend", "address"),
-    [
-        *(("dask", x) for x in ("foo", "", "http://127.0.0.1:8786", "tcp://127.0.0.1:9")),
-        *(("ray", x) for x in ("auto", "ray://127.0.0.1:10001", ":6379", "127.0.0.1:9")),
-    ],
-)
-def test_addresses_where_nobody_answers(backend: str, address: str):
+@pytest.mark.parametrize("address", ["foo", "", "http://127.0.0.1:8786", "tcp://127.0.0.1:9"])
+def test_addresses_where_nobody_answers(address: str):
     with pytest.raises(ConfigurationError, match=f"answers at {address} "):
-        run(JOBS, Backend(backend, address), print)
+        run(JOBS, Backend("dask", address), print)
 
 
 class Scheduler:
@@ -184,20 +176,17 @@ class Scheduler:
 
 
 def test_a_scheduler_that_has_lost_its_workers(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(clusters, "_LOOK", 0.001)
     monkeypatch.setattr(clusters, "_MOST_LOOKS", 3)
-    told, raised, ended = [], [], threading.Event()
-
-    def give_up(error: Exception) -> None:
-        raised.append(error)
-        ended.set()
-
+    told, looks = [], 0
     scheduler: Any = Scheduler(1, 0, OSError("busy"), 0, 1, 0, 0, 0)
-    clusters._watch(scheduler, "tcp://HOST:PORT", told.append, give_up, ended)
+    for expected in (0, 1, 1, 2, 0, 1, 2):
+        looks = clusters.looked(scheduler, "tcp://HOST:PORT", looks, told.append)
+        assert looks == expected
+    with pytest.raises(ConfigurationError, match="has had no workers"):
+        clusters.looked(scheduler, "tcp://HOST:PORT", looks, told.append)
     # Once each time that they went.
     assert len(told) == 2
     assert all("tcp://HOST:PORT has no workers" in each for each in told)
-    assert [type(each) for each in raised] == [ConfigurationError]
 
 
 @contextmanager
@@ -251,13 +240,6 @@ def limited() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def free_port() -> int:
-    """A port that the system chooses, for what does not ask it itself."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
 @pytest.mark.cluster
 def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
@@ -278,45 +260,3 @@ def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, monkeypatch: py
         monkeypatch.setattr(clusters, "_PATIENCE", 1)
         with pytest.raises(ConfigurationError, match="has no workers"):
             computed(killing, place)
-
-
-@pytest.fixture
-def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where a Ray cluster of this test alone keeps what it has: a short name, since those of
-    sockets are."""
-    with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
-        for name, value in (
-            ("RAY_TMPDIR", folder),
-            ("RAY_AUTH_MODE", "token"),
-            ("RAY_AUTH_TOKEN", secrets.token_hex(32)),
-            ("RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S", "0"),
-            # Ray takes 127.0.0.1 for the address of a node only where it takes itself to be
-            # confined to one machine.
-            ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0"),
-        ):
-            monkeypatch.setenv(name, value)
-        yield Path(folder)
-
-
-def compute_on_ray(folder: str, address: str) -> None:
-    """Run in a process of its own, since Ray leaves much in the one that connects to it."""
-    clusters._RETRIES = 1
-    path = Path(folder)
-    found = computed([*mixed(path), Task("9", path, "kills")], Backend("ray", address))
-    error = found.pop("9").error
-    assert str(error).startswith("the process that computed it ended: ")
-    require_squares(found)
-
-
-@pytest.mark.cluster
-def test_ray_with_a_killed_worker(tmp_path: Path, ray_folder: Path):
-    log, words = tmp_path / "log", [sys.executable, "-m", "ray.scripts.scripts", "start", "--head"]
-    words += ["--block", "--node-ip-address=127.0.0.1", "--port=0", "--num-cpus=2"]
-    words += [f"--ray-client-server-port={free_port()}", "--object-store-memory=100000000"]
-    words += ["--include-dashboard=false", "--disable-usage-stats"]
-    with started(words, log=log) as (process,):
-        wait_for(process, log, log, "Ray runtime started")
-        address = wait_for(process, log, ray_folder / "ray" / "ray_current_cluster", ":").strip()
-        code = f"import {__name__} as module\nmodule.compute_on_ray({str(tmp_path)!r}, {address!r})"
-        subprocess.run([sys.executable, "-c", code], timeout=LONG, check=True)
-    assert (tmp_path / "ended").exists()

@@ -13,7 +13,6 @@ from safe_envs.agents.training.leaderboard import (
     attainable_of,
     board,
     entry_of,
-    frontiers_of,
     require_no_older,
     safety_over_envs,
 )
@@ -121,20 +120,6 @@ def test_results_of_an_earlier_version_are_neither_read_nor_overwritten(tmp_path
     (tmp_path / "results" / "ACC-v0.json").write_text("{}")
     with pytest.raises(ConfigurationError, match="earlier version"):
         require_no_older(tmp_path)
-
-
-@pytest.mark.slow
-def test_curves_are_computed_where_they_are_asked_for_and_kept(tmp_path, monkeypatch):
-    monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path / "cache"))
-    ids = (SCALAR, "safe_envs/QuadrotorLimits-v0")
-    none = lambda _: None  # noqa: E731
-    assert frontiers_of(ids, tmp_path, False, none) == {}
-    done = []
-    found = frontiers_of(ids, tmp_path, True, done.append)
-    assert list(found) == [SCALAR]
-    assert max(done) <= 1.0
-    assert found[SCALAR]["violations"] == sorted(found[SCALAR]["violations"])
-    assert frontiers_of(ids, tmp_path, False, none) == found
 
 
 def require_computed_and_kept(folder):

@@ -15,11 +15,9 @@ pytestmark = pytest.mark.slow
 
 NAMES = ["nominal", "ppo", "ppo-lag", "ppo + filter", "ppo behind filter", "ppo + promise filter"]
 NAMES += ["ppo behind backup"]
-CURVE = {"violations": [1e-3, 0.1, 1.0], "returns": [-500.0, 400.0, 700.0]}
 
 
-@pytest.mark.parametrize("curve", [None, CURVE])
-def test_agents_are_inside_the_axes_and_look_different(tmp_path, monkeypatch, curve):
+def test_agents_are_inside_the_axes_and_look_different(tmp_path, monkeypatch):
     safe = {(SCALAR, name): [50 - 8 * i, 49 - 8 * i, 48 - 8 * i] for i, name in enumerate(NAMES)}
     safe[SCALAR, "ppo"] = [0, 0, 0]
     found = result(safe, 3)
@@ -33,7 +31,7 @@ def test_agents_are_inside_the_axes_and_look_different(tmp_path, monkeypatch, cu
 
     monkeypatch.setattr(Figure, "savefig", kept)
     path = tmp_path / "Scalar.png"
-    draw("Scalar", [e for e in entries if e], found.rows, curve, NAMES, path)
+    draw("Scalar", [e for e in entries if e], found.rows, NAMES, path)
     assert path.stat().st_size > 10_000
     (figure,) = figures
     (axes,) = figure.axes
@@ -42,6 +40,6 @@ def test_agents_are_inside_the_axes_and_look_different(tmp_path, monkeypatch, cu
         assert left < 1 - row.safety_rate < right
         assert bottom < row.return_mean < top
     labels = axes.get_legend_handles_labels()[1]
-    assert labels == (["largest return, computed"] if curve else []) + NAMES
+    assert labels == NAMES
     assert len(set(leaderboard._LOOKS)) == len({m for _, m in leaderboard._LOOKS})
     assert unreadable(*figure_texts(figure)) == []

@@ -88,40 +88,30 @@ def test_the_smallest_h_is_within_the_panel_whatever_else_is_logged():
 
 def test_a_file_is_drawn_between_two_times(tmp_path):
     log_of(UNSAFE).to_csv(tmp_path / "log.csv")
-    for suffix in ("png", "pdf", "svg"):
-        out = tmp_path / f"log.{suffix}"
-        figure = plot_log(tmp_path / "log.csv", out, start=0.15, end=0.4, title="cost in $")
-        assert out.stat().st_size > 1000
+    out = tmp_path / "log.svg"
+    figure = plot_log(tmp_path / "log.csv", out, start=0.15, end=0.4, title="cost in $")
+    assert out.stat().st_size > 1000
     np.testing.assert_allclose(figure.axes[0].lines[0].get_xdata(), [0.2, 0.3, 0.4])
     assert figure.get_suptitle() == r"cost in \$"
 
 
-def test_names_from_a_file_are_no_mathematics(tmp_path):
-    log = DecisionLog(LogColumns.of(("$x",), ("$\\frac{",), ("$$h_{",)))
-    log.append([0, 0, 0, 0, -1, 1, 1, 0, 0, 1, -1])
-    plot_log(log, tmp_path / "log.png")
-    assert (tmp_path / "log.png").is_file()
-
-
-def test_what_cannot_be_drawn_is_refused(tmp_path):
-    log = log_of(SAFE)
-    for arguments, reason in (
-        ({"start": 3.0}, "start = 3.0"),
-        ({"start": 0.3, "end": 0.2}, "from 0 to 0.4 s"),
-        ({"out": tmp_path / "log.exe"}, "FILE.png"),
-        ({"out": tmp_path / "none" / "log.png"}, "does not exist"),
-    ):
-        with pytest.raises(ConfigurationError, match=reason):
-            plot_log(log, **arguments)
-    with pytest.raises(ConfigurationError, match="no path"):
-        plot_log(5)
-    with pytest.raises(ConfigurationError, match="0 periods"):
-        plot_log(DecisionLog(COLUMNS))
+@pytest.mark.parametrize(
+    ("given", "more", "reason"),
+    [
+        (log_of(SAFE), {"start": 3.0}, "start = 3.0"),
+        (log_of(SAFE), {"start": 0.3, "end": 0.2}, "from 0 to 0.4 s"),
+        (log_of(SAFE), {"out": "log.exe"}, "FILE.png"),
+        (log_of(SAFE), {"out": "none/log.png"}, "does not exist"),
+        (log_of(SAFE), {"out": 3}, "no path; give FILE"),
+        (5, {}, "no path"),
+        (DecisionLog(COLUMNS), {}, "0 periods"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(tmp_path, monkeypatch, given, more, reason):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigurationError, match=reason):
+        plot_log(given, **more)
     assert not list(tmp_path.iterdir())
-
-
-def texts_of(figure):
-    return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
 def with_barriers(rows, names=None, bounds=(-1.0, 1.0), proposed=0.0):
@@ -143,8 +133,9 @@ def test_the_panel_says_where_it_is_cut_off():
 @pytest.mark.parametrize(
     ("h", "u"),
     [
-        *(([np.nan, 1.0], 0.0), ([np.nan, np.nan], 1e308), ([np.inf, -np.inf], -1e30)),
-        *(([1e308, -1e308], 1e308), ([1e-320, 0.0], 1e-320), ([1e30, 1e30], 0.0)),
+        ([np.nan, np.nan], 1e308),
+        ([np.inf, -np.inf], -1e30),
+        ([1e-320, 0.0], 1e-320),
     ],
 )
 def test_numbers_that_cannot_be_drawn(h, u, tmp_path):
@@ -154,24 +145,16 @@ def test_numbers_that_cannot_be_drawn(h, u, tmp_path):
     assert (tmp_path / "log.pdf").stat().st_size > 1000
 
 
-def test_times_that_cannot_be_drawn(tmp_path):
-    for times in ((-1e308, 1e308), (3.0, 3.0), (1e17, 1e17)):
-        log = DecisionLog(LogColumns.of(("x",), ("u",), ("h",)))
-        for t in times:
-            log.append([t, 0, 0, 0, -1, 1, 1, 0, 0, 1, -1])
-        plot_log(log, tmp_path / "log.pdf")
+@pytest.mark.parametrize("times", [(-1e308, 1e308), (1e17, 1e17)])
+def test_times_that_cannot_be_drawn(times, tmp_path):
+    log = DecisionLog(LogColumns.of(("x",), ("u",), ("h",)))
+    for t in times:
+        log.append([t, 0, 0, 0, -1, 1, 1, 0, 0, 1, -1])
+    plot_log(log, tmp_path / "log.pdf")
 
 
-def test_names_that_no_font_has(tmp_path):
-    for name in ("a\rb", "\ufeffa", "\u202e", "a\x00"):
-        columns = LogColumns((name,), (name,), (name,), units={name: name})
-        log = DecisionLog(columns)
-        log.append([0, 0, 0, 0, -1, 1, 1, 0, 0, 1, -1])
-        plot_log(log, tmp_path / "log.pdf")
-
-
-def test_what_is_no_path_or_log_is_refused():
-    log = log_of(SAFE)
-    for path in (3, b"x.png"):
-        with pytest.raises(ConfigurationError, match="no path; give FILE"):
-            plot_log(log, path)
+def test_names_that_are_no_mathematics_or_in_no_font(tmp_path):
+    names = ("$\\frac{", "a\rb", "\ufeffa", "\u202e", "a\x00")
+    log = DecisionLog(LogColumns(names, names, names, units={name: name for name in names}))
+    log.append([0, *[0] * 15, *[-1] * 5, *[1] * 5, *[1] * 5, *[0] * 5, 0, 1, -1])
+    plot_log(log, tmp_path / "log.pdf")

@@ -11,7 +11,6 @@ import pytest
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.scripts.figures import sweep
 from safe_envs.scripts.figures.sweep import Layout, _rate, draw, figure_of
-from safe_envs.scripts.options.evaluation_options import WIDTHS
 from tests.readable import figure_texts, unreadable
 
 pytestmark = pytest.mark.slow
@@ -33,6 +32,7 @@ def rows_of(**values: Any) -> list[dict[str, Any]]:
             "ci_high": high,
         }
         row |= {"config": '{"title": "mine"}', "row": '{"learning": null}'}
+        row |= {"error": None, "return_mean": float(k)}
     return rows
 
 
@@ -79,18 +79,17 @@ def test_the_band_of_seeds_that_learned_anew_is_over_what_they_learned_too():
     assert _rate(same) == (6 / 60, *rate_interval(6, 60))
 
 
-def test_what_no_cell_has_yet_is_drawn_as_the_envs_own(tmp_path: Path):
+def test_what_no_cell_has_yet_is_drawn_as_the_envs_own():
     rows = [{**row, "start": None} for row in rows_of(noise=[0.1, 0.2])]
     layout = Layout.of(rows, ("noise", "start"))
     assert layout == Layout("noise", "start", ())
-    assert draw(rows, layout, tmp_path / "rates.svg") == 0
+    assert figure_of(rows, layout)[1] == 0
 
 
 @pytest.mark.parametrize(
     ("swept", "given", "panels"),
     [
-        (SWEPT, (), ("dt = 0.1", "dt = 0.2")),
-        (SWEPT, ("filter", "noise"), ("dt = 0.1",)),
+        (SWEPT, ("filter", "noise"), ("dt = 0.1", "dt = 0.2")),
         (("seed",), (), ("mine: safety rate",)),
     ],
 )
@@ -98,17 +97,51 @@ def test_a_picture_of_each_kind(
     tmp_path: Path, swept: tuple[str, ...], given: tuple[str, ...], panels: tuple[str, ...]
 ):
     path = tmp_path / "rates.svg"
-    assert draw(ROWS, Layout.of(ROWS, swept, *given), path) == 0
+    assert draw(ROWS, swept, path, "double", *given) == f"The picture: {path}"
     text = path.read_text()
     assert all(panel in text for panel in panels)
 
 
 def test_panels_without_room_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sweep, "_MOST_PANELS", 3)
-    layout = Layout("dt", "noise", ("filter", "seed"))
-    assert draw(ROWS, layout, tmp_path / "rates.svg") == 5
-    assert "filter = none, seed = 2" in (text := (tmp_path / "rates.svg").read_text())
-    assert "seed = 3" not in text
+    rows = rows_of(filter=FILTERS, noise=[0.3, 0.1], dt=[0.1, 0.2], start=[*"abcd"])
+    swept, path = ("filter", "noise", "dt", "start"), tmp_path / "rates.svg"
+    assert "without 5 of its panels" in draw(rows, swept, path, "double", "dt", "noise")
+    assert "filter = none, start = c" in (text := path.read_text())
+    assert "start = d" not in text
+
+
+PROMISES = ("none", "promise:p=0.9", "promise:p=0.99")
+
+
+@pytest.mark.parametrize(
+    ("given", "layout"),
+    [
+        ({"env": ["one", "two"]}, Layout(None, "filter", ("env",), returns=True)),
+        ({"noise": [0.1, 0.2]}, Layout("noise", "filter", ())),
+    ],
+)
+def test_promises_at_several_p_are_compared_by_return_over_violations(given, layout):
+    rows = rows_of(filter=PROMISES, seed=[0, 1], **given)
+    assert Layout.of(rows, ("filter", "seed", *given)) == layout
+    assert not Layout.of(rows, ("filter", "seed", *given), "filter").returns
+
+
+def test_a_point_is_the_pooled_return_over_the_pooled_violations():
+    rows = rows_of(filter=PROMISES, seed=[0, 1])
+    figure, _ = figure_of(rows, Layout.of(rows, ("filter", "seed")), "single")
+    (axes,) = figure.axes
+    found = [tuple(each.lines[0].get_xydata()[0]) for each in axes.containers]
+    assert found == [
+        pytest.approx((1 - (one["safe"] + other["safe"]) / 40, one["return_mean"] + 0.5))
+        for one, other in zip(rows[::2], rows[1::2], strict=True)
+    ]
+    assert axes.get_legend_handles_labels()[1] == list(PROMISES)
+    assert unreadable(*figure_texts(figure)) == []
+    # A cell that one panel lacks stays in the legend, which is that of the first one.
+    rows = rows_of(env=["one", "two"], filter=PROMISES)[1:]
+    figure, _ = figure_of(rows, Layout.of(rows, ("env", "filter")), "double")
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [*PROMISES[1:], "none"]
 
 
 MANY = {
@@ -129,10 +162,13 @@ MANY = {
 }
 
 
-@pytest.mark.parametrize("size", list(WIDTHS))
 @pytest.mark.parametrize(
-    ("names", "swept"),
-    [("short", ("filter",)), ("long", ("filter", "noise")), ("short", ("filter", "noise", "dt"))],
+    ("names", "swept", "size"),
+    [
+        ("short", ("filter",), "single"),
+        ("long", ("filter", "noise"), "single"),
+        ("short", ("filter", "noise", "dt"), "double"),
+    ],
 )
 def test_eight_filters_can_be_read_and_told_apart(names: str, swept: tuple[str, ...], size: str):
     values = {"filter": MANY[names], "noise": [0.1, 0.2, 0.3], "dt": [0.1, 0.2]}

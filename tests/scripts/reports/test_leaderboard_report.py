@@ -34,7 +34,7 @@ def report(**changes):
     found.missing[SCALAR, "ppo behind backup", None] = "no grid"  # pyright: ignore[reportIndexIssue]
     found.missing[PENDULUM, "ppo behind backup", None] = "no grid"  # pyright: ignore[reportIndexIssue]
     entries = [entry_of(found, env_id, variant) for env_id, variant in safe]
-    given = {"best": {SCALAR: "too many coordinates"}, "frontiers": {}}
+    given = {"best": {SCALAR: "too many coordinates"}}
     return LeaderboardReport(
         found,
         tuple(entry for entry in entries if entry),
@@ -46,7 +46,7 @@ def report(**changes):
 def test_a_variant_of_fewer_seeds_and_few_seeds_are_told():
     found = result({(SCALAR, "ppo"): [50, 49, 48, 50], (SCALAR, "nominal"): [0] * 5})
     entries = [entry_of(found, SCALAR, variant) for variant in ("ppo", "nominal")]
-    few = LeaderboardReport(found, tuple(e for e in entries if e), {}, {}, {})
+    few = LeaderboardReport(found, tuple(e for e in entries if e), {}, {})
     assert "| ppo, 4 seeds | " in leaderboard_markdown(few, {})
     assert "| nominal | " in leaderboard_markdown(few, {})
     assert any("91 % of the cases" in note for note in leaderboard_notes(few))
