@@ -228,7 +228,7 @@ def whole(tmp_path_factory):
     return outcome(folder)
 
 
-@pytest.mark.parametrize("size", [0, 300, 3000, 20_000])
+@pytest.mark.parametrize("size", [300, 20_000])
 def test_a_full_disk_leaves_what_was_there_and_nothing_else(size, whole, copied):
     folder, _ = copied
     for_more = {path.name for path in folder.iterdir()} | {"policy.npz"}

@@ -244,17 +244,6 @@ def test_the_derivative_acts_on_rises_alone_and_smoothing_is_an_exponential_mean
     np.testing.assert_allclose(found[1:], 0.8 ** np.arange(1, 11), rtol=1e-12)
 
 
-def test_a_static_plant_approaches_the_limit_geometrically():
-    """J = c - g lambda under integral control: the excess shrinks by 1 - g k_i at each update."""
-    multiplier, c, g = PIDMultiplier(0.5, 0.0, 0.3, 0.0), 4.0, 0.7
-    costs = []
-    for _ in range(60):
-        costs.append(c - g * multiplier.value)
-        multiplier.update(costs[-1])
-    wanted = 3.5 * (1.0 - 0.3 * 0.7) ** np.arange(60)
-    np.testing.assert_allclose(np.array(costs) - 0.5, wanted, atol=1e-12)
-
-
 @pytest.mark.parametrize(("kp", "ki"), [(0.0, 0.05), (0.6, 0.05), (1.0, 0.3)])
 def test_an_integrating_plant_answers_as_the_second_order_system_does(kp, ki):
     """J' = J - g lambda + w: the excess obeys a recurrence of order two with known roots.

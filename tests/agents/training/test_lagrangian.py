@@ -98,11 +98,6 @@ def same(one, other):
     return all((a[k] is b[k] is None) or torch.equal(a[k], b[k]) for k in a)
 
 
-def all_finite(model):
-    tensors = [*parameters(model).values(), *model.cost_critic.state_dict().values()]
-    return all(t is None or bool(torch.isfinite(t).all()) for t in tensors)
-
-
 def scalars(**options):
     return make_sb3_env("safe_envs/Scalar-v0", 4, horizon=0.5, **options)
 
@@ -173,20 +168,6 @@ def test_all_that_is_random_follows_from_the_seed(kind):
     assert one.constraint.state() == again.constraint.state()
     first, other = (made(kind, corridors(), seed=s).cost_critic.state_dict() for s in (1, 2))
     assert not all(torch.equal(first[name], other[name]) for name in first)
-
-
-@BOTH
-def test_a_limit_of_zero_gives_finite_numbers(kind):
-    model = learned(kind, cost_limit=0.0)
-    assert all_finite(model)
-    assert np.isfinite(list(model.constraint.figures().values())).all()
-
-
-def test_without_costs_the_multiplier_stays_zero():
-    env = unsafe(start=(0.0,), horizon=0.04)
-    model = made(SACLagrangian, env, cost_limit=0.0).learn(100)
-    assert model.constraint.episode_cost == model.constraint.value == 0.0
-    assert all_finite(model)
 
 
 @pytest.mark.parametrize("scale", [None, 3.0])
@@ -469,7 +450,7 @@ def test_the_env_is_the_process():
     bold = np.array([0.9, 0.4, 0.2])
     env, sums, total = IcyRoad(), [], np.zeros(2)
     observation, _ = env.reset(seed=0)
-    for _ in range(40_000):
+    for _ in range(10_000):
         action = 2.0 * bold[int(observation.argmax())] - 1.0
         observation, reward, terminated, _, info = env.step([action])
         total += reward, info["cost"]
