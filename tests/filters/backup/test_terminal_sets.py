@@ -236,14 +236,12 @@ def test_a_law_that_jumps_elsewhere_is_kept_away_from_the_jump():
     assert float(terminal.subs({x: 0.09})) > 0.0 > float(terminal.subs({x: 0.11}))
 
 
+PIECES = sp.Piecewise((-x - 1, x > 0.1), (-x, True))
+
+
 def cart(**rest):
-    given = {
-        "extent": {x: 1.0, v: 1.0},
-        "gain": 2.0,
-        "input_bounds": (-1.0, 1.0),
-        "barrier": 1 - x,
-        **rest,
-    }
+    given = {"extent": {x: 1.0, v: 1.0}, "gain": 2.0, "input_bounds": (-1.0, 1.0), **rest}
+    given.setdefault("barrier", 1 - x)
     law = BackupLaw("rest", (-x - k * v,), equilibrium={x: 0, v: 0}, extent=given.pop("extent"))
     return made([v, 0], law, **given)
 
@@ -256,30 +254,12 @@ def cart(**rest):
         (lambda: cart(barrier=-x - 1, start=[-2, 0]), ConfigurationError, "rest"),
         (lambda: cart(input_bounds=(0.5, 1.0)), ConfigurationError, "rest"),
         (lambda: cart(extent={x: 1.0}), SystemDefinitionError, "extent of v"),
-        (
-            lambda: made([v, 0], BackupLaw("a", (-v,), equilibrium={v: 0}, extent={v: 1.0}), 1 - x),
-            SystemDefinitionError,
-            "x",
-        ),
+        (lambda: made([v, 0], to_zero(-v, 1.0, (v,)), 1 - x), SystemDefinitionError, "x"),
         # What the coordinates depend on belongs to them.
-        (
-            lambda: made([v, -x], BackupLaw("a", (-v,), equilibrium={v: 0}, extent={v: 1}), 1 - v),
-            SystemDefinitionError,
-            "v depends on x",
-        ),
-        (
-            lambda: made(
-                [v, 0], BackupLaw("a", (-x - v,), equilibrium={v: 0}, extent={v: 1}), 1 - v
-            ),
-            SystemDefinitionError,
-            "law itself depends on x",
-        ),
+        (lambda: made([v, -x], to_zero(-v, 1, (v,)), 1 - v), SystemDefinitionError, "depends on x"),
+        (lambda: made([v, 0], to_zero(-x - v, 1, (v,)), 1 - v), SystemDefinitionError, "law itsel"),
         (lambda: made([-x], to_zero(-ANGLE + sp.atan2(-0.1, -1))), SystemDefinitionError, "jumps"),
-        (
-            lambda: made([-x], to_zero(sp.Piecewise((-x - 1, x > 0.1), (-x, True)))),
-            SystemDefinitionError,
-            "Piecewise",
-        ),
+        (lambda: made([-x], to_zero(PIECES)), SystemDefinitionError, "Piecewise"),
         (lambda: made([-x], to_zero(sp.floor(x))), SystemDefinitionError, "interval form"),
         (lambda: made([-x], to_zero(-sp.sqrt(x - 0.1))), ConfigurationError, "said"),
         (lambda: made([-x], to_zero(-x, 1e-300)), ConfigurationError, "extent.* said"),
