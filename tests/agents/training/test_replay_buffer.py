@@ -48,11 +48,6 @@ SPACES = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (2,)))
 TWO_INPUTS = ((0.0, 4.0), (-3.0, 5.0))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def make(horizon=0.5, filtered=True, input_bounds=BOX):
     env = gym.make(ENV_ID, horizon=horizon, input_bounds=input_bounds)
     return Monitor(SafetyFilterWrapper(env, "scbf") if filtered else env)
@@ -561,16 +556,6 @@ def test_n_step_returns_of_executed_actions_are_without_the_penalty():
     )
     np.testing.assert_allclose(executed, free, rtol=1e-5, atol=1e-6)
     assert np.any(free - proposed > 0.1)
-
-
-def test_penalties_pass_through_the_wrappers():
-    options = {"intervention_penalty": 2.0, "horizon": 0.25, "input_bounds": BOX}
-    env = VecNormalize(VecMonitor(make_sb3_env(ENV_ID, 3, "scbf", **options)))
-    model, _ = learned(SAC, env, **replay_options(env, "both"))
-    rewards = model.replay_buffer.rewards[: model.replay_buffer.size()]
-    distances = np.abs(stored(model)[0::2] - stored(model)[1::2])[..., 0]
-    assert np.any(distances > 0.1)
-    np.testing.assert_allclose(rewards[0::2] - rewards[1::2], 2.0 * distances, atol=1e-5)
 
 
 ONE_INPUT = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (1,)))

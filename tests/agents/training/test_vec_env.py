@@ -5,14 +5,12 @@ from __future__ import annotations
 
 import copy
 import pickle
-import sys
-from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize, VecVideoRecorder
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.training.vec_env import SB3VecEnv, make_sb3_env
@@ -252,27 +250,6 @@ def test_render_of_each_env_is_its_picture():
     (last,) = env.env_method("render", indices=2)
     np.testing.assert_array_equal(last, pictures[2])
     assert (last != pictures[0]).any()
-
-
-def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
-    # The render mode, the frame rate in the metadata, and one picture of all envs, here from a
-    # stand-in for rendering.
-    native = make_sb3_env(DUBINS, 2).env
-    native.render_mode = "rgb_array"
-    native.metadata = {**native.metadata, "render_modes": ["rgb_array"], "render_fps": 20}
-    monkeypatch.setattr(
-        type(native),
-        "render",
-        lambda self: tuple(np.full((4, 6, 3), i, dtype=np.uint8) for i in range(self.num_envs)),
-    )
-    monkeypatch.setitem(sys.modules, "moviepy", ModuleType("moviepy"))
-    recorder = VecVideoRecorder(SB3VecEnv(native), str(tmp_path), lambda _: True, video_length=5)
-    assert recorder.frames_per_sec == 20
-    assert [picture.max() for picture in recorder.get_images()] == [0, 1]
-    recorder.reset()
-    recorder.step(np.zeros((2, 1), dtype=np.float32))
-    assert [frame.shape for frame in recorder.recorded_frames] == [(8, 6, 3)] * 2
-    recorder.recorded_frames.clear()
 
 
 def test_penalty_is_the_distance_in_units_of_the_box():
