@@ -93,7 +93,12 @@ SMALL_MEMORY = {
 }
 COSTS = {"env_id": SCALAR, "filter": None, "cost_limit": 0.5}
 VIOLATIONS = {"env_id": SCALAR, "action": "both", "violation_limit": 0.1}
-ESTIMATED = {"filter": "scbf:belief=0.05", "estimator": "ekf", "options": MEASURED}
+ESTIMATED = {
+    "env_id": SCALAR,
+    "filter": "scbf:belief=0.05",
+    "estimator": "ekf",
+    "options": MEASURED,
+}
 NOISE = {"noise_type": "ornstein-uhlenbeck", "noise_std": 0.3}
 CASES = {
     "rewards-normalised": ("ppo", {"normalize": {"norm_obs": False}, "stats_window_size": 3}, {}),
