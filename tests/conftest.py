@@ -21,6 +21,7 @@ import hypothesis
 import pytest
 
 import safe_envs
+from safe_envs.engine.program import Program
 from safe_envs.problem.problem import SafetyProblem
 
 # The expressions that SymPy keeps are many: to look through all of them for garbage as often as
@@ -70,6 +71,12 @@ EVERY_ENV = tuple(
 def env_id(request: pytest.FixtureRequest) -> str:
     """Every registered id in turn, in `make oracle`; else the `FOUR`."""
     return request.param
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run programs as plain Python, which need no compilation."""
+    monkeypatch.setattr(Program, "compiled", Program.plain)
 
 
 _PROBLEMS: dict[str, SafetyProblem] = {}

@@ -13,7 +13,7 @@ import math
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -140,7 +140,8 @@ class _Link:
                 )
             return
         self._found[name] = module, node
-        for each in _names(_bare(node) if isinstance(node, ast.FunctionDef) else node):
+        is_function = isinstance(node, ast.FunctionDef)
+        for each in _kernel(module, name)[1] if is_function else _names(node):
             self.need(module, each)
 
     def definitions(self) -> Definitions:
@@ -157,7 +158,9 @@ class _Link:
         parts += [ast.unparse(constants[name]) for name in sorted(constants)]
         for name, node in sorted(functions.items()):
             mark = "entry" if name in entries else "kernel"
-            parts.append(f"@{mark}\n{ast.unparse(_bare(node))}\n")
+            own = name in self._generated
+            text = ast.unparse(_bare(node)) if own else _kernel(self._found[name][0], name)[0]
+            parts.append(f"@{mark}\n{text}\n")
         return "\n".join(parts)
 
 
@@ -178,6 +181,13 @@ def _parsed(module: str) -> _Module:
         elif isinstance(node, ast.ImportFrom) and node.module:
             known.imports.update({a.asname or a.name: (node.module, a.name) for a in node.names})
     return known
+
+
+@cache
+def _kernel(module: str, name: str) -> tuple[str, frozenset[str]]:
+    """Return a kernel's text without docstring and annotations, and the names in it."""
+    bare = _bare(_parsed(module).functions[name])
+    return ast.unparse(bare), frozenset(_names(bare))
 
 
 def _bare(node: ast.FunctionDef) -> ast.FunctionDef:

@@ -34,9 +34,9 @@ def test_what_is_certified_is_checked_from_its_file(tmp_path: Path):
 
 def test_the_best_attainable_safety_is_of_the_plant():
     problem = problem_of(SCALAR)
-    coarse, _ = safe_envs.best(problem, episodes=0, cells=(61,))
-    fine, policy = safe_envs.best(SCALAR, episodes=0, cells=(241,))
-    assert (policy.settings.knowledge, policy.settings.cells) == ("plant", (241,))
+    coarse, _ = safe_envs.best(problem, episodes=0, cells=(31,))
+    fine, policy = safe_envs.best(SCALAR, episodes=0, cells=(121,))
+    assert (policy.settings.knowledge, policy.settings.cells) == ("plant", (121,))
     ends = [(found.lower or 0.0, found.upper or 0.0) for found in (coarse, fine)]
     (low, high), (finer_low, finer_high) = ends
     assert low <= finer_high

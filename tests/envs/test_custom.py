@@ -108,14 +108,12 @@ def test_a_file_that_changed_is_read_anew(tmp_path):
 
 def test_modules_beside_the_file_can_be_imported(tmp_path):
     (tmp_path / "beside_it.py").write_text("EDGE = 1.5")
-    statement = "from beside_it import EDGE\n" + STATEMENT.replace(
-        "edge: float = 1.0", "edge: float = EDGE"
-    )
-    assert (
-        load_system(place(tmp_path, statement=statement))()
-        .barriers[0]
-        .expression.has(sp.Float(1.5))
-    )
+    text = STATEMENT.replace("edge: float = 1.0", "edge: float = EDGE")
+    problem = load_system(place(tmp_path, statement=f"from beside_it import EDGE\n{text}"))()
+    assert problem.barriers[0].expression.has(sp.Float(1.5))
+
+
+BESIDE, BARRIER = "from beside_it import EDGE", "from safe_envs import Barrier"
 
 
 def own(folder: Path, text: str, name: str = "problem") -> str:
@@ -135,25 +133,10 @@ def own(folder: Path, text: str, name: str = "problem") -> str:
         ("1 / 0", "problem", ConfigurationError, "line 1: ZeroDivisionError"),
         ("def problem():\n    1 / 0", "problem", ConfigurationError, "line 2: ZeroDivisionError"),
         ("def problem():\n    raise SystemExit(0)", "problem", ConfigurationError, "SystemExit"),
-        (
-            "def problem():\n    from beside_it import EDGE\n    return EDGE",
-            "problem",
-            ConfigurationError,
-            "returned float",
-        ),
+        (f"def problem():\n    {BESIDE}\n    return EDGE", "problem", ConfigurationError, "float"),
         ("def problem(*, radius): pass", "problem", ConfigurationError, "'radius'"),
-        (
-            "from safe_envs import Barrier\n\nBarrier('x')",
-            "problem",
-            SystemDefinitionError,
-            "own.py in line 3",
-        ),
-        (
-            STATEMENT.replace("(edge - x)", "(x - edge)"),
-            "problem",
-            SystemDefinitionError,
-            "sign",
-        ),
+        (f"{BARRIER}\n\nBarrier('x')", "problem", SystemDefinitionError, "own.py in line 3"),
+        (STATEMENT.replace("(edge - x)", "(x - edge)"), "problem", SystemDefinitionError, "sign"),
     ],
 )
 def test_what_is_no_statement_is_explained(tmp_path, text, name, error, fragment):

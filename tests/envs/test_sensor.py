@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import sympy as sp
-from gymnasium.envs.registration import EnvSpec
 from scipy.stats import binomtest, chi2, kstest
 
 from safe_envs import SafeEnv, SafeVectorEnv
@@ -212,25 +209,3 @@ def test_a_violation_ends_the_episode_by_the_true_state():
             steps += 1
         ends.append(steps)
     assert ends[0] == ends[1]
-
-
-@pytest.mark.parametrize(
-    "given", ["default", COMPLETE, {"x_1": 0.1, "gap": {"noise": 0.2}, "delay": 1}]
-)
-def test_envs_are_made_again_of_their_spec(given):
-    env = gym.make(ACC, measurement=given, sensor_noise=2.0)
-    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert json.loads(env.spec.to_json())["kwargs"]["measurement"] == given
-    assert again.unwrapped.problem.measurement == env.unwrapped.problem.measurement
-    batch = gym.make_vec(ACC, 2, measurement=given, sensor_noise=2.0)
-    np.testing.assert_array_equal(batch.reset(seed=0)[0][0], again.reset(seed=0)[0])
-
-
-def test_pictures_are_of_the_true_state():
-    frames = []
-    for measurement in (None, ["default:bias=.5"]):
-        env = SafeEnv(problem_of(PENDULUM, measurement=measurement), render_mode="rgb_array")
-        env.reset(seed=0)
-        env.step(np.array([0.5]))
-        frames.append(env.render())
-    np.testing.assert_array_equal(*frames)

@@ -5,8 +5,6 @@ That it plays as its envs do is in `tests/wrappers/test_batches.py`.
 
 from __future__ import annotations
 
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -16,25 +14,18 @@ from gymnasium.wrappers.vector import (
     RecordEpisodeStatistics,
 )
 
-from safe_envs import ConfigurationError, InvalidInputError, NumericalError, SafeVectorEnv
+from safe_envs import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.engine import choice as engines
-from safe_envs.engine.program import Program
 from safe_envs.errors import NotCompilableError
-from safe_envs.systems import vectors
 from safe_envs.wrappers import SafetyFilterVectorWrapper, filter_layers
-from tests.conftest import problem_of
 from tests.wrappers.cases import assert_close as assert_same
+
+pytestmark = pytest.mark.usefixtures("plain")
 
 SCALAR, DUBINS = "safe_envs/Scalar-v0", "safe_envs/StochasticDubins-v0"
 ENGINES = ("numpy", "compiled")
 each_engine = pytest.mark.parametrize("engine", ENGINES)
 with_and_without = pytest.mark.parametrize("condition", [None, "scbf"])
-
-
-@pytest.fixture(autouse=True)
-def plain(monkeypatch):
-    """Run programs as plain Python."""
-    monkeypatch.setattr(Program, "compiled", Program.plain)
 
 
 def made(env_id=DUBINS, condition=None, count=3, engine="numpy", **options):
@@ -160,21 +151,6 @@ def test_a_seed_forgets_the_noise_that_was_drawn_before(engine, condition):
     np.testing.assert_array_equal(ours, theirs)
 
 
-@each_engine
-def test_any_array_is_taken(engine):
-    env = made(condition="scbf", engine=engine)
-    everywhere = np.broadcast_to(True, (3,))
-    env.reset(seed=0, options={"reset_mask": everywhere})
-    first = env.step(np.broadcast_to(0.5, (3, 1)))[0]
-    env.restore({key: np.asfortranarray(v) for key, v in env.snapshot().items()})
-    env.step(np.zeros((6, 1))[::2])
-    env.restore({key: v.tolist() for key, v in env.snapshot().items()})
-    env.reset(options={"reset_mask": np.array([True, False] * 3)[::2]})
-    env.step([[0.1]] * 3)
-    env.reset(seed=0)
-    np.testing.assert_array_equal(env.step([[0.5]] * 3)[0], first)
-
-
 def test_wrappers_of_gymnasium_take_both_engines():
     shown = []
     for engine in ENGINES:
@@ -240,14 +216,6 @@ def test_the_engine_is_part_of_the_spec(monkeypatch):
     made(SCALAR, engine="auto").reset(seed=0)
 
 
-def test_seeds_may_be_a_list():
-    env = made(count=2)
-    first, _ = env.reset(seed=[4, 9])
-    np.testing.assert_array_equal(first[1], env.reset(seed=[9, 4])[0][0])
-    np.testing.assert_array_equal(first, env.reset(seed=np.array([4, 9]))[0])
-    np.testing.assert_array_equal(env.reset(seed=np.int64(4))[0], env.reset(seed=4)[0])
-
-
 MASKS = (np.array([True]), np.array([1, 0]), np.array([False, False]))
 
 
@@ -280,24 +248,3 @@ def test_reset_masks_may_be_used_again():
     _, info = _reset(made(SCALAR, count=2), mask)
     mask[:] = False
     np.testing.assert_array_equal(info["_cost"], [True, False])
-
-
-def test_a_fixed_start_is_that_of_every_env():
-    start = [2.0, 1.3, 0.3, 0.5, 1.0]
-    envs = SafeVectorEnv(problem_of("safe_envs/DubinsObstacle-v0", start=start), 3)
-    envs.reset(seed=0)
-    np.testing.assert_array_equal(envs.state, [start] * 3)
-    envs.reset(options={"reset_mask": np.array([True, False, True])})
-    np.testing.assert_array_equal(envs.state, [start] * 3)
-
-
-def test_the_batched_class_is_one_object_by_name(env_id):
-    kind = type(gym.make_vec(env_id, num_envs=1).unwrapped)
-    assert kind is getattr(vectors, kind.__name__) is pickle.loads(pickle.dumps(kind))
-    assert gym.spec(env_id).vector_entry_point == f"{kind.__module__}:{kind.__name__}"
-
-
-@pytest.mark.parametrize("name", ["Scalar", "NobodyVector", "Vector"])
-def test_no_batched_class_of_another_name(name):
-    with pytest.raises(AttributeError, match=name):
-        getattr(vectors, name)

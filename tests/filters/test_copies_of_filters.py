@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -82,3 +84,79 @@ def test_policies(name, system, copied):
     other = copied(policy)
     for _ in range(3):
         np.testing.assert_array_equal(other.predict(seen)[0], policy.predict(seen)[0])
+
+
+# After a filter is made or unpickled, no decision imports a module or compiles a formula.
+
+
+# In a process of its own, since other tests import whatever there is.
+_SCRIPT = """
+import sys
+import numpy as np
+import sympy as sp
+from safe_envs import ControlAffineSDE, NumericalError, SafetyFilter
+from safe_envs.dynamics import codegen
+from safe_envs.wrappers import DelayedFilter, SRCBF
+
+def filters_of(m):
+    x, u = sp.symbols(f"x:{m}", real=True), sp.symbols(f"u:{m}", real=True)
+    system = ControlAffineSDE(x, u, [0] * m, np.eye(m, dtype=int).tolist(), [0] * m)
+    h = [1 - x[0], x[0] + x[-1] + 2 - sp.log(4 - x[-1]), 3 - sum(s**2 for s in x)]
+    filters = [
+        SafetyFilter(system, h, "cbf", (-1, 1)),
+        SafetyFilter(system, h[2], "cbf:sampling_margin=first-order", (-1, 1), dt=0.1),
+    ]
+    return filters + [DelayedFilter(made, 2, 0.01) for made in filters]
+
+x, u, p = sp.symbols("x u p", real=True)
+# A shared logarithm has no value where the other piece applies.
+pieces = sp.Piecewise((x * sp.log(x) + x**2 * sp.log(x) ** 2, x > 0), (x, True))
+bent = ControlAffineSDE((x,), (u,), [pieces], [[1]], [[x]], signals={p: 1})
+bent = SafetyFilter(bent, [p - x, x + p], [SRCBF(), "scbf"], (-2, 2))
+each = {m: filters_of(m) for m in (1, 2, 4)}
+known = set(sys.modules)
+
+
+def refuse(*given, **named):
+    raise AssertionError("compiled after construction")
+
+
+codegen._compile = codegen.sp.lambdify = refuse
+rng = np.random.default_rng(0)
+for m, filters in each.items():
+    kinds = set()
+    for made in filters:
+        states, inputs = 1.5 * rng.normal(size=(60, m)), 3 * rng.normal(size=(60, m))
+        states[:, -1] = np.minimum(states[:, -1], 3.0)
+        found = made.filter(states, inputs, input_bounds=(-1, 0.5))
+        restart = getattr(made, "reset", int)
+        restart()
+        for state, proposal in zip(states, inputs, strict=True):
+            one = made.filter(state, proposal)
+            kinds.add((bool(one.feasible), bool(one.active.any())))
+        for bad in (states + 9, states[0] + 9):
+            restart()
+            if np.isneginf(made.filter(bad, np.zeros_like(bad)).barrier).any():
+                kinds.add("undefined")
+    assert kinds == {(True, False), (True, True), (False, True), "undefined"}, kinds
+
+states = np.linspace(-3, 3, 13)[:, None]
+batch = bent.filter(states, np.zeros((13, 1)), parameters={"p": 1.0})
+for i, state in enumerate(states):
+    found = bent.filter(state, [0.0], parameters={"p": 1.0})
+    assert np.allclose(found.action, batch.action[i])
+try:
+    bent.filter([1e200], [0.0], parameters={"p": 1.0})
+except NumericalError:
+    pass
+else:
+    raise AssertionError("no error")
+late = sorted(set(sys.modules) - known)
+assert not late, late
+"""
+
+
+@pytest.mark.slow
+def test_nothing_is_imported_or_compiled():
+    done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True)
+    assert not done.returncode, done.stderr.decode()

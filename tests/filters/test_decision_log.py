@@ -67,17 +67,6 @@ def test_sections_hold_what_was_decided(log, safety_filter):
     assert (len(empty), empty.h_min, str(empty)) == (0, np.inf, "an empty log")
 
 
-def test_headings_have_names_and_units(log):
-    assert log.columns.headings == [
-        *("t [s]", "state:x [m]", "state:y"),
-        *("nominal:u [m/s]", "nominal:w", "action:u [m/s]", "action:w"),
-        *("low:u [m/s]", "low:w", "high:u [m/s]", "high:w"),
-        *("h:wall 1", "h:wall 2", "h:room [m^2]"),
-        *("slack:wall 1", "slack:wall 2", "slack:room"),
-        *("intervention", "feasible", "cause"),
-    ]
-
-
 def test_a_loop_with_a_belief_is_logged_at_its_estimate():
     problem = problem_of("safe_envs/Pendulum-v0", measurement="default")
     found = SafetyFilter.for_problem(problem, "scbf:belief=0.1", estimator="ekf")

@@ -183,13 +183,10 @@ POINT = {"p": 0.0, "q": 1.0}
         ({"parameters": {**POINT, 3: 1.0}}, "parameters gives 3"),
         ({"parameters": {**POINT, "wind": 1.0}}, r"make the filter with adjustable=\('wind',\)"),
         ({"parameters": {**POINT, "t": 1.0}}, "the time is an argument of its own"),
-        ({"parameters": {**POINT, TIME: 1.0}}, "the time is an argument of its own"),
         ({"parameters": {**POINT, p: 1.0}}, "gives p twice"),
         ({"parameters": [0.0, 1.0]}, "give a dict of values by name"),
-        ({"parameters": np.zeros(2)}, "give a dict of values by name"),
         ({"parameters": {**POINT, "p": math.nan}}, "value of p is nan; give finite"),
         ({"parameters": {**POINT, "p": "0"}}, "the value of p is '0'"),
-        ({"parameters": {**POINT, "p": None}}, "the value of p is None"),
         (
             {"parameters": {**POINT, "p": [0.0, 1.0]}},
             r"value of p has the shape \(2,\); give a number",
@@ -199,13 +196,9 @@ POINT = {"p": 0.0, "q": 1.0}
         ({"parameters": POINT, "t": -1.0}, "declared nonnegative"),
         ({"parameters": POINT, "t": math.inf}, "time t is inf; give finite"),
         ({"input_bounds": (1, -1)}, "the lower one first"),
-        ({"input_bounds": (-1, math.nan)}, "the lower one first"),
         ({"input_bounds": (-1, 1e200)}, "within 1e\\+100"),
-        ({"input_bounds": (math.inf, math.inf)}, "finite ones are within"),
-        ({"input_bounds": 1.0}, r"bounds has the shape \(\)"),
         ({"input_bounds": np.zeros((3, 2))}, r"bounds has the shape \(3, 2\)"),
         ({"input_bounds": "wide"}, "the pair of bounds is 'wide'"),
-        ({"input_bounds": (None, 1)}, "the pair of bounds is"),
     ],
 )
 @pytest.mark.parametrize("batch", [(), (4,)])

@@ -47,99 +47,35 @@ def smaller(problem):
     return replace(problem, barriers=(Barrier(barrier.expression - 0.1, "smaller"),))
 
 
-EARLY = {"sampling_margin": "first-order"}
-
-
-@pytest.mark.parametrize(
-    ("problem", "learned", "make", "error", "fragment"),
-    [
-        (
-            "disk",
-            "residual",
-            lambda m: LearnedHOCBF(m, alpha=(1.0, 2.0), **EARLY),
-            ConfigurationError,
-            "first order",
-        ),
-        ("top", "network", lambda m: DDSCBF(m, **EARLY), ConfigurationError, "first order"),
-        *[
-            (
-                "disk",
-                "residual",
-                lambda m, p=p: LearnedHOCBF(m, alpha=p),
-                RelativeDegreeError,
-                f"{len(p)} given",
-            )
-            for p in ((1.0,), (1.0, 2.0, 3.0))
-        ],
-        *[
-            (
-                "disk",
-                "residual",
-                lambda m, s=s: LearnedHOCBF(m, **{"alpha": (1.0, 2.0), **s}),
-                ConfigurationError,
-                next(iter(s)),
-            )
-            for s in (
-                {"eps": -0.1},
-                {"eps": math.nan},
-                {"eps": math.inf},
-                {"eps": True},
-                {"level": 0.0},
-                {"level": 1.0},
-                {"alpha": (1.0, -2.0)},
-            )
-        ],
-        *[
-            ("top", "network", lambda m, s=s: DDSCBF(m, margin=s), ConfigurationError, "margin = ")
-            for s in (-1.0, math.nan, True)
-        ],
-        *[
-            (
-                "gap",
-                "gap_posterior",
-                lambda m, name=name: BayesianSCBF(m, **{name: 0.9}),
-                RelativeDegreeError,
-                "confidence",
-            )
-            for name in ("confidence", "simultaneous")
-        ],
-        *[
-            (
-                "cubic",
-                "posterior",
-                lambda m, name=name: BayesianSCBF(m, **{name: 0.9}, **EARLY),
-                ConfigurationError,
-                "first order",
-            )
-            for name in ("confidence", "simultaneous")
-        ],
-        (
-            "cubic",
-            "posterior",
-            lambda m: BayesianSCBF(m, confidence=0.9, simultaneous=0.9),
-            ConfigurationError,
-            "both",
-        ),
-        *[
-            (
-                "cubic",
-                "posterior",
-                lambda m, name=name, value=value: BayesianSCBF(m, **{name: value}),
-                ConfigurationError,
-                f"{name} = ",
-            )
-            for value in (0.0, 1.0, -0.1, math.nan, True, "much")
-            for name in ("confidence", "simultaneous")
-        ],
+EARLY, RATES = {"sampling_margin": "first-order"}, {"alpha": (1.0, 2.0)}
+LEVELS = ("confidence", "simultaneous")
+RESIDUAL, NETWORK = ("disk", "residual", LearnedHOCBF), ("top", "network", DDSCBF)
+CUBIC, GAP = ("cubic", "posterior", BayesianSCBF), ("gap", "gap_posterior", BayesianSCBF)
+UNFIT = [
+    (RESIDUAL, {**RATES, **EARLY}, "first order"),
+    (NETWORK, EARLY, "first order"),
+    *[(RESIDUAL, {"alpha": p}, f"{len(p)} given") for p in ((1.0,), (1.0, 2.0, 3.0))],
+    *[(RESIDUAL, {**RATES, "eps": e}, "eps") for e in (-0.1, math.nan, math.inf, True)],
+    *[(RESIDUAL, {**RATES, "level": level}, "level") for level in (0.0, 1.0)],
+    (RESIDUAL, {"alpha": (1.0, -2.0)}, "alpha"),
+    *[(NETWORK, {"margin": s}, "margin = ") for s in (-1.0, math.nan, True)],
+    *[(GAP, {name: 0.9}, "confidence") for name in LEVELS],
+    *[(CUBIC, {name: 0.9, **EARLY}, "first order") for name in LEVELS],
+    (CUBIC, {"confidence": 0.9, "simultaneous": 0.9}, "both"),
+    *[
+        (CUBIC, {name: value}, f"{name} = ")
+        for value in (0.0, 1.0, -0.1, math.nan, True, "much")
+        for name in LEVELS
     ],
-)
-def test_what_does_not_suit_a_learned_model_is_refused(
-    problem, learned, make, error, fragment, request
-):
-    with pytest.raises(error, match=fragment):
-        SafetyFilter.for_problem(
-            request.getfixturevalue(problem), make(request.getfixturevalue(learned))
-        )
+]
+
+
+@pytest.mark.parametrize(("where", "arguments", "fragment"), UNFIT)
+def test_what_does_not_suit_a_learned_model_is_refused(where, arguments, fragment, request):
+    problem, learned = (request.getfixturevalue(name) for name in where[:2])
+    of_degree = "given" in fragment or where is GAP
+    with pytest.raises(RelativeDegreeError if of_degree else ConfigurationError, match=fragment):
+        SafetyFilter.for_problem(problem, where[2](learned, **arguments))
 
 
 def test_barriers_that_nothing_was_learned_for_are_refused(disk, residual, top, network):
@@ -259,22 +195,15 @@ def test_exact_generators_make_the_filter_of_the_known_noise(request, name, degr
         assert_same_decisions(problem, stricter, known)
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.5])
-def test_the_direct_way_is_the_learned_noise(gap, diffusion, margin):
-    found = diffusion.diffusion.system(gap.model)
-    for sampled in (margin, "first-order") if margin == 0.0 else (margin,):
-        ours = (
-            DDSCBF(diffusion, sampling_margin=sampled)
-            if sampled == "first-order"
-            else DDSCBF(diffusion, margin=margin)
-        )
-        known = SafetyFilter(
-            found,
-            [(gap.barriers[0], SCBF(sampling_margin=sampled))],
-            input_bounds=gap.input_bounds,
-            dt=gap.dt,
-        )
-        assert_same_decisions(gap, SafetyFilter.for_problem(gap, ours), known, tolerance=1e-12)
+@pytest.mark.parametrize("given", [{}, {"margin": 0.5}, {"sampling_margin": "first-order"}])
+def test_the_direct_way_is_the_learned_noise(gap, diffusion, given):
+    margin = given.get("margin", given.get("sampling_margin", 0.0))
+    rows = [(gap.barriers[0], SCBF(sampling_margin=margin))]
+    known = SafetyFilter(
+        diffusion.diffusion.system(gap.model), rows, input_bounds=gap.input_bounds, dt=gap.dt
+    )
+    ours = SafetyFilter.for_problem(gap, DDSCBF(diffusion, **given))
+    assert_same_decisions(gap, ours, known, tolerance=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -405,29 +334,19 @@ def test_a_generator_without_a_value_is_told_with_the_state(gap):
 # Identified systems
 
 
-@pytest.mark.parametrize("name", ["cubic", "gap"])
-def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name):
-    problem = request.getfixturevalue(name)
-    learned = request.getfixturevalue("posterior" if name == "cubic" else "gap_posterior")
-    for margin in ("none", 0.02) if name == "cubic" else ("none",):
-        ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin=margin))
-        known = SafetyFilter(
-            learned.system,
-            [(problem.barriers[0], SCBF(sampling_margin=margin))],
-            input_bounds=problem.input_bounds,
-        )
-        assert_same_decisions(problem, ours, known, tolerance=1e-12)
-    if name == "cubic":
-        ours = SafetyFilter.for_problem(
-            problem, BayesianSCBF(learned, sampling_margin="first-order")
-        )
-        known = SafetyFilter(
-            learned.system,
-            [(problem.barriers[0], SCBF(sampling_margin="first-order"))],
-            input_bounds=problem.input_bounds,
-            dt=problem.dt,
-        )
-        assert_same_decisions(problem, ours, known, tolerance=1e-12)
+@pytest.mark.parametrize(
+    ("name", "learned", "margin"),
+    [
+        ("gap", "gap_posterior", "none"),
+        *[("cubic", "posterior", m) for m in ("none", 0.02, "first-order")],
+    ],
+)
+def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name, learned, margin):
+    problem, learned = request.getfixturevalue(name), request.getfixturevalue(learned)
+    ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin=margin))
+    rows = [(problem.barriers[0], SCBF(sampling_margin=margin))]
+    known = SafetyFilter(learned.system, rows, input_bounds=problem.input_bounds, dt=problem.dt)
+    assert_same_decisions(problem, ours, known, tolerance=1e-12)
 
 
 def curved_barrier(cubic):

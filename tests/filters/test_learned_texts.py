@@ -31,52 +31,25 @@ from tests.wrappers.learned import assert_same_decisions, situations
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(
-    params=["residual", "network", "diffusion", "most probable", "confident", "simultaneous"]
-)
+KEPT = {
+    "residual": ("disk", LearnedHOCBF, {"alpha": (1.0, 2.0), "eps": 0.0}, ":alpha=1,2:eps=0"),
+    "network": ("top", DDSCBF, {"margin": 0.02}, ":margin=0.02"),
+    "diffusion": ("gap", DDSCBF, {}, ""),
+    "gap_posterior": ("gap", BayesianSCBF, {}, ""),
+    "posterior": ("cubic", BayesianSCBF, {"confidence": 0.8}, ":confidence=0.8"),
+    "simultaneous": ("cubic", BayesianSCBF, {"simultaneous": 0.9}, ":simultaneous=0.9"),
+}
+
+
+@pytest.fixture(params=KEPT)
 def kept(request, tmp_path):
     """A problem, a condition, and the text of the same condition with a file."""
     path = tmp_path / "learned model.npz"
-
-    def of(name):
-        return request.getfixturevalue(name)
-
-    problem, learned, make, text = {
-        "residual": lambda: (
-            of("disk"),
-            of("residual"),
-            lambda m: LearnedHOCBF(m, alpha=(1.0, 2.0), eps=0.0),
-            "learned-hocbf:file={}:alpha=1,2:eps=0",
-        ),
-        "network": lambda: (
-            of("top"),
-            of("network"),
-            lambda m: DDSCBF(m, margin=0.02),
-            "ddscbf:margin=0.02:file={}",
-        ),
-        "diffusion": lambda: (of("gap"), of("diffusion"), DDSCBF, "ddscbf:file={}"),
-        "most probable": lambda: (
-            of("gap"),
-            of("gap_posterior"),
-            BayesianSCBF,
-            "bayesian-scbf:file={}",
-        ),
-        "confident": lambda: (
-            of("cubic"),
-            of("posterior"),
-            lambda m: BayesianSCBF(m, confidence=0.8),
-            "bayesian-scbf:confidence=0.8:file={}",
-        ),
-        "simultaneous": lambda: (
-            *(of("cubic"), of("posterior")),
-            *(
-                lambda m: BayesianSCBF(m, simultaneous=0.9),
-                "bayesian-scbf:file={}:simultaneous=0.9",
-            ),
-        ),
-    }[request.param]()
+    env, kind, parameters, text = KEPT[request.param]
+    name = "posterior" if request.param == "simultaneous" else request.param
+    problem, learned = request.getfixturevalue(env), request.getfixturevalue(name)
     learned.save(path)
-    return problem, make(learned), text.format(path)
+    return problem, kind(learned, **parameters), f"{kind.name}:file={path}{text}"
 
 
 def test_a_condition_from_a_file_is_the_one_from_memory_to_the_last_bit(kept):
@@ -164,19 +137,14 @@ def test_what_corrects_the_model_starts_from_it_whatever_is_known(disk, residual
         SafetyFilter.for_problem(both, (condition, HOCBF((1.0, 2.0))), "plant")
 
 
-def test_files_of_something_else_are_refused(
-    tmp_path, disk, top, gap, cubic, residual, network, diffusion, posterior
-):
-    for name, learned in (
-        ("residual", residual),
-        ("network", network),
-        ("diffusion", diffusion),
-        ("posterior", posterior),
-    ):
-        learned.save(tmp_path / name)
+def test_files_of_something_else_are_refused(tmp_path, disk, top, gap, cubic, request):
+    for name in ("residual", "network", "diffusion", "posterior"):
+        request.getfixturevalue(name).save(tmp_path / name)
     wider = problem_of("safe_envs/CubicSDEDisk-v0", barrier={"radius": 1.1})
     plain = problem_of("safe_envs/ACCGap-v0", barrier={"power": 1})
     obstacle = problem_of("safe_envs/DubinsObstacle-v0")
+    large = problem_of("safe_envs/DubinsDisk-v0", barrier={"radius": 2.0})
+    low = problem_of("safe_envs/Pendulum-v0", barrier={"level": 0.1})
     for text, problem, why in (
         ("ddscbf:file={}/posterior", cubic, "bayesian.*ddscbf"),
         ("bayesian-scbf:file={}/residual", disk, "learned-hocbf.*bayesian"),
@@ -184,16 +152,8 @@ def test_files_of_something_else_are_refused(
         ("learned-hocbf:file={}/residual", obstacle, "its system"),
         ("ddscbf:file={}/network", gap, "its system"),
         ("bayesian-scbf:file={}/posterior", gap, "its system"),
-        (
-            "learned-hocbf:file={}/residual",
-            problem_of("safe_envs/DubinsDisk-v0", barrier={"radius": 2.0}),
-            "its barriers",
-        ),
-        (
-            "ddscbf:file={}/network",
-            problem_of("safe_envs/Pendulum-v0", barrier={"level": 0.1}),
-            "its barriers",
-        ),
+        ("learned-hocbf:file={}/residual", large, "its barriers"),
+        ("ddscbf:file={}/network", low, "its barriers"),
         ("learned-hocbf:file={}/residual", disk.configured(model={"v": 1.7}), "its model"),
         ("ddscbf:file={}/network", top.configured(model={"l": 0.6}), "its model"),
         ("ddscbf:file={}/diffusion", gap.configured(model={"M": 1500.0}), "its model"),
@@ -210,7 +170,7 @@ def test_files_of_something_else_are_refused(
         assert np.isfinite(SafetyFilter.for_problem(problem, condition).filter(x, u).action).all()
 
 
-@pytest.mark.parametrize("kept", ["residual", "confident"], indirect=True)
+@pytest.mark.parametrize("kept", ["residual", "posterior"], indirect=True)
 def test_the_wrappers_take_text_and_conditions(kept):
     problem, condition, text = kept
     env_id = f"safe_envs/{problem.name}-v0"
@@ -224,15 +184,10 @@ def test_the_wrappers_take_text_and_conditions(kept):
         wrapped.reset(seed=3)
     for wrapped in (vector, other):
         wrapped.reset(seed=[3, 4])
+    one, two = (np.ones(e.action_space.shape, dtype=np.float32) for e in (env, vector))
     for _ in range(5):
-        results = [
-            wrapped.step(np.ones(env.action_space.shape, dtype=np.float32))
-            for wrapped in (env, again, remade)
-        ]
-        batches = [
-            wrapped.step(np.ones(vector.action_space.shape, dtype=np.float32))
-            for wrapped in (vector, other)
-        ]
+        results = [wrapped.step(one) for wrapped in (env, again, remade)]
+        batches = [wrapped.step(two) for wrapped in (vector, other)]
         for result in results:
             assert np.array_equal(result[4]["safe_action"], results[0][4]["safe_action"])
             assert np.array_equal(result[0], results[0][0])

@@ -28,11 +28,6 @@ FILTERS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def visited(env_id, count):
     """States that random actions lead to."""
     env = gym.make(env_id)
@@ -309,25 +304,6 @@ def test_names_of_symbols_change_nothing():
         - 4 * b * s
     )
     assert found == [pytest.approx([by_both - 1, by_both - 2 * b - 2 * s**2], rel=1e-12)] * 4
-
-
-def test_learning_through_the_filter():
-    module = TorchFilter(planar(2, 3, seed=2))
-    assert not list(module.parameters())
-    x = torch.tensor(0.5 * np.random.default_rng(0).normal(size=(64, 2)), dtype=torch.float32)
-    wanted = module(x, x @ torch.tensor([[1.0, -0.5], [0.3, 1.0]]))
-    weights = torch.zeros(2, 2, requires_grad=True)
-    losses, intervened = [], False
-    for _ in range(15):
-        found = module(x, x @ weights, return_result=True)
-        loss = (found.action - wanted).square().mean()
-        (slope,) = torch.autograd.grad(loss, weights)
-        with torch.no_grad():
-            weights -= 2.0 * slope
-        losses.append(loss.item())
-        intervened |= bool(found.active.any())
-    assert intervened
-    assert losses[-1] < 0.3 * losses[0]
 
 
 X, U, P = sp.symbols("x u p", real=True)

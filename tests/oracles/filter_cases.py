@@ -125,30 +125,22 @@ ROUND, TILTED, ACROSS = 2 - x**2 - y**2, 1 + x + 0.5 * y + x * y, 1.5 - y + 0.2 
 EARLY = {"sampling_margin": "first-order"}
 ONE = Measured(integrators(1), [1.2 + sp.sin(x), 0.1 * s])
 OTHER = Measured(integrators(1), [1 - s**2 / 9, x, s])
+LIGHT, HEAVY = {"weights": (5.0, 0.2, 1.0)}, {"weights": (5.0, 0.2)}
+BALL, ABOVE = (ROUND - z**2, CBF(1.0)), (ACROSS - z, CBF(0.5))
+ABOUT = (ROUND, Doubtful(1.0, form=(0.1, 0, 0, 0.2, 0.1, 0.2)))
+SLOPING = (x**2, x * s / 4, 0, 0.2 + s**2, 0.1, 0.2)
 CASES: dict[str, tuple[int, list[tuple[Any, Any]], dict[str, Any]]] = {
     "one reciprocal": (1, [(CURVED, SRCBF(0.7))], {}),
     "one sampled": (1, [(CURVED, CBF(1.0, **EARLY))], {}),
     "one on three inputs": (3, [(CURVED + y - z**2, CBF(1.0))], {"weights": (1.0, 3.0, 0.5)}),
-    "several on three": (
-        3,
-        [(ROUND - z**2, CBF(1.0)), (TILTED + z, CBF(2.0, **EARLY)), (ACROSS - z, CBF(0.5))],
-        {"weights": (5.0, 0.2, 1.0)},
-    ),
-    "reciprocal among several on three": (
-        3,
-        [(ROUND - z**2, CBF(1.0)), (TILTED + z, RCBF(2.0)), (ACROSS - z, CBF(0.5))],
-        {},
-    ),
+    "several on three": (3, [BALL, (TILTED + z, CBF(2.0, **EARLY)), ABOVE], LIGHT),
+    "reciprocal among several on three": (3, [BALL, (TILTED + z, RCBF(2.0)), ABOVE], {}),
     "reciprocal on three": (3, [(CURVED + y - z**2, RCBF(1.0))], {"weights": (1.0, 3.0, 0.5)}),
     "sampled on three": (3, [(CURVED + y - z**2, CBF(1.0, **EARLY))], {}),
     "several": (1, [(CURVED, CBF(1.0)), (STEEP, CBF(0.5)), (SLANTED, CBF(2.0, **EARLY))], {}),
     "early reciprocal": (1, [(CURVED, RCBF(1.0, **EARLY)), (STEEP, CBF(1.0, **EARLY))], {}),
     "several reciprocal": (1, [(CURVED, RCBF(1.0)), (STEEP, CBF(0.5)), (SLANTED, SRCBF(2.0))], {}),
-    "plane": (
-        2,
-        [(ROUND, CBF(1.0)), (TILTED, CBF(2.0, **EARLY)), (ACROSS, CBF(0.5))],
-        {"weights": (5.0, 0.2)},
-    ),
+    "plane": (2, [(ROUND, CBF(1.0)), (TILTED, CBF(2.0, **EARLY)), (ACROSS, CBF(0.5))], HEAVY),
     "reciprocal in a plane": (
         2,
         [(ROUND, RCBF(1.0)), (TILTED, SRCBF(1.0)), (ACROSS, CBF(0.5))],
@@ -172,22 +164,15 @@ CASES: dict[str, tuple[int, list[tuple[Any, Any]], dict[str, Any]]] = {
         [(CURVED, CBF(1.0, **EARLY)), (STEEP, Doubtful(0.5, form=(0.1 + x**2, 0.05, 0.3)))],
         {},
     ),
-    "plane above": (2, [(ROUND, Doubtful(1.0, form=(0.1, 0, 0, 0.2, 0.1, 0.2)))], {}),
-    "planes above": (
-        2,
-        [
-            (ROUND, Doubtful(1.0, form=(0.1, 0, 0, 0.2, 0.1, 0.2))),
-            (TILTED, Doubtful(1.0, form=(x**2, x * s / 4, 0, 0.2 + s**2, 0.1, 0.2))),
-        ],
-        {},
-    ),
+    "plane above": (2, [ABOUT], {}),
+    "planes above": (2, [ABOUT, (TILTED, Doubtful(1.0, form=SLOPING))], {}),
     "minimum": (1, [(sp.Min(CURVED, STEEP), CBF(1.0)), (SLANTED, CBF(2.0, **EARLY))], {}),
     "reciprocal minimum": (2, [(sp.Min(ROUND, TILTED), RCBF(1.0)), (ACROSS, CBF(0.5))], {}),
     "maximum": (1, [(sp.Max(CURVED, SLANTED), CBF(1.0))], {}),
     "maximum in a plane": (
         2,
         [(TILTED, CBF(2.0, **EARLY)), (sp.Max(ROUND, ACROSS, -x), CBF(1.0))],
-        {"weights": (5.0, 0.2)},
+        HEAVY,
     ),
     "maxima on three": (
         3,

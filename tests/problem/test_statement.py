@@ -4,6 +4,8 @@ step."""
 from __future__ import annotations
 
 import math
+from dataclasses import fields
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -20,9 +22,12 @@ from safe_envs import (
     SystemDefinitionWarning,
     define_problem,
 )
+from safe_envs.agents.sweeps.spec import ENV_OPTIONS, sections
 from safe_envs.problem.clf import CLF
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS, WHOLE_OPTIONS, ProblemOptions
 from safe_envs.problem.signals import TIME, Feature
 from safe_envs.problem.validation import require_sound
+from safe_envs.registry import make_problem
 from safe_envs.wrappers import SafetyFilter
 
 x, v, u, w, k, sigma = sp.symbols("x v u w k sigma", real=True)
@@ -91,19 +96,15 @@ def test_starts_are_drawn_from_the_ranges_where_all_barriers_are_positive():
         ({"nominal": [u, u]}, SystemDefinitionError, "nominal expression for each of the 1"),
         ({"gains": (1.0,)}, SystemDefinitionError, "relative degree is 2"),
         ({"gains": (1.0, -1.0)}, SystemDefinitionError, "positive numbers"),
-        ({"gains": 2.0}, ConfigurationError, "tuple of rates"),
         ({"barriers": [1 - x**2, 2 - v], "gains": TWO_GAINS}, SystemDefinitionError, "of h_2"),
         ({"noise": 0.1}, ConfigurationError, "parameters of the diffusion"),
         ({"plane": ("x", "y")}, ConfigurationError, "names states"),
-        ({"states": (x,)}, ConfigurationError, "'states'"),
         ({"filters": "scbf"}, ConfigurationError, "did you mean 'filter'"),
         ({"workspace": {x: (2.0, 3.0)}}, SystemDefinitionError, "outside the workspace"),
         ({"workspace": {"x": (-2.0, 3.0)}}, SystemDefinitionError, "the symbol itself"),
-        ({"start": [0.0]}, SystemDefinitionError, "2 states: x, v"),
         ({"start": [(0.0, math.inf), 0.0]}, ConfigurationError, "not finite"),
         ({"input_bounds": (1.0, -1.0)}, ConfigurationError, "lower one below the upper"),
         ({"input_bounds": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "give \\(low, high\\)"),
-        ({"input_bounds": 3.0}, ConfigurationError, "give \\(low, high\\)"),
         ({"system": IDLE}, SystemDefinitionError, "input w never appears"),
         ({"system": BY_NO_INPUT}, RelativeDegreeError, "no action can keep it positive"),
         ({"model": SYSTEM.with_parameters(k=0)}, SystemDefinitionError, "input u never appears"),
@@ -262,3 +263,82 @@ def test_a_text_is_no_function(given):
     # Sympy reads texts by Python's eval.
     with pytest.raises(SystemDefinitionError, match="is a text"):
         CLF(**given)
+
+
+# The options of a problem: read from texts, checked, and the same for every interface.
+
+
+READERS = {option.name: option.metadata["reader"] for option in fields(ProblemOptions)}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("noise", "0.2", 0.2),
+        ("noise", "0.1,.2,0", [0.1, 0.2, 0.0]),
+        ("start", "-1,2e1,.5", [-1.0, 20.0, 0.5]),
+        ("start", "inward", "inward"),
+        ("input_bounds", ["-1,2"], [-1.0, 2.0]),
+        ("input_bounds", ["-1,2", "0,3"], [[-1.0, 2.0], [0.0, 3.0]]),
+        ("plant", ["v=.8", "m=-2"], {"v": 0.8, "m": -2}),
+        ("barrier", ["kind=round", "power=3", "D=3.0"], {"kind": "round", "power": 3, "D": 3.0}),
+    ],
+)
+def test_texts_become_values(name, text, value):
+    assert repr(READERS[name](name, text)) == repr(value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("noise", "a", "--noise 'a'"),
+        ("noise", "", "--noise ''"),
+        ("start", "1,b", "--start '1,b'"),
+        ("input_bounds", ["1"], "'1' has 1 numbers"),
+        ("input_bounds", ["1,2,3"], "'1,2,3' has 3 numbers"),
+        ("input_bounds", ["a,b"], "'a,b'"),
+        *(("plant", [text], "NAME=VALUE") for text in ("v", "=1", "v=")),
+        ("plant", ["v=1", "v=2"], "comes twice"),
+        ("model", ["v=fast"], "'fast' is not a number"),
+    ],
+)
+def test_texts_of_another_form_are_named(name, text, message):
+    with pytest.raises(ConfigurationError, match=message):
+        READERS[name](f"--{name}", text)
+
+
+def test_every_option_can_be_varied_by_a_sweep():
+    kinds = get_type_hints(ProblemOptions)
+    assert {name for name, kind in kinds.items() if kind == int | None} == set(WHOLE_OPTIONS)
+    grid = {"delay": [0, 2], "model_delay": [0, 1], "substeps": [1], "slew_limit": [[-1, 1]]}
+    fixed = {"env": "Pendulum-v0", "filter": "scbf"}
+    _, found, _ = sections({"fixed": fixed, "grid": grid}, "a sweep")
+    assert repr(found) == repr(grid | {"slew_limit": [[-1.0, 1.0]]})
+    forms = ["default", ["default", "delay=2"], {"theta": 0.1, "delay": 1}]
+    listed = sections({"fixed": fixed, "grid": {"measurement": forms}}, "a sweep")[1]["measurement"]
+    assert listed == [["default"], ["default", "delay=2"], ["theta:noise=0.1", "delay=1"]]
+    with pytest.raises(ConfigurationError, match="a sweep: fixed: measurement = 3; give 'default'"):
+        sections({"fixed": fixed | {"measurement": 3}}, "a sweep")
+    with pytest.raises(ConfigurationError, match=r"delay = -1; give a whole number from 0"):
+        sections({"fixed": fixed | {"delay": -1}}, "a sweep")
+    assert {*ENV_OPTIONS, *PARAMETER_GROUPS} == {"system", *OPTION_NAMES}
+
+
+def test_arguments_of_the_barrier_go_to_its_function():
+    problem = make_problem("Scalar-v0", noise=0.0, limit=2.0)
+    assert problem == make_problem("Scalar-v0", barrier={"limit": 2.0}).configured(noise=0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"dt": "fast"}, "dt = "),
+        ({"horizon": float("nan")}, "horizon = "),
+        ({"plant": 3}, "plant = "),
+        ({"barrier": {"limit": 1.0}}, "no barrier argument"),
+        ({"nois": 0.0}, "did you mean 'noise'"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(ConfigurationError, match=message):
+        make_problem("Scalar-v0").configured(**options)

@@ -132,14 +132,6 @@ def test_a_wrong_scene_is_named(scene, fragment):
         env.render()
 
 
-def test_the_view_grows_with_the_trail():
-    from safe_envs.rendering.axes import grown
-
-    assert grown((0.0, 2.0), np.array([0.5, 1.9])) == (0.0, 2.0)
-    assert grown((0.0, 2.0), np.array([0.5, 2.1])) == (-1.0, 3.0)
-    assert grown((0.0, 2.0), np.array([8.9, np.inf])) == (-7.0, 9.0)
-
-
 def four_states(**changes) -> SafetyProblem:
     """A cart with a pole, without a workspace, whose barriers vanish at other scales than 1."""
     x, v, theta, rate, force = sp.symbols("x v theta rate force", real=True)
@@ -170,52 +162,6 @@ def test_states_without_a_workspace_are_shown_with_the_edges_of_the_safe_set():
     low, high = make_scene(four_states(starts={"spread": spread})).range_of(1)
     assert low <= -3.0
     assert high >= 3.0
-
-
-def test_bars_fill_the_scene_with_trails():
-    env = drawn(four_states())
-    first = env.render()
-    # The edges are drawn on the bars of x, theta and rate.
-    assert shown(first[:, SCENE], style.EDGE) > 50
-    stepped(env, 10, 1.0)
-    frame = env.render()
-    for top in (58, 176, 295, 413):
-        below = (slice(top + 58, top + 100), SCENE)
-        assert (frame[below] != first[below]).any(), "no trail below a bar"
-    # Seven states leave no room for trails, and are drawn.
-    states = sp.symbols("a:7", real=True)
-    force = sp.Symbol("force", real=True)
-    chain = ControlAffineSDE(states, (force,), [*states[1:], 0], [0] * 6 + [1], [0] * 7)
-    many = four_states(
-        plant=chain,
-        model=chain,
-        barriers=(Barrier(1 - states[-1]),),
-        states=tuple(Variable(s, -1.0, 1.0) for s in states),
-        starts={"origin": Start.at((0.0,) * 7)},
-    )
-    assert stepped(SafeEnv(many, render_mode="rgb_array"), 1).render().shape == (540, 960, 3)
-
-
-def test_the_name_of_the_smallest_barrier_is_apart_from_its_value(monkeypatch):
-    from safe_envs.rendering.canvas import Canvas
-
-    env = drawn(four_states())
-    env.render()
-    boxes, blit = {}, Canvas.text
-
-    def kept(self, text, at, *arguments, align=(0.0, 0.0), **options):
-        width = blit(self, text, at, *arguments, align=align, **options)
-        boxes[text] = (at[0] - align[0] * width, at[1], width)
-        return width
-
-    monkeypatch.setattr(Canvas, "text", kept)
-    env.render()
-    (name,) = (box for text, box in boxes.items() if text == "smallest: capacity")
-    for text, (left, top, width) in boxes.items():
-        if text.startswith(("now", "least")) or text in ("0 s", "2 s"):
-            assert abs(top - name[1]) > 15 or left + width < name[0] or left > name[0] + name[2], (
-                text
-            )
 
 
 def test_an_obstacle_is_outlined_where_the_first_violation_was():

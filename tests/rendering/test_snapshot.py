@@ -94,24 +94,6 @@ def test_a_decision_is_of_one_step():
     assert history.snapshot.decision is None
 
 
-@pytest.mark.parametrize(
-    ("value", "scale", "text"),
-    [
-        (0.0, 0.0, "0.00"),
-        (-0.004123, 0.0, "\u22120.00412"),
-        (0.5, 0.0, "0.500"),
-        (12.34, 0.0, "12.3"),
-        (0.0123, 5.0, "0.01"),
-        (0.0123, 0.02, "0.0123"),
-        (0.004, 5.0, "0.00"),
-        (1234.0, 0.0, "1\u202f234"),
-        (-0.00012, 0.0, "\u22121.20\u00d710⁻⁴"),
-    ],
-)
-def test_numbers_have_three_digits_that_count(value, scale, text):
-    assert style.number(value, scale) == text
-
-
 @pytest.mark.parametrize("limited", [True, False])
 def test_an_env_without_a_limit_of_time_has_no_horizon(monkeypatch, limited):
     bare = gym.make("Pendulum-v1", render_mode="rgb_array")

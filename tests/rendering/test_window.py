@@ -116,17 +116,6 @@ def test_windows_that_ended_do_not_end_new_ones():
 
 
 @pytest.mark.usefixtures("no_display")
-def test_a_window_leaves_the_display_to_others():
-    import pygame
-
-    env = stepped(gym.make(DUBINS, render_mode="human", dt=0.001), 1)
-    theirs = pygame.display.set_mode((20, 20))
-    env.close()
-    theirs.fill((1, 2, 3))
-    pygame.display.quit()
-
-
-@pytest.mark.usefixtures("no_display")
 def test_a_copy_of_an_env_opens_its_window_when_it_draws():
     env = stepped(SafeEnv(problem_of(DUBINS, dt=0.001), render_mode="human"), 2)
     copied = deepcopy(env)

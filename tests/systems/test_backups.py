@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-import sympy as sp
 from scipy.integrate import quad
 
 from safe_envs.dynamics.codegen import compile_function, stacked
@@ -148,17 +147,6 @@ def test_braking_reaches_the_exact_kernel_of_a_car():
         x = np.stack([speeds, 10.0 + exact * (1 + excess)])
         smallest, _ = known.stays(law, x, 1200)
         assert ((smallest >= 0.0) == kept).all()
-
-
-def test_the_double_integrator_is_the_car_without_drag():
-    known = Simulated("ACCGap", plant={"f_0": 0.0, "f_1": 0.0, "f_2": 0.0, "M": 1.0})
-    (law,) = known.laws.laws
-    u = known.problem.input_bounds[0][1]
-    gap, speed = sp.Symbol("z", real=True), sp.Symbol("v", real=True)
-    b = law.terminal.args if isinstance(law.terminal, sp.Min) else (law.terminal,)
-    expected = gap - 10 - sp.Max(0, speed - 20) ** 2 / (2 * u)
-    values = {gap: 30.0, speed: 25.0}
-    assert any(abs(float((e - expected).subs(values))) < 1e-9 for e in b)
 
 
 def test_numbers_that_allow_no_backup_leave_no_terminal_set():

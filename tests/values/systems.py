@@ -18,6 +18,7 @@ from safe_envs.values.tables import ValueSettings, ValueTable
 
 x, y, u, v, s = sp.symbols("x y u v s", real=True)
 Interval = tuple[float, float]
+COMMON = {"input_bounds": (-1.0, 1.0), "dt": 0.1, "filter": "scbf"}
 
 
 def scalar(
@@ -26,49 +27,18 @@ def scalar(
     """Return dx = (drift + gain u) dt + sigma dW, with h = x on (-1, 2)."""
     size = options.pop("s", 0.4)
     used = sp.sympify(sigma).free_symbols | sp.sympify(drift).free_symbols
-    system = ControlAffineSDE(
-        states=[x],
-        inputs=[u],
-        drift=[drift],
-        input_matrix=[[gain]],
-        diffusion=[[sigma]],
-        parameters={s: size} if s in used else {},
-    )
-    given = {
-        "input_bounds": (-1.0, 1.0),
-        "start": (0.5,),
-        "dt": 0.1,
-        "horizon": 1.0,
-        "workspace": {x: (-1.0, 2.0)},
-        "name": "scalar",
-        "filter": "scbf",
-        **options,
-    }
-    return define_problem(system, barriers, **given)
+    parameters = {s: size} if s in used else {}
+    system = ControlAffineSDE([x], [u], [drift], [[gain]], [[sigma]], parameters)
+    given = {"start": (0.5,), "horizon": 1.0, "workspace": {x: (-1.0, 2.0)}, "name": "scalar"}
+    return define_problem(system, barriers, **{**COMMON, **given, **options})
 
 
 def pursued(**options):
     """Return a state that has to stay away from another one, which moves by itself."""
-    system = ControlAffineSDE(
-        states=[x, y],
-        inputs=[u],
-        drift=[0, sp.Rational(3, 2)],
-        input_matrix=[[1], [0]],
-        diffusion=[[s], [0]],
-        parameters={s: 0.3},
-    )
-    return define_problem(
-        system,
-        (x - y) ** 2 - sp.Rational(1, 25),
-        input_bounds=(-1.0, 1.0),
-        start=(0.6, -0.8),
-        dt=0.1,
-        horizon=1.5,
-        workspace={x: (-1.0, 1.5)},
-        name="pursued",
-        filter="scbf",
-        **options,
-    )
+    system = ControlAffineSDE([x, y], [u], [0, sp.Rational(3, 2)], [1, 0], [s, 0], {s: 0.3})
+    given = {"start": (0.6, -0.8), "horizon": 1.5, "workspace": {x: (-1.0, 1.5)}, "name": "pursued"}
+    barrier = (x - y) ** 2 - sp.Rational(1, 25)
+    return define_problem(system, barrier, **COMMON, **given, **options)
 
 
 def solved(problem: SafetyProblem, *cells: int, **settings: Any) -> ValueTable:

@@ -127,15 +127,6 @@ def test_the_filter_knows_what_it_is_given():
     assert loops[0].fingerprint() != loops[1].fingerprint()
 
 
-def test_zero_is_a_formula():
-    bounds = [
-        closed_loop_table(problem, None, policy, (30,)).start_bounds(POINTS)
-        for problem, policy in ((scalar(0, 0.3, nominal=sp.Integer(0)), "nominal"),
-                                (scalar(0, 0.3), "zero"))
-    ]  # fmt: skip
-    np.testing.assert_array_equal(*bounds)
-
-
 def test_each_closed_loop_has_a_table_of_its_own():
     others = [
         loop(),

@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import functools
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,14 @@ from gymnasium.vector import AutoresetMode
 from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, define_problem
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.filters.conditions.syntax import (
+    files_of,
+    learned_parts,
+    with_absolute_paths,
+)
 from safe_envs.filters.specification import problem_automaton
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.render import split_filters
 from safe_envs.values.look_ahead import LookAhead
 from safe_envs.values.promise_filter import (
     PromiseFilter,
@@ -32,6 +39,7 @@ from safe_envs.wrappers import (
     SafetyFilterWrapper,
     SpecificationMonitorVector,
 )
+from tests.conftest import problem_of
 from tests.oracles.walks import PERIOD, STEPS, exact_values, place_of, walk, worst_inputs
 from tests.values.systems import scalar, solved, x
 
@@ -39,7 +47,7 @@ SAFETY = ""
 REACH = "always safe & eventually goal"
 ORDER = "always safe & eventually (left then right)"
 WINDOW = "eventually[3,9] right"
-TOUCH = "eventually left"
+TOUCH, NESTED = "eventually left", "not A and (B or eventually[1,2] C)"
 
 
 @functools.cache
@@ -240,12 +248,12 @@ def test_for_a_specification_the_proposed_input_is_executed_where_nothing_can_be
 def test_p_is_spent_evenly_and_its_mean_does_not_fall():
     # Noise in boxes shows what the next states have: p_1 = min(c, L_1), with one c for all.
     problem = scalar(-x, 0.3 + 0.3 * x, start=(0.3,), horizon=0.5)
-    played = Episodes(promised(solved(problem, 120, inputs=9), problem, 0.6), 4000)
+    played = Episodes(promised(solved(problem, 120, inputs=9), problem, 0.6), 1000)
     begun = played.reset()["promise"]
-    _, info = played.step(np.full(4000, -1.0))
+    _, info = played.step(np.full(1000, -1.0))
     levels, most = info["promise"], info["promise"].max()
     assert 0.02 < (np.abs(levels - most) < 1e-6).mean() < 1.0
-    error = 3.0 * levels.std() / np.sqrt(4000)
+    error = 3.0 * levels.std() / np.sqrt(1000)
     assert begun[0] - error <= levels.mean() <= begun[0] + error + 0.06
 
 
@@ -283,15 +291,8 @@ def two_inputs(gain, barrier, box, start, dt=1.0, noise=0.02):
     u, v = sp.symbols("u v", real=True)
     inputs, row = ((u, v), [[1, gain]]) if gain else ((u,), [[1]])
     system = ControlAffineSDE((x,), inputs, [0.5], row, [[noise]])
-    return define_problem(
-        system,
-        barrier,
-        input_bounds=box,
-        start=start,
-        dt=dt,
-        horizon=dt,
-        workspace={x: (-3.0, 3.0)},
-    )
+    given = {"start": start, "dt": dt, "horizon": dt, "workspace": {x: (-3.0, 3.0)}}
+    return define_problem(system, barrier, input_bounds=box, **given)
 
 
 def test_two_inputs_move_in_the_euclidean_distance():
@@ -395,9 +396,8 @@ def test_a_late_start_is_no_whole_episode():
         envs.reset(options={"t": PERIOD})
 
 
-@pytest.mark.parametrize("text", [SAFETY, ORDER])
-def test_a_snapshot_has_all_that_is_remembered(text):
-    played = Episodes(filter_of(text, 0.6), 20)
+def test_a_snapshot_has_all_that_is_remembered():
+    played = Episodes(filter_of(ORDER, 0.6), 20)
     envs = played.filtered
     envs.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 20, 1))
@@ -427,9 +427,8 @@ def test_a_snapshot_has_all_that_is_remembered(text):
     np.testing.assert_array_equal(envs.snapshot()["promise"], now["promise"])
 
 
-@pytest.mark.parametrize("text", [SAFETY, ORDER])
-def test_one_env_is_a_batch_of_one(text):
-    chosen = filter_of(text, 0.6)
+def test_one_env_is_a_batch_of_one():
+    chosen = filter_of(ORDER, 0.6)
     one, batch = SafetyFilterWrapper(SafeEnv(chosen.problem), chosen), Episodes(chosen, 1)
     _, info = one.reset(seed=0)
     infos = batch.reset(seed=0)
@@ -447,9 +446,8 @@ def test_one_env_is_a_batch_of_one(text):
             break
 
 
-@pytest.mark.parametrize("text", [SAFETY, REACH])
-def test_copies_and_pickles_decide_alike(text):
-    chosen, infos = filter_of(text, 0.6), []
+def test_copies_and_pickles_decide_alike():
+    chosen, infos = filter_of(REACH, 0.6), []
     assert copy.deepcopy(chosen) is chosen  # Its table may be of gigabytes.
     for each in (chosen, pickle.loads(pickle.dumps(chosen))):
         played = Episodes(each, 50)
@@ -504,3 +502,83 @@ def test_what_is_no_specification_of_the_problem_is_refused(specification, fragm
     settings = PromiseSettings(0.9, specification=specification)
     with pytest.raises(ConfigurationError, match=fragment):
         promise_filter_for(walk(), settings)
+
+
+# The text of the promise filter, and where it is known.
+
+
+@pytest.mark.parametrize(
+    ("text", "settings"),
+    [
+        ("promise:p=0.99", PromiseSettings(0.99)),
+        ("promise:p=0.5:table=a,b.npz", PromiseSettings(0.5, table="a,b.npz")),
+        (
+            "promise:p=0.9:robust=v:0.8..2.4;w:-1.0..-0.5:leaving=safe:table=/a/b+c.npz",
+            PromiseSettings(0.9, (("v", 0.8, 2.4), ("w", -1.0, -0.5)), "safe", table="/a/b+c.npz"),
+        ),
+        (f"promise:p=0.9:spec={REACH}", PromiseSettings(0.9, specification=REACH)),
+        (
+            "promise:p=0.5:leaving=safe:spec=!(A | B) until C then D:table=/a/b,c.npz",
+            PromiseSettings(0.5, (), "safe", "/a/b,c.npz", "!(A | B) until C then D"),
+        ),
+        (
+            f"promise:p=0.9:robust=v:1.0..2.0:spec={NESTED}",
+            PromiseSettings(0.9, (("v", 1.0, 2.0),), specification=NESTED),
+        ),
+    ],
+)
+def test_the_text_of_settings_makes_them_again(text, settings, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert PromiseSettings.of_text(text) == settings
+    assert settings.text == text
+    assert split_filters(f"none,{text},scbf") == ["none", text, "scbf"]
+    # A sweep reads the table, wherever it runs.
+    files = [Path(settings.table)] if settings.table else []
+    assert list(files_of(text)) == files
+    assert list(files_of(with_absolute_paths(text))) == [tmp_path / file for file in files]
+    assert learned_parts(text) == []
+
+
+def test_spaces_do_not_count():
+    settings = PromiseSettings.of_text(" promise:leaving=safe:robust= v :1..3:p=.25 ")
+    assert settings == PromiseSettings(0.25, (("v", 1.0, 3.0),), "safe")
+    assert settings.intervals == {"v": (1.0, 3.0)}
+    settings = PromiseSettings.of_text("promise:spec= always  safe&eventually goal :p=.9")
+    assert settings.text == "promise:p=0.9:spec=always safe&eventually goal"
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("promise", "probability"),
+        ("promise:p", "p no value"),
+        ("promise:q=3:p=.9", "'q'.*robust"),
+        ("promise:robst=v:1..2:p=.9", "'robust'"),
+        ("promise:0.99", "'0.99'"),
+        ("promise:p=0", "p = 0 "),
+        ("promise:p=-.1", "p = -0.1"),
+        ("promise:p=high", "'high'"),
+        ("promise:p=.9:p=.8", "'p' twice"),
+        ("promise:p=.9:leaving=later", "'later'.*violation, safe"),
+        ("promise:p=.9:robust=v", "'v'"),
+        ("promise:p=.9:robust=v:2..1", "v:2..1"),
+        ("promise:p=.9:robust=v:1..inf", "finite"),
+        ("promise:p=.9:robust=v:1..2;v:3..4", "v twice"),
+        ("promise:p=.9:table=", "table"),
+        ("promise:p=.9:spec=", "spec has no"),
+        ("promise:p=.9:spec=always safe:spec=always safe", "'spec' twice"),
+        ("promise:p=.9+scbf", "alone"),
+        ("promise+promise:p=.9", "alone"),
+    ],
+)
+def test_what_cannot_be_read_is_refused(text, fragment):
+    with pytest.raises(ConfigurationError, match=f"(?s){fragment}"):
+        PromiseSettings.of_text(text)
+
+
+def test_settings_that_are_none_are_refused():
+    with pytest.raises(ConfigurationError, match="specification = 3"):
+        PromiseSettings(0.9, specification=3)  # pyright: ignore[reportArgumentType]
+    problem = problem_of("safe_envs/Scalar-v0")
+    with pytest.raises(ConfigurationError, match="'speed'"):
+        PromiseSettings(0.9, (("speed", 0.8, 2.4),)).require_fit(problem)

@@ -13,7 +13,6 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from safe_envs.engine.program import Program
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
 from tests.wrappers.cases import CASES, DUBINS, FEW, SCALAR, actions, of_env, own
@@ -24,12 +23,6 @@ COPIES = {
     "copy": copy.copy,
 }
 copied = pytest.mark.parametrize("copied", COPIES.values(), ids=COPIES)
-
-
-@pytest.fixture
-def plain(monkeypatch):
-    """Run programs as plain Python."""
-    monkeypatch.setattr(Program, "compiled", Program.plain)
 
 
 def plain_of(found):

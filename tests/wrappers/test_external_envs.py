@@ -200,15 +200,9 @@ NEEDED = {key: SWING[key] for key in ("model", "barriers")}
                 ({"state_fn": lambda o: o * np.nan}, InvalidInputError, "finite"),
                 ({"state_fn": lambda o: o["x"]}, InvalidInputError, "state_fn"),
                 ({"state_fn": 3}, ConfigurationError, "state_fn = 3"),
-                (
-                    {"action_map": ActionMap(lambda a: 2 * a, lambda u: u)},
-                    ConfigurationError,
-                    "to_input",
-                ),
-                (
-                    {"action_map": ActionMap(lambda a: a + 3 * np.sin(np.pi * a), lambda u: u)},
-                    ConfigurationError,
-                    "to_input",
+                *(
+                    ({"action_map": ActionMap(to, lambda u: u)}, ConfigurationError, "to_input")
+                    for to in (lambda a: 2 * a, lambda a: a + 3 * np.sin(np.pi * a))
                 ),
                 ({"action_map": 2.0}, ConfigurationError, "action_map = 2.0"),
                 ({"dt": None}, ConfigurationError, "dt"),
@@ -229,17 +223,12 @@ NEEDED = {key: SWING[key] for key in ("model", "barriers")}
             ConfigurationError,
             "SafetyFilterVectorWrapper",
         ),
-        (
-            lambda: SafetyFilterVectorWrapper(
-                SyncVectorEnv([lambda: gym.make("safe_envs/Scalar-v0")]), "scbf"
-            ),
-            ConfigurationError,
-            "make_vec",
-        ),
-        (
-            lambda: SafetyFilterVectorWrapper(gym.make_vec("Pendulum-v1", num_envs=2), "scbf"),
-            ConfigurationError,
-            "not one of this project",
+        *(
+            (lambda make=make: SafetyFilterVectorWrapper(make(), "scbf"), ConfigurationError, says)
+            for make, says in (
+                (lambda: SyncVectorEnv([lambda: gym.make("safe_envs/Scalar-v0")]), "make_vec"),
+                (lambda: gym.make_vec("Pendulum-v1", num_envs=2), "not one of this project"),
+            )
         ),
         (lambda: FilterSpec.load(SPEC.replace(":spec", ":np")), ConfigurationError, "FilterSpec"),
     ],

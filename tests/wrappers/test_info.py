@@ -76,6 +76,7 @@ def assert_contract(make, groups, steps=4):
             assert finite(key, info[key]), key
 
 
+@pytest.mark.usefixtures("plain")
 @pytest.mark.parametrize("name", GROUPS)
 def test_each_key_has_its_type_at_reset_and_at_every_step(name):
     assert_contract(CASES[name], GROUPS[name])

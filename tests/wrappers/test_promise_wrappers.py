@@ -162,6 +162,7 @@ def test_a_snapshot_that_the_env_restores_alone_leaves_no_old_bound():
     np.testing.assert_array_equal(found["instant"], 0)
 
 
+@pytest.mark.usefixtures("plain")
 def test_only_numpy_decides():
     pytest.importorskip("numba")
     with pytest.raises(NotCompilableError, match="promise"):
@@ -173,23 +174,21 @@ def test_only_numpy_decides():
         np.testing.assert_allclose(mine["promise"], theirs["promise"], rtol=1e-9)
 
 
+def wrapped(env=None, filter=None, **given):  # noqa: A002
+    env = gym.make(SCALAR) if env is None else env
+    kind = SafetyFilterVectorWrapper if hasattr(env, "num_envs") else SafetyFilterWrapper
+    return kind(env, guess() if filter is None else filter, **given)
+
+
 @pytest.mark.parametrize(
     ("call", "fragment"),
     [
-        (
-            lambda: SafetyFilterWrapper(gym.make(SCALAR, dt=0.02, horizon=1.0), guess()),
-            "another dt",
-        ),
-        (lambda: SafetyFilterWrapper(gym.make(SCALAR), guess(), priorities=[1.0]), "priorities"),
-        (lambda: SafetyFilterWrapper(gym.make(SCALAR), guess(), objective="clf"), "nearest"),
-        (lambda: SafetyFilterWrapper(gym.make(SCALAR), "scbf", observe_promise=True), "scbf"),
-        (
-            lambda: SafetyFilterVectorWrapper(
-                gym.make_vec(SCALAR, 2), "scbf", observe_promise=True
-            ),
-            "scbf",
-        ),
-        (lambda: SafetyFilterWrapper(gym.make(SCALAR), "scbf").ask_promise(0.5), "scbf"),
+        (lambda: wrapped(gym.make(SCALAR, dt=0.02, horizon=1.0)), "another dt"),
+        (lambda: wrapped(priorities=[1.0]), "priorities"),
+        (lambda: wrapped(objective="clf"), "nearest"),
+        (lambda: wrapped(filter="scbf", observe_promise=True), "scbf"),
+        (lambda: wrapped(gym.make_vec(SCALAR, 2), "scbf", observe_promise=True), "scbf"),
+        (lambda: wrapped(filter="scbf").ask_promise(0.5), "scbf"),
         (lambda: one().ask_promise(0.98), "0.98"),
         (lambda: one().ask_promise(0.0), "probability"),
     ],

@@ -110,7 +110,7 @@ def test_third_party_envs_are_judged_through_their_monitor(mode) -> None:
     assert assert_plays_as_alone(make, mode) > 2
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("plain")
 def test_a_compiled_batch_is_judged_as_its_envs_are() -> None:
     def make(count=None, mode="SameStep"):
         if count is None:

@@ -236,65 +236,12 @@ def test_the_guide_has_these_wrappers_and_no_other():
     assert named == {*SAME, *SIGHT, *ACTIONS, *REPEATS, RESET, *VECTORS, VIDEO}
 
 
-EFFECTS = {
-    "": (
-        *("ClipReward", "TransformReward", "NormalizeReward", "TimeLimit", "OrderEnforcing"),
-        *("PassiveEnvChecker", "RecordEpisodeStatistics", "RecordVideo", "HumanRendering"),
-        *("RenderCollection", "AddWhiteNoise", "ObstructView", "VectorizeTransformReward"),
-    ),
-    "state_fn": (
-        *("DelayObservation", "DtypeObservation", "DiscretizeObservation", "FilterObservation"),
-        *("FlattenObservation", "FrameStackObservation", "GrayscaleObservation"),
-        *("TransformObservation", "NormalizeObservation", "AddRenderObservation"),
-        *("ResizeObservation", "ReshapeObservation", "RescaleObservation", "TimeAwareObservation"),
-        "VectorizeTransformObservation",
-    ),
-    "action_map": (
-        *("ClipAction", "DiscretizeAction", "TransformAction", "RescaleAction", "StickyAction"),
-        "VectorizeTransformAction",
-    ),
-    "state_fn and dt": ("MaxAndSkipObservation",),
-    # AtariPreprocessing has a screen for its observations, which no filter reads a state from.
-    "dt": ("RepeatAction", "AtariPreprocessing"),
-    "step": ("ArrayConversion", "JaxToNumpy", "JaxToTorch", "NumpyToTorch", "DictInfoToList"),
-}
-"""What the class alone tells to be undone; most change a space, too, which is seen as well."""
-EFFECT = {name: effect for effect, names in EFFECTS.items() for name in names}
-WORDS = {
-    "state_fn": ("changes observations", "state_fn undoes that"),
-    "action_map": ("changes actions", "action_map undoes that"),
-    "dt": ("repeats actions", "dt is the time"),
-    "step": ("a step of its own",),
-}
-
-
 def doubts(env: Any) -> list[str]:
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         doubt_layers(env)
     assert {each.category for each in found} <= {SystemDefinitionWarning}
     return [str(each.message) for each in found]
-
-
-@pytest.mark.parametrize("module", [wrappers, wrappers.vector], ids=["single", "vector"])
-def test_every_wrapper_of_gymnasium_is_decided_on(module: Any):
-    names = {*module.__all__} - {RESET, "vector"}
-    assert names <= EFFECT.keys()
-    single = module is wrappers
-    env = gym.make("Pendulum-v1") if single else gym.make_vec("Pendulum-v1", 2)
-    base = gym.Wrapper if single else gym.vector.VectorWrapper
-    for name in names:
-        try:
-            kind = getattr(module, name)
-        except (ImportError, gym.error.DependencyNotInstalled):
-            continue
-        layer = kind.__new__(kind)  # its own arguments do not matter here
-        base.__init__(layer, env)
-        found, effect = doubts(layer), EFFECT[name]
-        assert len(found) == bool(effect), name
-        for word in (w for part in effect.split(" and ") if part for w in WORDS[part]):
-            assert name in found[0]
-            assert word in found[0], name
 
 
 class Tampers(gym.Wrapper):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,13 +18,14 @@ from safe_envs.agents.evaluation.attainable import (
     attainable_safety,
     best_for,
     held_against,
-    leaves_safely,
     simulate,
     times_unavoidable,
 )
+from safe_envs.agents.evaluation.frontier import Frontier, FrontierPoint, FrontierSpec, frontier
+from safe_envs.errors import ConfigurationError
 from safe_envs.files import VARIABLE, entries
 from safe_envs.registry import make_problem
-from safe_envs.values.tables import ValueSettings
+from safe_envs.values.frontier import FrontierSettings
 from tests.agents.policies.coarse import COARSE, SHORT, coarse
 
 NEAR_THE_EDGE = {**SHORT, "start": [0.8], "noise": 1.5}
@@ -75,9 +77,9 @@ def test_leaving_is_counted_as_it_was_asked_for():
 
 
 def test_the_worlds_of_plant_and_model_differ():
-    # The plant cannot be held at this angle, the model can.
-    problem = make_problem("Pendulum-v0", horizon=0.2, start=[0.3, 0.0], plant={"m": 4.0})
-    settings = ValueSettings(knowledge="plant", cells=(30, 30), inputs=3)
+    # The plant has noise near the edge, the model has little.
+    problem = make_problem("Scalar-v0", **NEAR_THE_EDGE, model={"sigma": 0.3})
+    settings = coarse(knowledge="plant")
     found = [
         attainable_safety(each, replace(settings, knowledge=knowledge), episodes=50)[0]
         for each, knowledge in (
@@ -105,16 +107,8 @@ def test_bounds_that_the_greedy_policy_contradicts_are_withheld(greedy, lower, u
 
 @pytest.mark.parametrize(("safe", "lower", "kept"), [(999, 0.99999, True), (990, 0.99999, False)])
 def test_a_single_violation_contradicts_no_lower_bound(safe, lower, kept):
-    rate = SimulatedRate(
-        safe=safe,
-        episodes=1000,
-        rate=safe / 1000,
-        low=0.0,
-        high=1.0,
-        confidence=0.95,
-        leave_rate=0.0,
-        seed=0,
-    )
+    interval = {"low": 0.0, "high": 1.0, "confidence": 0.95, "leave_rate": 0.0, "seed": 0}
+    rate = SimulatedRate(safe=safe, episodes=1000, rate=safe / 1000, **interval)
     judged = attainable.judged(replace(made_up(lower, 1.0), simulated=rate))
     assert (judged.lower == lower) == kept
 
@@ -163,16 +157,6 @@ def test_the_interval_holds_the_true_ratio():
         assert found.low <= measured / avoidable <= (found.high or np.inf) * (1 + 1e-12)
 
 
-def test_where_the_countings_are_the_same_is_known():
-    same = {"DubinsDisk-v0", "StochasticDubins-v0", "Pendulum-v0", "CubicSDEDisk-v0"}
-    others = {"Scalar-v0", "ACC-v0", "CubicSDE-v0", "QuadrotorAltitude-v0"}
-    assert [name for name in sorted(same | others) if not leaves_safely(make_problem(name))] == (
-        sorted(same)
-    )
-    # A larger ellipse is not within the workspace.
-    assert leaves_safely(make_problem("Pendulum-v0", barrier={"level": 3.0}))
-
-
 def test_an_evaluation_shows_what_it_computes_or_finds(monkeypatch, empty_cache):
     monkeypatch.setattr(attainable, "evaluation_settings", lambda problem: COARSE)
     given = {"options": NEAR_THE_EDGE, "filters": ["none"], "episodes": 50, "bounds": False}
@@ -204,3 +188,72 @@ def test_what_is_attainable_from_the_starts_is_computed_once(monkeypatch, empty_
     for damaged in ("", "[]", "{}", json.dumps({**vars(found), "lower": 2.0})):
         kept.place.write_text(damaged)
         assert best_for(problem) == found
+
+
+# Points next to a curve.
+
+
+PRICES = np.array([0.0, 10.0, 100.0])
+VALUES = (50.0, 47.0, 40.0)
+
+
+def _point(rate, mean, half=1.0):
+    ends = (max(rate - 0.01, 0.0), rate + 0.01, mean, mean - half, mean + half)
+    return FrontierPoint("a", "filter", 100, round(100 * rate), 0, rate, *ends, VALUES)
+
+
+def _frontier(*points):
+    values = SimpleNamespace(prices=PRICES, values=np.array(VALUES), least_violations=7 / 90)
+    values.largest_return = lambda v: (np.array(VALUES) + v[:, None] * PRICES).min(axis=1)
+    return Frontier(None, values, (), points, {}, 0.95)  # pyright: ignore[reportArgumentType]
+
+
+def test_the_cost_is_the_distance_to_the_least_line():
+    below, on = _point(0.05, 30.0), _point(0.4, 50.0)
+    found = _frontier(below, on)
+    assert found.cost(below) == pytest.approx(15.0)
+    assert found.cost(on) == pytest.approx(0.0)
+    assert found.excess == 0.0
+
+
+def test_the_least_risk_of_a_return_is_where_the_curve_has_it():
+    found = _frontier(_point(0.5, 47.5))
+    assert found.needed(found.points[0]) == pytest.approx(0.075)
+    assert found.needed(_point(0.5, 30.0)) == 0.0
+
+
+def test_points_beyond_their_intervals_show_the_error_of_the_grid():
+    assert _frontier(_point(0.05, 48.0)).excess == pytest.approx(47.0 - 46.0)
+
+
+def test_what_does_not_suit_is_an_error_unless_it_may_be_missing():
+    problem = make_problem("Scalar-v0", horizon=0.05)
+    settings = FrontierSettings(2, 0, (51,))
+    spec = {"policies": {"nominal": "nominal"}, "filters": ("wrong",), "episodes": 4}
+    with pytest.raises(ConfigurationError, match="wrong"):
+        frontier(problem, FrontierSpec(**spec), settings)
+    found = frontier(problem, FrontierSpec(**spec, may_miss=("wrong",)), settings)
+    assert [point.name for point in found.points] == ["nominal"]
+    assert "unknown filter" in found.left_out["wrong"]
+
+
+def test_leaving_the_workspace_counts_as_asked():
+    """The nominal controller is pulled down from the lowest safe state."""
+    problem = make_problem("Scalar-v0", horizon=0.5, start=[-2.999], noise=0.5)
+    spec = FrontierSpec({"zero": "zero"}, episodes=50)
+    rates = []
+    for leaving in ("violation", "safe"):
+        found = frontier(problem, spec, FrontierSettings(2, 0, (51,), leaving))
+        rates.append(found.points[0].violation_rate)
+    assert rates == [1.0, 0.0]
+
+
+def test_below_the_least_chance_of_a_violation_the_curve_is_the_line_of_the_largest_price():
+    found = _frontier()
+    plain, (chances, returns) = found.curve(), found.curve(bottom=30.0)
+    assert plain[0][0] == pytest.approx(7 / 90)
+    assert (chances[0], returns[0]) == (0.0, 40.0)
+    assert found.curve(bottom=42.0)[0][0] == pytest.approx(0.02)
+    assert (np.diff(chances) > 0).all()
+    assert (np.diff(returns) >= 0).all()
+    np.testing.assert_array_equal(chances[-len(plain[0]) :], plain[0])

@@ -1,22 +1,35 @@
-"""An evaluation depends on neither the batch nor the processes, and keeps little."""
+"""An evaluation depends on neither the batch nor the processes, keeps little, and compares filters
+on the same episodes."""
 
 from __future__ import annotations
 
+import errno
 import json
 import tracemalloc
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import NominalController, evaluate, make_problem
+from safe_envs.agents.evaluation import episodes_file as module
+from safe_envs.agents.evaluation.episodes import episode_seed
 from safe_envs.agents.evaluation.evaluate import refine
+from safe_envs.agents.evaluation.statistics import (
+    mcnemar_p,
+    paired_difference_interval,
+    rate_interval,
+)
+from safe_envs.wrappers import HOCBF, SCBF, SafetyFilterWrapper, spec_of
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow
 
+NEAR = {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0]}
+LONG = {"noise": 0.6, "horizon": 3.0, "dt": 0.008}
 SHORT = {"options": {"horizon": 0.05}, "bounds": False}
 
 
@@ -63,21 +76,9 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     [
         # Episodes that end at different times: out of the workspace, and at the goal.
         ("Scalar-v0", "random", ("none", "cbf:alpha=3"), {"noise": 0.9, "dt": 0.02}, {}),
-        (
-            "DubinsObstacle-v0",
-            "nominal",
-            ("none", "hocbf"),
-            {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0]},
-            {},
-        ),
+        ("DubinsObstacle-v0", "nominal", ("none", "hocbf"), NEAR, {}),
         # More control periods than the noise is drawn ahead for, and bridges.
-        (
-            "Scalar-v0",
-            "nominal",
-            ("none",),
-            {"noise": 0.6, "horizon": 3.0, "dt": 0.008},
-            {"monitoring": "continuous"},
-        ),
+        ("Scalar-v0", "nominal", ("none",), LONG, {"monitoring": "continuous"}),
         # The mean of a bound over the starts goes the same way.
         ("CubicSDEDisk-v0", "random", ("scbf",), {"horizon": 0.2}, {"bounds": True}),
     ],
@@ -145,35 +146,6 @@ def test_seeds_and_numbers_of_episodes():
     assert many.rows[0].return_mean != other.rows[0].return_mean
 
 
-def test_config_is_enough_to_run_it_again():
-    options = {
-        "noise": [0.3, 0.1],
-        "plant": {"v": 1.7},
-        "model": {"v": 1.9},
-        "barrier": {"radius": 2.5},
-        "dt": 0.1,
-        "substeps": 2,
-        "horizon": 1.0,
-        "input_bounds": [-4.0, 5.0],
-        "start": [0.5, 0.0, 1.0],
-    }
-    given = {"episodes": 10, "seed": 9, "knowledge": "plant", "bounds": False}
-    first = evaluate("StochasticDubins-v0", "random", ["none", "hocbf"], options=options, **given)
-    config = json.loads(json.dumps(first.config, allow_nan=False))
-    again = evaluate(
-        config["env_id"],
-        config["policy"]["name"],
-        [f["spec"] for f in config["filters"]],
-        options=config["options"],
-        **{name: config[name] for name in ("episodes", "seed", "knowledge")},
-        bounds=False,
-    )
-    assert config["env_id"] == "safe_envs/StochasticDubins-v0"
-    assert (config["problem"]["plant"]["v"], config["problem"]["model"]["v"]) == (1.7, 1.9)
-    for a, b in zip(first.rows, again.rows, strict=True):
-        assert replace(a, filter="") == replace(b, filter="")
-
-
 def test_trajectories_keep_a_bounded_number_of_episodes():
     given = {"filters": ["none"], **SHORT}
     kept = evaluate("Scalar-v0", episodes=300, num_envs=90, record=True, **given).trajectories
@@ -203,16 +175,12 @@ def test_memory_does_not_grow_with_episodes():
 
 @pytest.mark.parametrize(
     ("call", "shares"),
-    [
-        (evaluate, (0.5,)),
-        (refine, (1 / 16, 1 / 8, 2 / 8, 4 / 8)),
-    ],
+    [(evaluate, (0.5,)), (refine, (1 / 16, 1 / 8, 2 / 8, 4 / 8))],
 )
 def test_progress_goes_from_nothing_to_all(call, shares):
     told = []
-    call(
-        "Scalar-v0", filters=["none", "scbf"], episodes=7, num_envs=3, progress=told.append, **SHORT
-    )
+    given = {"filters": ["none", "scbf"], "episodes": 7, "num_envs": 3, **SHORT}
+    call("Scalar-v0", progress=told.append, **given)
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.1
     assert told[-1] == 1.0
@@ -236,3 +204,171 @@ def test_evaluations_of_one_episode_over_and_over_are_marked(env_id, policy, opt
     assert answer.is_deterministic == repeats
     barrier = answer.trajectories["none"].barrier
     assert (barrier == barrier[:, :1]).all() == repeats
+
+
+# The file of single episodes is written group by group, whole or not at all.
+
+
+GIVEN = {"options": {"horizon": 0.1, "noise": 3.0}, "bounds": False, "episodes": 50}
+
+
+def test_groups_do_not_depend_on_the_size_of_batches(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_GROUP", 16)
+    contents = set()
+    for size in (1, 7, 33, 50):
+        place = tmp_path / f"{size}.parquet"
+        given = {**GIVEN, "episodes_out": place, "num_envs": size}
+        found = evaluate("Scalar-v0", "random", ["none", "scbf"], **given)
+        contents.add(place.read_bytes())
+    assert len(contents) == 1
+    file, columns = pq.ParquetFile(place), found.episode_columns()
+    groups = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+    assert groups == 2 * [16, 16, 16, 2]
+    table = file.read()
+    assert table["filter"].to_pylist() == 50 * ["none"] + 50 * ["scbf"]
+    assert table["episode"].to_pylist() == 2 * list(range(50))
+    assert set(table["identification"].to_pylist()) == {0}
+    for name in ("return", "length", "interventions"):
+        assert table[name].to_pylist() == columns[name].tolist()
+    times = [None if np.isnan(t) else t for t in columns["first_violation"].tolist()]
+    assert table["first_violation"].to_pylist() == times
+    assert 0 < times.count(None) < 100
+
+
+@pytest.mark.parametrize("error", [SystemError, KeyboardInterrupt])
+@pytest.mark.parametrize("before", [None, "old"])
+def test_a_failure_leaves_what_was_there(tmp_path, error, before):
+    place, calls = tmp_path / "out.parquet", []
+    if before:
+        place.write_text(before)
+
+    def progress(done):
+        calls.append(done)
+        if len(calls) == 3:
+            assert len(list(tmp_path.iterdir())) == (2 if before else 1)
+            raise error
+
+    with pytest.raises(error):
+        evaluate("Scalar-v0", episodes_out=place, progress=progress, num_envs=5, **GIVEN)
+    assert [p.read_text() for p in tmp_path.iterdir()] == ([before] if before else [])
+
+
+def test_a_full_disk_is_named(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full)
+    with pytest.raises(ConfigurationError, match=r"out.parquet: No space left"):
+        evaluate("Scalar-v0", episodes_out=tmp_path / "out.parquet", **GIVEN)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_pyarrow_it_is_said_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda _: None)
+    with pytest.raises(ConfigurationError, match="sweep"):
+        evaluate("Scalar-v0", episodes_out=tmp_path / "out.parquet", **GIVEN)
+
+
+# Filters in an evaluation: on the same episodes, each with intervals, and compared.
+
+
+DUBINS = "safe_envs/StochasticDubins-v0"
+
+
+def test_filters_see_the_same_episodes_and_are_compared_on_them():
+    filters = ["none", "hocbf:alpha=1,2", "scbf"]
+    given = {"options": {"horizon": 3.0, "noise": 0.4}, "episodes": 100, "seed": 4}
+    given |= {"confidence": 0.9, "bounds": False}
+    answer = evaluate(DUBINS, filters=filters, num_envs=64, record=True, **given)
+    safe = {name: (answer.trajectories[name].barrier > 0).all(axis=0) for name in filters}
+    pairs = [(c.first, c.second) for c in answer.comparisons]
+    assert pairs == [(filters[1], filters[0]), (filters[2], filters[0]), (filters[2], filters[1])]
+    for c in answer.comparisons:
+        a, b = safe[c.first], safe[c.second]
+        table = [int(flags.sum()) for flags in (a & b, a & ~b, ~a & b, ~a & ~b)]
+        assert [c.both, c.only_first, c.only_second, c.neither] == table
+        assert c.difference == pytest.approx(a.mean() - b.mean())
+        assert (c.ci_low, c.ci_high) == paired_difference_interval(*table, 0.9)
+        assert c.mcnemar_p == mcnemar_p(*table[1:3])
+    assert answer.document()["comparisons"] == [vars(c) for c in answer.comparisons]
+    # Together at first, and never together again.
+    bare, filtered = (answer.trajectories[name].states for name in filters[:2])
+    np.testing.assert_array_equal(bare[0], filtered[0])
+    parted = (bare != filtered).any(axis=2)
+    assert parted.any()
+    assert (np.diff(parted.astype(int), axis=0) >= 0).all()
+    # Alone a filter has the same row.
+    (row,) = evaluate(DUBINS, filters=filters[2], **given).rows
+    assert row == answer.rows[2]
+
+
+def test_confidence_is_that_of_every_interval():
+    given = {"options": {"horizon": 0.5, "noise": 0.8}, "episodes": 100, "bounds": False}
+    narrow, wide = (
+        evaluate("Scalar-v0", filters=["none", "scbf"], confidence=c, **given) for c in (0.5, 0.999)
+    )
+    assert (narrow.config["confidence"], wide.config["confidence"]) == (0.5, 0.999)
+    for a, b in zip(narrow.rows, wide.rows, strict=True):
+        assert (a.ci_low, a.ci_high) == rate_interval(a.safe, 100, 0.5)
+        assert b.ci_low < a.ci_low < a.safety_rate < a.ci_high < b.ci_high
+        assert b.curve.ci_low[-1] < a.curve.ci_low[-1]
+        assert a.curve.rate == b.curve.rate
+    assert wide.comparisons[0].ci_low < narrow.comparisons[0].ci_low
+
+
+def test_a_filter_that_never_acts_leaves_everything_as_it_is():
+    given = {"options": {"horizon": 1.0, "noise": 1.5}, "episodes": 20, "bounds": False}
+    answer = evaluate("ACC-v0", "random", ["none", "cbf:alpha=50"], record=True, **given)
+    bare, filtered = answer.rows
+    assert (bare.intervention_rate, filtered.intervention_rate) == (0.0, 0.0)
+    for name in ("safe", "return_mean", "effort_mean", "min_h_median", "curve"):
+        assert getattr(bare, name) == getattr(filtered, name)
+    states = [answer.trajectories[row.filter].states for row in answer.rows]
+    np.testing.assert_array_equal(*states)
+
+
+def test_a_filter_may_have_a_condition_for_each_barrier_and_be_objects():
+    problem = make_problem(DUBINS, horizon=1.0, noise=0.4)
+    disk = problem.barriers[0]
+    wall = replace(disk, name="wall", expression=1 - problem.plant.states[0])
+    problem = replace(problem, barriers=(disk, wall))
+    filters = ["hocbf:alpha=1.0,1.0+hocbf:alpha=2.0,8.0", "hocbf:alpha=2.0,8.0+hocbf:alpha=1.0,1.0"]
+    objects = [HOCBF(alpha=(2.0, 8.0)), (SCBF.for_gains((1.0, 1.0)),) * 2]
+    answer = evaluate(problem, filters=[*filters, *objects], episodes=20, bounds=False)
+    names = [*filters, "hocbf:alpha=2.0,8.0"]
+    assert [f["spec"] for f in answer.config["filters"]][:3] == names
+    assert len({row.effort_mean for row in answer.rows}) == 4
+    (text,) = evaluate(problem, filters=spec_of(objects[0]), episodes=20, bounds=False).rows
+    assert text == answer.rows[2]
+    for call, fragment in (("hocbf+hocbf+hocbf", "3"), ((HOCBF(alpha=(1.0, 1.0)),) * 3, "3")):
+        with pytest.raises(ConfigurationError, match=f"{fragment} conditions"):
+            evaluate(problem, filters=[call])
+
+
+def test_the_log_of_the_first_episode_has_its_decisions():
+    found = evaluate(DUBINS, filters=["none", "hocbf"], episodes=3, record=True, bounds=False)
+    log = found.trajectories["hocbf"].log
+    env = SafetyFilterWrapper(gym.make(DUBINS), "hocbf")
+    problem, policy = found.problem, NominalController(found.problem)
+    observation, info = env.reset(seed=episode_seed(0, 0))
+    sections = map(log.section, ("h", "nominal", "action", "slack"))
+    for k, row in enumerate(zip(*sections, strict=True)):
+        barrier = info["barrier"]
+        state = log.section("state")[k]
+        np.testing.assert_allclose(env.unwrapped.components, state, rtol=1e-9, atol=1e-12)
+        action, _ = policy.predict(observation, deterministic=True)
+        observation, _, terminated, truncated, info = env.step(action)
+        expected = (barrier, info["nominal_action"], info["safe_action"], info["slacks"])
+        for values, there in zip(row, expected, strict=True):
+            np.testing.assert_allclose(values, there, rtol=1e-6, atol=1e-9)
+        assert log.t[k] == pytest.approx(k * problem.dt)
+        assert (log.intervention[k], log.feasible[k]) == (info["intervention"], info["feasible"])
+    assert terminated or truncated
+    assert log.interventions == info["episode_interventions"] > 0
+    assert log.columns.units["omega"] == "rad/s"
+    np.testing.assert_array_equal(log.section("high")[:, 0], problem.input_bounds[0][1])
+    # Without a filter what is proposed is executed.
+    bare = found.trajectories["none"].log
+    np.testing.assert_array_equal(bare.section("nominal"), bare.section("action"))
+    assert np.ptp(bare.section("action")) > 0.0
+    assert (bare.interventions, bare.infeasible) == (0, 0)

@@ -27,13 +27,8 @@ STOPS = (
 )
 """Laws that stop within a period where the cart is slow."""
 
+LONG, LOUD = {"noise": 0.9, "dt": 0.05, "horizon": 1.5}, {"noise": 1.0, "horizon": 2.5}
 SHORT = {"filters": ["none"], "options": {"horizon": 0.05}, "bounds": False}
-
-
-@pytest.fixture
-def plain(monkeypatch):
-    """Lets programs run as plain Python, which need no compilation."""
-    monkeypatch.setattr(Program, "compiled", Program.plain)
 
 
 def assert_columns_alike(found, expected, relative=1e-9):
@@ -80,8 +75,9 @@ def both(problem, name, policy, relative=1e-9, **given):
     return columns[1], theirs.rows[0]
 
 
-@pytest.mark.parametrize("monitoring", ["discrete", "continuous"])
-@pytest.mark.parametrize("filtered", [False, True], ids=["unfiltered", "filtered"])
+@pytest.mark.parametrize(
+    ("filtered", "monitoring"), [(False, "continuous"), (True, "discrete")], ids=str
+)
 @pytest.mark.usefixtures("plain")
 def test_episodes_are_those_of_numpy(env_id, filtered, monitoring):
     problem = problem_of(env_id, noise=0.2)
@@ -95,20 +91,8 @@ def test_episodes_are_those_of_numpy(env_id, filtered, monitoring):
     ("env_id", "text", "policy", "options", "varied"),
     [
         # Violations after which an episode goes on, and ends out of the workspace.
-        (
-            "Scalar-v0",
-            "scbf",
-            "random",
-            {"noise": 0.9, "dt": 0.05, "horizon": 1.5},
-            "first_violation length interventions",
-        ),
-        (
-            "StochasticDubins-v0",
-            "scbf",
-            "nominal",
-            {"noise": 1.0, "horizon": 2.5},
-            "first_violation interventions infeasible slack",
-        ),
+        ("Scalar-v0", "scbf", "random", LONG, "first_violation length interventions"),
+        ("StochasticDubins-v0", "scbf", "nominal", LOUD, "interventions infeasible slack"),
         # Violations from the start on, and ends at the goal.
         ("Scalar-v0", "none", "random", {"start": [1.5], "horizon": 0.5, "noise": 0.5}, "return"),
         ("DubinsObstacle-v0", "hocbf", "random", {"start": [2.0, 1.3, 0.3, 0.5, 1.0]}, "length"),

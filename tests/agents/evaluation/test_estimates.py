@@ -59,11 +59,7 @@ ERROR = "scbf:measurement_error=0.01"
         # Named views are the only ones.
         (["scbf@state", "szcbf"], {}, ["scbf@state", "szcbf"]),
         # A filter by itself has no belief.
-        (
-            ["backup"],
-            {"problem": "DubinsDisk-v0", "knowledge": "plant"},
-            ["backup@state", "backup"],
-        ),
+        (["backup"], DISK, ["backup@state", "backup"]),
     ],
 )
 def test_views_of_a_filter(filters, more, names):
@@ -103,19 +99,6 @@ def test_bounds_of_true_states_are_not_those_of_estimates():
     assert found.row("scbf@state").continuous_bound == pytest.approx(0.25)
     for name in ("scbf", "scbf:belief=0.05"):
         assert found.row(name).continuous_bound is found.row(name).held_bound is None
-
-
-@pytest.mark.parametrize(("observe", "width"), [("estimate", 4), ("measurement", 3)])
-def test_policies_may_see_the_measurement(observe, width):
-    seen = set()
-
-    def policy(observation):
-        seen.add(observation.shape[1])
-        return np.zeros((len(observation), 1))
-
-    given = SHORT | {"options": {"measurement": "default", "horizon": 0.1}}
-    evaluate("safe_envs/StochasticDubins-v0", policy, ["none"], observe=observe, **given)
-    assert seen == {width}
 
 
 @pytest.mark.parametrize(

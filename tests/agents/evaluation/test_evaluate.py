@@ -17,6 +17,8 @@ from tests.agents.evaluation.evaluated import Constant, Schedule, replay, safe_s
 
 pytestmark = pytest.mark.slow
 
+NEAR = {"noise": 0.05, "start": [1.5, 1.2, 0.3, 0.5, 1.0], "horizon": 3.0}
+MANY = {"noise": 0.3, "horizon": 0.7, "barrier": {"half_width": 0.7}}
 COUNTS = ("episodes", "safe", "violations")
 MEASURES = ("safety_rate", "ci_low", "ci_high", "min_h_median", "min_h_p05", "effort_mean")
 RATES = ("return_mean", "intervention_rate", "infeasible_rate")
@@ -25,41 +27,17 @@ RATES = ("return_mean", "intervention_rate", "infeasible_rate")
 @pytest.mark.parametrize(
     ("env_id", "spec", "policy", "knowledge", "options"),
     [
-        ("Scalar-v0", "none", "random", "model", {"noise": 0.8}),
         ("Scalar-v0", "scbf", "random", "model", {"noise": 0.3, "input_bounds": [-0.2, 3.0]}),
         ("StochasticDubins-v0", "hocbf:alpha=1,1", "random", "model", {}),
-        (
-            "DubinsObstacle-v0",
-            "hocbf",
-            "nominal",
-            "model",
-            {"noise": 0.05, "start": [1.5, 1.2, 0.3, 0.5, 1.0], "horizon": 3.0},
-        ),
-        ("QuadrotorAltitude-v0", "hocbf", "nominal", "model", {"start": [5.0, 2.0]}),
+        ("DubinsObstacle-v0", "hocbf", "nominal", "model", NEAR),
         ("QuadrotorAltitude-v0", "hocbf", "nominal", "plant", {"start": [5.0, 2.0]}),
-        (
-            "Quadrotor-v0",
-            "hocbf",
-            "nominal",
-            "model",
-            {"noise": 0.3, "horizon": 0.7, "barrier": {"half_width": 0.7}},
-        ),
+        pytest.param("Quadrotor-v0", "none", "nominal", "model", MANY, marks=pytest.mark.oracle),
     ],
 )
 def test_episodes_replayed_by_hand(env_id, spec, policy, knowledge, options):
     episodes, seed, options = 5, 11, {"horizon": 1.0, **options}
-    answer = evaluate(
-        env_id,
-        policy,
-        [spec],
-        options=options,
-        episodes=episodes,
-        seed=seed,
-        num_envs=3,
-        knowledge=knowledge,
-        record=True,
-        bounds=False,
-    )
+    given = {"options": options, "episodes": episodes, "seed": seed, "knowledge": knowledge}
+    answer = evaluate(env_id, policy, [spec], num_envs=3, record=True, bounds=False, **given)
     (found,), env_id = answer.rows, f"safe_envs/{env_id}"
     row, trajectories = replay(env_id, options, spec, policy, episodes, seed, knowledge)
     assert (found.filter, found.policy) == (spec, policy)
@@ -88,16 +66,8 @@ def test_rows_are_what_the_results_of_single_episodes_say(monkeypatch):
     w = sp.Symbol("w")
     problem = make_problem("Scalar-v0", noise=0.8, input_bounds=[-0.5, 3.0], dt=0.02, horizon=0.5)
     problem = replace(problem, start="wide", starts={"wide": Start((1.7 * w - 0.5,), (w,))})
-    answer = evaluate(
-        problem,
-        "random",
-        ["none", "cbf:alpha=2"],
-        episodes=40,
-        num_envs=7,
-        bounds=False,
-        record=True,
-        confidence=0.9,
-    )
+    given = {"episodes": 40, "num_envs": 7, "bounds": False, "record": True, "confidence": 0.9}
+    answer = evaluate(problem, "random", ["none", "cbf:alpha=2"], **given)
     columns = answer.episode_columns()
     for row in answer.rows:
         each = {name: values[columns["filter"] == row.filter] for name, values in columns.items()}
@@ -151,13 +121,8 @@ def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
 def test_the_curve_of_a_long_episode_is_thinned_out_evenly_and_has_both_ends(steps):
     # The inputs let x grow by dt in each step: x' = e^dt x + (e^dt - 1) u.
     dt, last = 1e-3, steps // 2 + 1
-    options = {
-        "noise": 0.0,
-        "start": [0.0],
-        "dt": dt,
-        "horizon": steps * dt,
-        "input_bounds": [-2.0, 2.0],
-    }
+    options = {"noise": 0.0, "start": [0.0], "dt": dt, "horizon": steps * dt}
+    options["input_bounds"] = [-2.0, 2.0]
     x = np.cumsum([0.0] + [dt] * steps)
     inputs = (x[1:] - math.exp(dt) * x[:-1]) / (math.exp(dt) - 1)
     limit = {"limit": float(x[last - 1] + x[last]) / 2}
@@ -189,13 +154,8 @@ def test_interventions_after_a_violation_do_not_count():
     assert 1 < steps < 10
     assert (row.intervention_rate, row.infeasible_rate, row.safe) == (1.0, 1.0, 0)
     assert row.effort_mean == pytest.approx(0.25)
-    (mixed,) = evaluate(
-        problem,
-        Schedule(problem, [-0.5] * steps + [1.0] * (10 - steps)),
-        ["cbf:alpha=1"],
-        episodes=1,
-        bounds=False,
-    ).rows
+    policy = Schedule(problem, [-0.5] * steps + [1.0] * (10 - steps))
+    (mixed,) = evaluate(problem, policy, ["cbf:alpha=1"], episodes=1, bounds=False).rows
     assert mixed.intervention_rate == 0.0
 
 
@@ -216,17 +176,13 @@ def test_touching_the_edge_is_unsafe():
     options = {"noise": 0.0, "start": [0.5], "horizon": 0.05}
     up_and_down = [3.0, -3.0, -3.0, -3.0, -3.0]
     problem = make_problem("Scalar-v0", **options)
-    reached = (
-        evaluate(problem, Schedule(problem, up_and_down), ["none"], episodes=1, record=True)
-        .trajectories["none"]
-        .states[:, 0, 0]
-    )
+    given = {"filters": ["none"], "episodes": 1, "record": True}
+    found = evaluate(problem, Schedule(problem, up_and_down), **given)
+    reached = found.trajectories["none"].states[:, 0, 0]
     assert reached[1] == reached.max()
     for limit, safe in ((reached[1], 0), (np.nextafter(reached[1], 1.0), 1)):
         problem = make_problem("Scalar-v0", **{**options, "barrier": {"limit": float(limit)}})
-        answer = evaluate(
-            problem, Schedule(problem, up_and_down), ["none"], episodes=1, record=True
-        )
+        answer = evaluate(problem, Schedule(problem, up_and_down), **given)
         assert answer.trajectories["none"].barrier[1, 0] == limit - reached[1]
         assert answer.rows[0].safe == safe
 

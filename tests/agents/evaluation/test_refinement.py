@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 
 import pytest
 
-from safe_envs.agents import evaluate, make_problem
+from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.evaluate import TOLERANCE, refine, verdict
 from safe_envs.agents.evaluation.statistics import pair_counts, paired_difference_interval
 from tests.oracles.laws import mean_reverting
@@ -131,16 +130,3 @@ def test_horizons_that_are_no_multiple_of_the_period_stay_as_simulated():
     ends = [e.rows[0].curve.time[-1] for e in answer.evaluations]
     assert ends == [pytest.approx(0.09)] * 3
     assert answer.given.config["problem"]["horizon"] == 0.1
-
-
-def test_document_is_that_of_the_given_period_and_the_refinement():
-    problem = make_problem("Scalar-v0", horizon=0.1)
-    answer = refine(problem, episodes=6, record=True)
-    document = json.loads(json.dumps(answer.document(), allow_nan=False))
-    plain = evaluate(problem, episodes=6)
-    assert document["rows"] == [row.as_dict() for row in plain.rows]
-    assert document["config"] == json.loads(json.dumps(plain.config))
-    assert document["refinement"]["dt"] == [0.01, 0.005, 0.0025]
-    assert document["refinement"]["rows"] == [vars(row) for row in answer.rows]
-    assert len(answer.given.trajectories) == 2
-    assert [len(e.trajectories) for e in answer.evaluations] == [0, 0, 0]

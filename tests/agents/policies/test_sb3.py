@@ -42,11 +42,6 @@ SHORT = {"episodes": 3, "options": {"horizon": 0.2}, "bounds": False, "best": Fa
 OFF_POLICY = {"buffer_size": 100, "learning_starts": 10, "batch_size": 8}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def single():
     return gym.make(ENV_ID, horizon=0.5)
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import threading
-from concurrent.futures import Future
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,6 @@ from safe_envs.agents import NominalController, ZeroController, make_problem
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.policies.base import BlockPolicy
 from safe_envs.agents.rare_events import splitting
-from safe_envs.agents.rare_events.compiled_paths import CompiledPaths
 from safe_envs.agents.rare_events.estimate import (
     PlainEpisodes,
     RareEstimate,
@@ -146,13 +142,8 @@ def test_pilots_and_estimates_have_noise_of_their_own():
 def test_a_pilot_chooses_the_score_that_loses_less(problem, power):
     # The second score has the smaller spread in some pilots of the first law, and misses most of
     # its probability.
-    player = NumpyPaths(
-        problem,
-        lambda lengths: TiltedNoiseEnv(problem, lengths),
-        NominalController(problem),
-        4096,
-        False,
-    )
+    tilted = lambda lengths: TiltedNoiseEnv(problem, lengths)  # noqa: E731
+    player = NumpyPaths(problem, tilted, NominalController(problem), 4096, False)
     pilot = Splitting(player, 0).pilot(100, 20)
     assert (pilot.power, len(pilot.estimates), pilot.often) == (power, 20, False)
     assert pilot.enough() > 2 * pilot.particles
@@ -289,34 +280,7 @@ def test_what_numba_cannot_compile_is_told_and_what_it_is_not_for_done_by_numpy(
 def test_what_has_no_end_has_the_error_of_numpy(monkeypatch, engine):
     monkeypatch.setattr(Program, "compiled", Program.plain)
     u = sp.Symbol("u", real=True)
-    system = ControlAffineSDE(
-        states=(X,), inputs=(u,), drift=[X**3], input_matrix=[1], diffusion=[0.01]
-    )
+    system = ControlAffineSDE((X,), (u,), [X**3], [1], [0.01])
     given = {"input_bounds": (-1.0, 1.0), "start": [3.0], "dt": 0.1, "horizon": 2.0, "nominal": 1.0}
     with pytest.raises(NumericalError, match="finite"):
         row_of(define_problem(system, 1 + X**2, **given), engine=engine, **SHORT)
-
-
-def test_an_interrupt_waits_for_parts_under_way_alone(monkeypatch):
-    """Those that nobody has begun are left."""
-    begun, player = [], SimpleNamespace(most_paths=1)
-    reader, writer = threading.Event(), threading.Event()
-
-    def play(functions, part, *arguments):
-        begun.append(part)
-        if len(begun) == 2:
-            reader.set()
-        writer.wait(5.0)
-
-    def interrupted(future):
-        assert reader.wait(5.0)
-        threading.Timer(0.05, writer.set).start()
-        raise KeyboardInterrupt
-
-    player.play = play
-    monkeypatch.setattr(Future, "result", interrupted)
-    paths: Any = CompiledPaths.__new__(CompiledPaths)
-    paths._program, paths._functions, paths._threads = player, {}, 2
-    with pytest.raises(KeyboardInterrupt):
-        paths._play(np.arange(50))
-    assert len(begun) == 2

@@ -27,6 +27,7 @@ from tests.oracles.laws import (
 
 pytestmark = pytest.mark.slow
 
+PLANE = sp.symbols("x y", real=True)
 SCALAR: dict[str, Any] = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "input_bounds": [-1.0, 1.0]}
 """Random starts, and a box that is too small for some of them."""
 
@@ -43,44 +44,23 @@ def assert_near(row, exact, within):
     assert row.ci_high / row.ci_low < within
 
 
+def plane(barriers, diffusion, dt):
+    """Noise alone moves a point in a plane."""
+    system = ControlAffineSDE(PLANE, sp.symbols("u v", real=True), [0, 0], sp.eye(2), diffusion)
+    given = {"start": [0.0, 0.0], "dt": dt, "horizon": 1.0, "nominal": [0, 0]}
+    return define_problem(system, barriers, input_bounds=(-1.0, 1.0), **given)
+
+
 def two_channels():
     """h is a walk, as its gradient and the diffusion are constant."""
-    x, y, u, v = sp.symbols("x y u v", real=True)
-    system = ControlAffineSDE(
-        states=(x, y),
-        inputs=(u, v),
-        drift=[0, 0],
-        input_matrix=[[1, 0], [0, 1]],
-        diffusion=[[0.15, 0.1], [0.0, 0.2]],
-    )
-    given = {
-        "input_bounds": (-1.0, 1.0),
-        "start": [0.0, 0.0],
-        "dt": 0.1,
-        "horizon": 1.0,
-        "nominal": [0, 0],
-    }
-    return replace(define_problem(system, 1.5 - x - y, **given), substeps=2)
+    x, y = PLANE
+    return replace(plane(1.5 - x - y, [[0.15, 0.1], [0.0, 0.2]], 0.1), substeps=2)
 
 
 def two_ways():
     """Two ways to fail, in different units."""
-    x, y, u, v = sp.symbols("x y u v", real=True)
-    system = ControlAffineSDE(
-        states=(x, y),
-        inputs=(u, v),
-        drift=[0, 0],
-        input_matrix=[[1, 0], [0, 1]],
-        diffusion=[[0.2, 0], [0, 3 / 5.15]],
-    )
-    given = {
-        "input_bounds": (-1.0, 1.0),
-        "start": [0.0, 0.0],
-        "dt": 0.05,
-        "horizon": 1.0,
-        "nominal": [0, 0],
-    }
-    return define_problem(system, [1 - x, 3 - y], **given)
+    x, y = PLANE
+    return plane([1 - x, 3 - y], [[0.2, 0], [0, 3 / 5.15]], 0.05)
 
 
 def martingale():

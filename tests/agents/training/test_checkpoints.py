@@ -154,13 +154,10 @@ MISSING = object()
     ("name", "value"),
     [
         ("counters", {"num_timesteps": -4, "_n_updates": 1, "_episode_num": 1}),
-        ("counters", {"num_timesteps": 64}),
         ("counts", {"steps": 1, "violations": 0, "episodes": [["a", "b"]]}),
         ("counts", {"steps": 1, "violations": 0, "episodes": [], "extra": 1}),
-        ("counts", []),
         ("buffer", {"pos": 10**9, "full": False}),
         ("buffer", {"pos": 1, "full": False}),
-        ("buffer", None),
         ("seconds", "long"),
         ("format", 1),
         (None, "[]"),
@@ -192,7 +189,6 @@ def test_a_state_of_another_shape_is_refused(name, value, run, limited, tmp_path
         None,
         [],
         {"high": MISSING},
-        {"mean": "much"},
         {"saturated": float("inf")},
         {"met": 1},
         {"kind": "speed"},
@@ -228,7 +224,7 @@ def whole(tmp_path_factory):
     return outcome(folder)
 
 
-@pytest.mark.parametrize("size", [0, 300, 3000, 20_000])
+@pytest.mark.parametrize("size", [300, 20_000])
 def test_a_full_disk_leaves_what_was_there_and_nothing_else(size, whole, copied):
     folder, _ = copied
     for_more = {path.name for path in folder.iterdir()} | {"policy.npz"}

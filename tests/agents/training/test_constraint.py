@@ -120,8 +120,6 @@ def test_restored_ones_go_on_alike():
             (constraint(), changes)
             for changes in (
                 {"running": [0.0]},
-                {"ended": [-1.0, 0.0]},
-                {"measured": [1.0]},
                 {"recent": [[1.0]]},
                 {"cost": [float("nan"), 0.0]},
                 {"multiplier": None},
@@ -132,10 +130,8 @@ def test_restored_ones_go_on_alike():
             (PIDMultiplier(0.3, 1.0, 1.0, 1.0), changes)
             for changes in (
                 {"integral": -1.0},
-                {"integral": "much"},
                 {"value": math.nan},
                 {"value": 1e9},
-                {"smoothed": True},
                 {"extra": 0.0},
             )
         ),
@@ -204,9 +200,7 @@ PID = {"limit": 0.1, "kp": 1.0, "ki": 1.0, "kd": 1.0}
             (name, number, lambda **changes: PIDMultiplier(**PID | changes))
             for name, number in (
                 ("limit", -0.1),
-                ("limit", math.nan),
                 ("kp", math.inf),
-                ("ki", "0.1"),
                 ("kd", True),
                 ("smoothing", 1.0),
                 ("most", 0.0),
@@ -229,30 +223,11 @@ def test_a_constant_excess_raises_the_multiplier_linearly():
     np.testing.assert_allclose(found, 3.0 * 0.4 + 0.5 * 0.4 * np.arange(1, 21), rtol=1e-12)
 
 
-def test_gradient_ascent_is_the_case_without_p_and_d():
-    rng = np.random.default_rng(0)
-    multiplier, wanted = PIDMultiplier(0.3, 0.0, 0.1, 0.0), 0.0
-    for cost in rng.random(200):
-        wanted = max(wanted + 0.1 * (cost - 0.3), 0.0)
-        assert multiplier.update(cost) == pytest.approx(wanted, abs=1e-12)
-
-
 def test_the_derivative_acts_on_rises_alone_and_smoothing_is_an_exponential_mean():
     multiplier = PIDMultiplier(0.0, 0.0, 0.0, kd=2.0)
     assert updated(multiplier, (5.0, 6.0, 4.0, 4.5)) == [0.0, 2.0, 0.0, 1.0]
     found = updated(PIDMultiplier(0.0, kp=1.0, ki=0.0, kd=0.0, smoothing=0.8), [1.0] + [0.0] * 10)
     np.testing.assert_allclose(found[1:], 0.8 ** np.arange(1, 11), rtol=1e-12)
-
-
-def test_a_static_plant_approaches_the_limit_geometrically():
-    """J = c - g lambda under integral control: the excess shrinks by 1 - g k_i at each update."""
-    multiplier, c, g = PIDMultiplier(0.5, 0.0, 0.3, 0.0), 4.0, 0.7
-    costs = []
-    for _ in range(60):
-        costs.append(c - g * multiplier.value)
-        multiplier.update(costs[-1])
-    wanted = 3.5 * (1.0 - 0.3 * 0.7) ** np.arange(60)
-    np.testing.assert_allclose(np.array(costs) - 0.5, wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize(("kp", "ki"), [(0.0, 0.05), (0.6, 0.05), (1.0, 0.3)])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib.resources import files
 
 import pytest
-import torch
 import yaml
 from stable_baselines3 import PPO
 
@@ -23,11 +22,6 @@ pytestmark = pytest.mark.slow
 SHORT = {"n_timesteps": 16, "eval_freq": 16}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def written(algorithm, *texts):
     return training(algorithm, read_hyperparameters(texts), **SHORT)
 
@@ -38,18 +32,13 @@ def written(algorithm, *texts):
         ("ppo", "policy=MultiInputPolicy", "'MultiInputPolicy'; .*MlpPolicy"),
         ("ppo", "policy=CnnPolicy", "MlpPolicy"),
         ("ppo", "n_epochs=0", "n_epochs = 0; .*from 1"),
-        ("ppo", "n_epochs=2.5", r"n_epochs = 2\.5"),
         ("ppo", "n_steps=true", "n_steps = True"),
         ("ppo", "gamma=1.5", r"gamma = 1\.5; .*from 0 to 1"),
-        ("ppo", "gamma=-0.1", r"gamma = -0\.1"),
         ("ppo", "gae_lambda=true", "gae_lambda = True"),
         ("ppo", "clip_range=0", "clip_range = 0; .*above 0"),
         ("ppo", "ent_coef=-1", "ent_coef = -1"),
         ("sac", "tau=2", "tau = 2"),
-        ("sac", "train_freq=0", "train_freq = 0"),
         ("sac", "gradient_steps=-2", "gradient_steps = -2; .*from -1"),
-        ("sac", "buffer_size=0", "buffer_size = 0"),
-        ("sac", "learning_starts=-1", "learning_starts = -1"),
     ],
 )
 def test_what_is_out_of_range_is_refused(algorithm, text, fragment):
@@ -60,9 +49,7 @@ def test_what_is_out_of_range_is_refused(algorithm, text, fragment):
 REFUSED = [
     ("ppo", {"learning_rat": 3}, "'learning_rate'"),
     ("ppo", {"learning_rate": "exp_3"}, "learning_rate"),
-    ("ppo", {"learning_rate": "lin_x"}, "learning_rate"),
     ("ppo", {"policy_kwargs": {"speed": 3}}, "ppo does not take .*speed"),
-    ("a2c", {"n_epochs": 3}, "a2c does not take"),
     ("ppo", {"normalize": "no thanks"}, "normalize|does not take"),
     ("ppo", {"normalize": {"bogus": 1}}, "bogus"),
     ("sac", {"noise_type": "pink", "noise_std": 0.1}, "noise_type"),

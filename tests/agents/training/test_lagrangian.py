@@ -4,7 +4,6 @@ best policy of a process where it is known exactly."""
 from __future__ import annotations
 
 import copy
-import itertools
 from typing import Any
 
 import gymnasium as gym
@@ -38,11 +37,6 @@ SETTINGS: dict[Any, dict[str, Any]] = {
 NO_GAINS = {"multiplier_kp": 0.0, "multiplier_ki": 0.0, "multiplier_kd": 0.0}
 BOTH = pytest.mark.parametrize("kind", [PPOLagrangian, SACLagrangian])
 STEPS = {PPOLagrangian: 512, SACLagrangian: 100}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
 
 
 class Corridor(gym.Env[np.ndarray, np.ndarray]):
@@ -96,11 +90,6 @@ def same(one, other):
     a, b = parameters(one), parameters(other)
     assert a.keys() == b.keys()
     return all((a[k] is b[k] is None) or torch.equal(a[k], b[k]) for k in a)
-
-
-def all_finite(model):
-    tensors = [*parameters(model).values(), *model.cost_critic.state_dict().values()]
-    return all(t is None or bool(torch.isfinite(t).all()) for t in tensors)
 
 
 def scalars(**options):
@@ -175,20 +164,6 @@ def test_all_that_is_random_follows_from_the_seed(kind):
     assert not all(torch.equal(first[name], other[name]) for name in first)
 
 
-@BOTH
-def test_a_limit_of_zero_gives_finite_numbers(kind):
-    model = learned(kind, cost_limit=0.0)
-    assert all_finite(model)
-    assert np.isfinite(list(model.constraint.figures().values())).all()
-
-
-def test_without_costs_the_multiplier_stays_zero():
-    env = unsafe(start=(0.0,), horizon=0.04)
-    model = made(SACLagrangian, env, cost_limit=0.0).learn(100)
-    assert model.constraint.episode_cost == model.constraint.value == 0.0
-    assert all_finite(model)
-
-
 @pytest.mark.parametrize("scale", [None, 3.0])
 def test_the_actor_of_sac_descends_on_the_weighted_loss(scale, monkeypatch):
     """Against the loss (alpha log pi - min Q_r + l s max Q_c)/(1 + l), written out here."""
@@ -253,7 +228,7 @@ def test_sac_s_cost_critics_learn_the_discounted_cost_of_the_policy():
     """With a discount of 0 they learn the cost of the step itself, which is known."""
     settings = {"policy_kwargs": {"net_arch": [32]}, "learning_rate": 5e-3, "seed": 0}
     settings |= {"cost_gamma": 0.0, "gamma": 1.0, **NO_GAINS}
-    model = made(SACLagrangian, DummyVecEnv([IcyRoad] * 4), **settings).learn(1200)
+    model = made(SACLagrangian, DummyVecEnv([IcyRoad] * 4), **settings).learn(800)
     for action, costs in zip(torch.tensor([[-0.8], [0.8]]), COSTS.T, strict=True):
         with torch.no_grad():
             found = model.cost_critic(torch.eye(3), action.expand(3, 1))
@@ -454,22 +429,11 @@ def test_the_linear_program_has_the_closed_form(limit):
         np.testing.assert_allclose(np.delete(bold, ICE), [1.0, 0.0], atol=1e-9)
 
 
-def test_the_best_return_is_on_the_hull_of_the_policies_without_chance():
-    returns, costs = np.transpose([value_of(p) for p in itertools.product((0.0, 1.0), repeat=3)])
-    # Of any two policies, the mixture that costs as much as is allowed.
-    mixtures = [
-        returns[i] + (LIMIT - costs[i]) / (costs[j] - costs[i]) * (returns[j] - returns[i])
-        for i, j in itertools.permutations(range(8), 2)
-        if costs[i] <= LIMIT < costs[j]
-    ]
-    assert max(mixtures) == pytest.approx(best(LIMIT)[0], rel=1e-9)
-
-
 def test_the_env_is_the_process():
     bold = np.array([0.9, 0.4, 0.2])
     env, sums, total = IcyRoad(), [], np.zeros(2)
     observation, _ = env.reset(seed=0)
-    for _ in range(40_000):
+    for _ in range(10_000):
         action = 2.0 * bold[int(observation.argmax())] - 1.0
         observation, reward, terminated, _, info = env.step([action])
         total += reward, info["cost"]

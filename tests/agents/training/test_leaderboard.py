@@ -149,9 +149,3 @@ def test_the_best_is_computed_where_it_is_asked_for_and_kept(tmp_path, monkeypat
         lambda problem, *how: known if problem.name == "Scalar" else best_for(problem, *how),
     )
     require_computed_and_kept(tmp_path)
-
-
-@pytest.mark.oracle
-def test_the_best_of_an_env_is_computed_and_kept(tmp_path, monkeypatch):
-    monkeypatch.setenv("SAFE_ENVS_CACHE", str(tmp_path / "cache"))
-    require_computed_and_kept(tmp_path)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import pickle
-import zipfile
 
 import gymnasium as gym
 import numpy as np
@@ -49,11 +46,6 @@ SETTINGS = {
 }
 SPACES = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (2,)))
 TWO_INPUTS = ((0.0, 4.0), (-3.0, 5.0))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
 
 
 def make(horizon=0.5, filtered=True, input_bounds=BOX):
@@ -142,9 +134,8 @@ def test_proposed_is_what_stable_baselines_stores():
     )
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_both_stores_each_step_with_either_action(count):
-    model, witness = learned(SAC, several(count), **replay_options(several(count), "both"))
+def test_both_stores_each_step_with_either_action():
+    model, witness = learned(SAC, several(), **replay_options(several(), "both"))
     proposed, executed = witness.actions()
     buffer = model.replay_buffer
     assert buffer.size() == 2 * len(proposed)
@@ -219,20 +210,6 @@ def test_ppo_keeps_the_proposals_and_their_probabilities():
     )
 
 
-def test_a_file_of_plain_ppo_needs_nothing_of_this_package(tmp_path):
-    model = PPO("MlpPolicy", make(), n_steps=8, batch_size=8, device="cpu").learn(8)
-    model.save(tmp_path / "model.zip")
-    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
-        data = json.loads(archive.read("data"))
-    pickles = {
-        key: base64.b64decode(entry[":serialized:"])
-        for key, entry in data.items()
-        if isinstance(entry, dict) and ":serialized:" in entry
-    }
-    assert "action_space" in pickles
-    assert not [key for key, content in pickles.items() if b"safe_envs" in content]
-
-
 def test_saving_and_loading(tmp_path):
     model, _ = learned(SAC, several(), **replay_options(several(), "both"))
     model.save(tmp_path / "model.zip")
@@ -250,29 +227,16 @@ def test_saving_and_loading(tmp_path):
 def buffer_of(
     envs=3, action="executed", kind=FilteredReplayBuffer, input_bounds=TWO_INPUTS, **arguments
 ):
-    return kind(
-        20 * envs,
-        *SPACES,
-        device="cpu",
-        n_envs=envs,
-        action=action,
-        input_bounds=input_bounds,
-        **arguments,
-    )
+    given = {"device": "cpu", "n_envs": envs, "action": action, "input_bounds": input_bounds}
+    return kind(20 * envs, *SPACES, **given, **arguments)
 
 
 def add(buffer, infos, rewards=0.0):
     count = len(infos)
     rng = np.random.default_rng(1)
     proposed = rng.uniform(-1.0, 1.0, (count, 2))
-    buffer.add(
-        np.zeros((count, 2)),
-        np.zeros((count, 2)),
-        proposed,
-        np.full(count, rewards),
-        np.zeros(count, dtype=bool),
-        infos,
-    )
+    seen, done = np.zeros((count, 2)), np.zeros(count, dtype=bool)
+    buffer.add(seen, seen, proposed, np.full(count, rewards), done, infos)
     return proposed.astype(np.float32)
 
 
@@ -305,15 +269,6 @@ def test_infos_of_one_batch_are_read_at_once():
     assert buffer.actions[0].tolist() == [[0.0, 0.0], [-1.0, -1.0], [1.0, 1.0]]
 
 
-def test_infos_of_several_batches_or_without_a_filter_are_read_one_by_one():
-    given = {"safe_action": np.array([2.0, 1.0])}
-    buffer = buffer_of()
-    add(buffer, [View({"safe_action": np.zeros((3, 2))}, k, **given) for k in range(3)])
-    assert buffer.actions[0].tolist() == [[0.0, 0.0]] * 3
-    proposed = add(buffer, [View({"cost": np.zeros(3)}, k) for k in range(3)])
-    assert buffer.actions[1].tobytes() == proposed.tobytes()
-
-
 def test_a_full_buffer_starts_again():
     buffer = buffer_of(envs=1, action="both")
     for k in range(11):
@@ -326,14 +281,8 @@ def test_a_full_buffer_starts_again():
 def test_options_of_a_problem_and_of_any_env_of_it():
     env = make()
     vector = SafetyFilterVectorWrapper(gym.make_vec(ENV_ID, num_envs=2, input_bounds=BOX), "scbf")
-    for source in (
-        env.unwrapped.problem,
-        env,
-        vector,
-        several(),
-        VecNormalize(several()),
-        native(),
-    ):
+    problem, normalised = env.unwrapped.problem, VecNormalize(several())
+    for source in (problem, env, vector, several(), normalised, native()):
         assert replay_options(source, "both") == {
             "replay_buffer_class": FilteredReplayBuffer,
             "replay_buffer_kwargs": {"input_bounds": (BOX,), "action": "both"},
@@ -341,6 +290,7 @@ def test_options_of_a_problem_and_of_any_env_of_it():
 
 
 BOXES = [(0.0, 4.0), ((0.0, 4.0),), ((0.0, 4.0), (5.0, -3.0)), ((0.0, 4.0), (0.0, np.inf))]
+BOXES += ["b", ((0,), (1, 2))]
 SMALL = {"optimize_memory_usage": True, "handle_timeout_termination": False}
 
 
@@ -351,13 +301,7 @@ def of_several_bounds():
 @pytest.mark.parametrize(
     ("call", "fragment"),
     [
-        *(
-            (
-                lambda box=box: buffer_of(input_bounds=box),
-                "input_bounds = ",
-            )
-            for box in (*BOXES, "b", ((0,), (1, 2)))
-        ),
+        *((lambda box=box: buffer_of(input_bounds=box), "input_bounds = ") for box in BOXES),
         (lambda: buffer_of(action="excuted"), "'executed'"),
         (lambda: buffer_of(action=None), "action = None"),
         (lambda: buffer_of(action="both", **SMALL), "optimize_memory_usage"),
@@ -370,10 +314,7 @@ def of_several_bounds():
         (lambda: replay_options(gym.make("CartPole-v1")), "not one of this project's envs"),
         (lambda: replay_options(DummyVecEnv([lambda: gym.make("CartPole-v1")])), "not one of"),
         (lambda: replay_options(None), "not one of this project's envs"),
-        (
-            lambda: replay_options(of_several_bounds()),
-            r"\[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
-        ),
+        (lambda: replay_options(of_several_bounds()), r"\(-3.0, 5.0\),\), \(\(-2.0, 2.0\)"),
     ],
 )
 def test_what_does_not_fit_is_refused(call, fragment):
@@ -391,7 +332,7 @@ def third_party():
 
 @pytest.mark.parametrize(
     ("algorithm", "make_envs"),
-    [(SAC, several), (SAC, native), (TD3, make), (DDPG, lambda: DummyVecEnv([third_party]))],
+    [(SAC, several), (TD3, make), (DDPG, lambda: DummyVecEnv([third_party]))],
 )
 def test_the_class_alone_stores_what_was_executed(algorithm, make_envs):
     """One argument; plain Stable-Baselines3 stores something else."""
@@ -447,15 +388,8 @@ def test_wrappers_around_the_filter_that_change_actions():
     model.env.envs[0].unwrapped.reset(seed=0)
     executed = {"safe_action": np.array([0.0]), "nominal_action": np.array([2.0])}
     executed["input_bounds"] = np.array([BOX])
-    row = (
-        np.zeros((1, 4)),
-        np.zeros((1, 4)),
-        np.array([[0.5]]),
-        np.zeros(1),
-        np.zeros(1),
-        [executed],
-    )
-    model.replay_buffer.add(*row)
+    seen, ends = np.zeros((1, 4)), np.zeros(1)
+    model.replay_buffer.add(seen, seen, np.array([[0.5]]), ends, ends, [executed])
     assert stored(model).tolist() == [[[-0.5]]]
 
 
@@ -593,28 +527,17 @@ def filled(penalty, action="executed", n_steps=1, kind=None):
     last = env.reset()
     for proposed in np.random.default_rng(0).uniform(-1.0, 1.0, (24, 3, 1)).astype(np.float32):
         observations, rewards, dones, infos = env.step(proposed)
-        buffer.add(
-            last,
-            observations,
-            proposed,
-            rewards,
-            dones,
-            [kind(info) for info in infos] if kind else infos,
-        )
+        given = [kind(info) for info in infos] if kind else infos
+        buffer.add(last, observations, proposed, rewards, dones, given)
         last = observations
     return buffer
 
 
 @pytest.mark.parametrize("kind", [None, dict], ids=["native", "dicts"])
 def test_a_penalty_belongs_to_the_proposal(kind):
+    buffers = filled(0.0), filled(2.0, "proposed"), filled(2.0, kind=kind)
     own, penalised, executed, both = (
-        buffer.rewards[: buffer.size()]
-        for buffer in (
-            filled(0.0),
-            filled(2.0, "proposed"),
-            filled(2.0, kind=kind),
-            filled(2.0, "both", kind=kind),
-        )
+        buffer.rewards[: buffer.size()] for buffer in (*buffers, filled(2.0, "both", kind=kind))
     )
     assert np.any(own - penalised > 0.1)
     np.testing.assert_allclose(executed, own, rtol=1e-5, atol=1e-6)
@@ -622,33 +545,17 @@ def test_a_penalty_belongs_to_the_proposal(kind):
     assert both[1::2].tobytes() == penalised.tobytes()
 
 
-@pytest.mark.parametrize("kind", [None, dict], ids=["native", "dicts"])
-def test_n_step_returns_of_executed_actions_are_without_the_penalty(kind):
+def test_n_step_returns_of_executed_actions_are_without_the_penalty():
     def returns(buffer):
         np.random.seed(0)  # noqa: NPY002  (of which Stable-Baselines3 samples)
         return buffer.sample(200).rewards.numpy()
 
     free, executed, proposed = (
-        returns(filled(c, action, 3, kind))
+        returns(filled(c, action, 3))
         for c, action in ((0.0, "executed"), (2.0, "executed"), (2.0, "proposed"))
     )
     np.testing.assert_allclose(executed, free, rtol=1e-5, atol=1e-6)
     assert np.any(free - proposed > 0.1)
-
-
-def test_penalties_pass_through_the_wrappers():
-    env = VecNormalize(
-        VecMonitor(
-            make_sb3_env(
-                ENV_ID, 3, "scbf", intervention_penalty=2.0, horizon=0.25, input_bounds=BOX
-            )
-        )
-    )
-    model, _ = learned(SAC, env, **replay_options(env, "both"))
-    rewards = model.replay_buffer.rewards[: model.replay_buffer.size()]
-    distances = np.abs(stored(model)[0::2] - stored(model)[1::2])[..., 0]
-    assert np.any(distances > 0.1)
-    np.testing.assert_allclose(rewards[0::2] - rewards[1::2], 2.0 * distances, atol=1e-5)
 
 
 ONE_INPUT = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (1,)))

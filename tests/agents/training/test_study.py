@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from scipy.stats import binom, trim_mean
+from scipy.stats import trim_mean
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.episodes import episode_seed
@@ -39,9 +39,9 @@ from safe_envs.files import locked
 
 SCALAR = "safe_envs/Scalar-v0"
 SMALL = {
-    "n_timesteps": 256,
+    "n_timesteps": 128,
     "num_envs": 4,
-    "eval_freq": 128,
+    "eval_freq": 64,
     "eval_episodes": 4,
     "settings": {"n_steps": 16, "batch_size": 64},
 }
@@ -56,7 +56,7 @@ ALONE = Backend(jobs=1)
 
 def study(**changes):
     given = {"seeds": 2, "episodes": 20, "training": SMALL, "options": {"horizon": 0.5}}
-    return Study((SCALAR,), VARIANTS, **given | changes)
+    return Study((SCALAR,), **{"variants": VARIANTS, **given, **changes})
 
 
 def timeless(rows):
@@ -178,7 +178,7 @@ def test_an_interrupted_study_ends_as_an_uninterrupted_one(tmp_path, monkeypatch
     with pytest.raises(KeyboardInterrupt):
         run_study(few, tmp_path / "part", ALONE)
     assert len(calls) == 2
-    assert [path.name for path in calls[1].glob("checkpoint_*")] == [f"checkpoint_{128:012d}"]
+    assert [path.name for path in calls[1].glob("checkpoint_*")] == [f"checkpoint_{64:012d}"]
     monkeypatch.setattr("safe_envs.agents.training.trainer.train", train)
     resumed = run_study(few, tmp_path / "part", ALONE)
     assert timeless(resumed.rows) == timeless(whole.rows)
@@ -196,13 +196,12 @@ def test_trainings_in_processes_are_those_of_one_process(tmp_path):
 
 @pytest.mark.slow
 def test_what_does_not_suit_an_env_is_told_and_the_rest_is_computed(tmp_path):
-    variants = (Variant("nominal"), Variant("promise", filter="promise:p=0.9"))
-    ids = ("safe_envs/QuadrotorLimits-v0",)
-    found = run_study(Study(ids, variants, 2, episodes=2), tmp_path, ALONE)
+    variants = (Variant("nominal"), Variant("backup", filter="backup"))
+    found = run_study(study(episodes=2, variants=variants), tmp_path, ALONE)
     assert [row.variant for row in found.rows] == ["nominal", "nominal"]
     ((key, reason),) = found.missing.items()
-    assert key == (ids[0], "promise", None)
-    assert "a grid takes at most 4" in reason
+    assert key == (SCALAR, "backup", None)
+    assert "BackupLaw" in reason
 
 
 @pytest.mark.slow
@@ -315,7 +314,6 @@ def test_a_file_of_ones_own(tmp_path):
         ({"name": 3}, "name = 3"),
         ({"name": "two\nlines"}, "printable"),
         ({"name": "red \x1b[31m"}, "printable"),
-        ({"name": "a | b"}, "printable"),
         ({"name": "a" * 81}, "printable"),
         ({"algorithm": None, "policy": "law.py:law"}, "runs none"),
         ({"algorithm": None, "policy": "os:abort"}, "runs none"),
@@ -324,16 +322,13 @@ def test_a_file_of_ones_own(tmp_path):
         ({"training": {"filter": "./a+b/law.py:Condition"}}, "runs none"),
         ({"training": {"filter": ["scbf"]}}, "filter"),
         ({"training": {"settings": [1]}}, "settings"),
-        ({"training": {"settings": "gamma"}}, "settings"),
         ({"algorithm": "pop"}, "ppo"),
         ({"algorithm": None, "training": {"filter": "scbf"}}, "no algorithm"),
         ({"policy": ["a"]}, "policy"),
         ({"training": {"fliter": "scbf"}}, "filter"),
         ({"training": {"seed": 1}}, "seed"),
         ({"training": {"knowledge": "plant"}}, "knowledge"),
-        ({"training": [1]}, "training"),
         ({"filters": "scbf"}, "filters"),
-        ({"filters": []}, "filters"),
         ({"penalty": 1.0}, "penalty"),
     ],
 )
@@ -424,22 +419,6 @@ def test_statistics_of_agents_and_of_their_differences(tmp_path):
     assert summaries(StudyResult(study, [], {}), read.agents, SCALAR) == []
 
 
-def test_agents_are_told_without_a_filter_that_their_env_has_not(tmp_path):
-    given = {**ONE, "filters": ["default", "promise:p=0.9", "none"]}
-    read = read_study(written(tmp_path / "s.yml", given))
-    rows = [row_of("one | default", 0, "scbf", violations=3), row_of("one | none", 0, "none")]
-    first, second = summaries(
-        StudyResult(Study([SCALAR], read.variants), rows, {}), read.agents, SCALAR
-    )
-    assert (first.filter, second.filter) == ("scbf", "promise:p=0.9")
-    assert second.estimates["safety"] is None
-    for each in (first, second):
-        # Those of the agents, whatever filter they are evaluated with.
-        assert each.estimates["violations"].value == 3.0
-        assert each.estimates["safety_alone"].value == 0.5
-    assert summaries(StudyResult(Study([SCALAR], read.variants), [], {}), read.agents, SCALAR) == []
-
-
 @pytest.mark.parametrize("count", range(1, 15))
 def test_the_interquartile_mean_is_scipys_trimmed_mean(count):
     values = np.random.default_rng(count).normal(size=(6, count))
@@ -462,18 +441,6 @@ def test_one_env_is_the_enumeration_of_all_draws(count, confidence):
     assert found.high == pytest.approx(means[::-1][place], abs=1e-14)
     assert found.value == pytest.approx(trim_mean(values, 0.25))
     assert found.seeds == count
-
-
-def test_two_different_values_give_the_binomial_distribution():
-    # Of five draws from {0, 0, 1, 1, 1}, k are 1: the middle three have clip(k - 1, 0, 3) ones.
-    shares = np.array([binom.pmf(k, 5, 0.6) for k in range(6)])
-    means = np.clip(np.arange(6) - 1, 0, 3) / 3
-    for confidence in (0.5, 0.8, 0.95):
-        tail = (1 - confidence) / 2
-        low = means[np.searchsorted(np.cumsum(shares), tail)]
-        high = means[::-1][np.searchsorted(np.cumsum(shares[::-1]), tail)]
-        found = over_seeds([[1, 0, 1, 0, 1]], confidence)
-        assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
 
 
 def test_several_envs_are_drawn_within_each():
@@ -520,14 +487,6 @@ def coverage(draw, truth, count, trials, seed=0):
 
 def normal(rng, count):
     return rng.normal(size=count)
-
-
-def test_intervals_of_few_seeds_hold_less_often_than_they_say():
-    # Of three values it is from the least to the largest, as (1/3)^3 > 2.5 %: both are on one side
-    # of the median with probability 2/2^3.
-    three, five = (coverage(normal, 0.0, count, 1000) for count in (3, 5))
-    assert three == pytest.approx(0.75, abs=4 * np.sqrt(0.75 * 0.25 / 1000))
-    assert three < five < 0.95
 
 
 def test_intervals_of_few_seeds_come_with_what_they_are_worth():

@@ -3,22 +3,26 @@ that its figures are those of the evaluation."""
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 
 import numpy as np
 import pytest
-import torch
+from rich.console import Console
 from safetensors.numpy import load_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-from safe_envs import ConfigurationError
+from safe_envs import ENV_IDS, ConfigurationError
 from safe_envs.agents import evaluate, make_sb3_env
 from safe_envs.agents.training.callbacks import SafetyFigures
 from safe_envs.agents.training.config import PromiseCurriculum, Training
+from safe_envs.agents.training.constraint import COST, DEFAULT_VIOLATION_LIMIT, VIOLATION
+from safe_envs.agents.training.hyperparameters import CONSTRAINED, hyperparameters
 from safe_envs.agents.training.trainer import train
 from safe_envs.filters.learning.data import load
+from safe_envs.scripts.reports.sweep import print_evaluations
 from tests.agents.training.small import (
     DUBINS,
     SCALAR,
@@ -33,11 +37,6 @@ pytestmark = pytest.mark.slow
 
 FILES = {"config.json", "evaluations.json", "progress.jsonl", "model.zip", "policy.npz", "best"}
 FIGURES = ("rate", "episode_cost", "h_min", "violations", "interventions", "infeasible")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module", params=["ppo", "sac"])
@@ -92,39 +91,29 @@ SMALL_MEMORY = {
     "optimize_memory_usage": True,
     "replay_buffer_kwargs": {"handle_timeout_termination": False},
 }
+COSTS = {"env_id": SCALAR, "filter": None, "cost_limit": 0.5}
+VIOLATIONS = {"env_id": SCALAR, "action": "both", "violation_limit": 0.1}
+ESTIMATED = {
+    "env_id": SCALAR,
+    "filter": "scbf:belief=0.05",
+    "estimator": "ekf",
+    "options": MEASURED,
+}
 NOISE = {"noise_type": "ornstein-uhlenbeck", "noise_std": 0.3}
 CASES = {
     "rewards-normalised": ("ppo", {"normalize": {"norm_obs": False}, "stats_window_size": 3}, {}),
     "bare": ("a2c", {"use_sde": True}, {"filter": None}),
-    "both-actions": (
-        "sac",
-        {"normalize": True},
-        {"action": "both", "intervention_penalty": 0.1},
-    ),
+    "both-actions": ("sac", {"normalize": True}, {"action": "both", "intervention_penalty": 0.1}),
     "n-step-full-buffer": ("sac", {"n_steps": 3, "buffer_size": 40}, {}),
-    "small-memory": ("sac", {**SMALL_MEMORY, "ent_coef": 0.1}, {"filter": None}),
     "noise": ("td3", NOISE, {}),
-    "violation-limit": ("ppo-lag", {"normalize": True}, {"env_id": SCALAR, "filter": None}),
-    "cost-limit": (
-        "ppo-lag",
-        {"use_sde": True, "multiplier_smoothing": 0.5},
-        {"env_id": SCALAR, "filter": None, "cost_limit": 0.5},
-    ),
-    "sac-lag": (
-        "sac-lag",
-        {"normalize": True, "buffer_size": 40},
-        {"env_id": SCALAR, "action": "both", "violation_limit": 0.1},
-    ),
+    "cost-limit": ("ppo-lag", {"use_sde": True, "multiplier_smoothing": 0.5}, COSTS),
+    "sac-lag": ("sac-lag", {"normalize": True, "buffer_size": 40}, VIOLATIONS),
     "sac-lag-small-memory": (
         "sac-lag",
         {**SMALL_MEMORY, "cost_gamma": 0.9, "multiplier_kd": 0.3},
-        {"env_id": SCALAR, "filter": None, "cost_limit": 0.5},
+        COSTS,
     ),
-    "estimator": (
-        "ppo",
-        {},
-        {"filter": "scbf:belief=0.05", "estimator": "ekf", "options": MEASURED},
-    ),
+    "estimator": ("ppo", {}, ESTIMATED),
     "curriculum": ("ppo", {}, {**PROMISE, **CURRICULUM}),
 }
 
@@ -165,19 +154,11 @@ def test_a_stopped_training_of_any_kind_ends_as_one_that_was_not(
     assert last["filter"] == (wanted.filter or "none")
     if wanted.limit_kind is not None:
         assert last["constraint"]["multiplier"] > 0.0
-    if wanted.estimator is not None:
-        # The same policy acts at estimates elsewhere, and at true states.
-        given = {"options": {"measurement": "default", "horizon": 0.5}, "estimator": "ukf"}
-        path = str(tmp_path / "run")
-        found = evaluate(DUBINS, path, ["scbf"], episodes=4, bounds=False, **given)
-        assert [row.filter for row in found.rows] == ["scbf@state", "scbf", "scbf:belief=0.05"]
     if wanted.curriculum is not None:
         found = [line.get("train/probability") for line in logged(tmp_path / "run")]
         values = [value for value in found if value is not None]
         assert values == sorted(values)
         assert values[0] < values[-1] == 0.97
-        train(training(algorithm, changes, **PROMISE), tmp_path / "without")
-        assert outcome(tmp_path / "without")[2] != outcome(tmp_path / "run")[2]
 
 
 def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
@@ -233,7 +214,6 @@ def test_the_figures_are_those_of_the_infos():
 
 REFUSED = [
     ({"n_timesteps": 0}, "n_timesteps"),
-    ({"num_envs": 2.5}, "num_envs"),
     ({"action": "both "}, "action"),
     ({"action": "both"}, "action"),
     ({"algorithm": "sac", "intervention_penalty": 1.0}, "intervention penalty"),
@@ -249,12 +229,9 @@ REFUSED = [
         ({"env_id": SCALAR, "filter": PROMISE["filter"], "promise_curriculum": 0.5, **each}, word)
         for each, word in (
             ({"filter": "scbf"}, "promise filter"),
-            ({"filter": None}, "promise filter"),
             ({"promise_curriculum": 0.97}, "promise_curriculum"),
             ({"promise_curriculum": 0.0}, "promise_curriculum"),
             ({"promise_curriculum": float("nan")}, "JSON"),
-            ({"promise_curriculum": True}, "promise_curriculum"),
-            ({"promise_curriculum": "half"}, "promise_curriculum"),
             ({"curriculum_part": 0.0}, "curriculum_part"),
             ({"curriculum_part": 1.5}, "curriculum_part"),
         )
@@ -323,3 +300,95 @@ def test_each_episode_keeps_the_p_it_began_with():
             envs.env_method("ask_promise", wrong)
     with pytest.raises(ConfigurationError, match="promise filter"):
         make_sb3_env(SCALAR, 2, "scbf", **horizon).env_method("ask_promise", 0.5)
+
+
+# Limits of a training: which are allowed, and that it is told whether one is met.
+
+
+BOTH = pytest.mark.parametrize("algorithm", CONSTRAINED)
+
+
+@BOTH
+def test_without_a_limit_there_is_the_default_one(algorithm):
+    one = Training.of(SCALAR, algorithm)
+    assert (one.cost_limit, one.violation_limit) == (None, DEFAULT_VIOLATION_LIMIT)
+    other = Training.of(SCALAR, algorithm, cost_limit=0)
+    assert (other.limit_kind, other.cost_limit, other.violation_limit) == (COST, 0, None)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "limits", "fragment"),
+    [
+        ("ppo", {"cost_limit": 1.0}, "cost_limit; .*ppo-lag or sac-lag"),
+        ("td3", {"violation_limit": 0.1}, "violation_limit"),
+        ("ppo-lag", {"cost_limit": 1.0, "violation_limit": 0.1}, "2 limits"),
+        ("ppo-lag", {"violation_limit": 1.0}, "violation_limit = 1"),
+        ("sac-lag", {"violation_limit": -0.1}, r"violation_limit = -0\.1"),
+        ("ppo-lag", {"cost_limit": "few"}, "cost_limit = 'few'"),
+    ],
+)
+def test_other_limits_are_refused(algorithm, limits, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        Training.of(SCALAR, algorithm, **limits)
+
+
+@pytest.mark.parametrize("key", ["cost_limit", "cost_unit"])
+def test_a_limit_is_no_hyperparameter(key, tmp_path):
+    with pytest.raises(ConfigurationError, match="--violation-limit"):
+        train(training("ppo-lag", {key: 1.0}), tmp_path / "run")
+
+
+@BOTH
+def test_the_budget_is_that_of_the_algorithm_without_a_constraint(algorithm):
+    for env_id in ENV_IDS:
+        mine = hyperparameters(algorithm, env_id)
+        theirs = hyperparameters(algorithm.removesuffix("-lag"), env_id)
+        assert {key: mine[key] for key in theirs} == theirs
+        assert all(key.startswith(("cost_", "multiplier_")) for key in mine.keys() - theirs.keys())
+
+
+def printed(rows):
+    stream = io.StringIO()
+    print_evaluations(Console(file=stream, width=400), "none", rows)
+    return stream.getvalue()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("algorithm", "kind"), [("ppo-lag", VIOLATION), ("sac-lag", COST)])
+def test_a_limit_of_zero_gives_finite_numbers_and_is_judged_and_told(algorithm, kind, tmp_path):
+    # Without costs, and with costs that no policy avoids: the noise of a step is larger than the
+    # safe set.
+    for name, start, noise in (("safe", [0.0], 0.0), ("unsafe", [0.9], 3.0)):
+        folder = tmp_path / name
+        options = {"horizon": 0.1, "start": start, "noise": noise}
+        given = {"filter": None, "eval_episodes": 40, "n_timesteps": 160, kind: 0.0}
+        train(training(algorithm, env_id=SCALAR, options=options, **given), folder)
+        keys = {key for line in logged(folder) for key in line}
+        names = ("multiplier", "limit", "episode_cost", "violation_rate")
+        assert {f"constraint/{name}" for name in names} <= keys
+        assert "NaN" not in (folder / "progress.jsonl").read_text()
+        last = evaluations(folder)[-1]
+        judgement = last["constraint"]
+        assert (judgement["kind"], judgement["met"]) == (kind, name == "safe")
+        assert ("NOT MET" in printed([last])) is (name == "unsafe")
+        assert judgement["episodes"] > 10
+        for key in ("low", "multiplier"):
+            assert (judgement[key] > judgement["limit"] == 0.0) is (name == "unsafe")
+        (checkpoint,) = folder.glob("checkpoint_*")
+        for array in load_file(checkpoint / "learner.safetensors").values():
+            assert np.isfinite(array).all()
+    # The policy is data, and a file of Stable-Baselines3.
+    (row,) = evaluate(SCALAR, str(folder), ["none"], episodes=20, seed=1).rows
+    assert 0.0 <= row.safety_rate <= 1.0
+    if algorithm == "ppo-lag":
+        assert PPO.load(folder / "model.zip").n_steps == 16
+
+
+@pytest.mark.slow
+def test_a_filter_in_the_loop_keeps_the_limit_by_itself(tmp_path):
+    given = {"intervention_penalty": 0.1, "violation_limit": 0.5, "eval_episodes": 8}
+    wanted = training("ppo-lag", env_id=SCALAR, options={"horizon": 0.1}, **given)
+    train(wanted, tmp_path / "run")
+    last = evaluations(tmp_path / "run")[-1]
+    assert (last["constraint"]["met"], last["filter"]) == (True, "scbf")
+    assert "NOT MET" not in printed([last])

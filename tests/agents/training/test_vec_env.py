@@ -4,21 +4,13 @@ they are read."""
 from __future__ import annotations
 
 import copy
-import json
 import pickle
-import sys
-from types import ModuleType
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    VecMonitor,
-    VecNormalize,
-    VecVideoRecorder,
-)
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs.agents.training.vec_env import SB3VecEnv, make_sb3_env
@@ -260,47 +252,18 @@ def test_render_of_each_env_is_its_picture():
     assert (last != pictures[0]).any()
 
 
-def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
-    # The render mode, the frame rate in the metadata, and one picture of all envs, here from a
-    # stand-in for rendering.
-    native = make_sb3_env(DUBINS, 2).env
-    native.render_mode = "rgb_array"
-    native.metadata = {**native.metadata, "render_modes": ["rgb_array"], "render_fps": 20}
-    monkeypatch.setattr(
-        type(native),
-        "render",
-        lambda self: tuple(np.full((4, 6, 3), i, dtype=np.uint8) for i in range(self.num_envs)),
-    )
-    monkeypatch.setitem(sys.modules, "moviepy", ModuleType("moviepy"))
-    recorder = VecVideoRecorder(SB3VecEnv(native), str(tmp_path), lambda _: True, video_length=5)
-    assert recorder.frames_per_sec == 20
-    assert [picture.max() for picture in recorder.get_images()] == [0, 1]
-    recorder.reset()
-    recorder.step(np.zeros((2, 1), dtype=np.float32))
-    assert [frame.shape for frame in recorder.recorded_frames] == [(8, 6, 3)] * 2
-    recorder.recorded_frames.clear()
-
-
 def test_penalty_is_the_distance_in_units_of_the_box():
     env_id, c = "safe_envs/QuadrotorLimits-v0", 0.7
-    envs = [
-        make_sb3_env(
-            env_id, 2, "hocbf", seed=3, intervention_penalty=p, noise=0.05, max_episode_steps=12
-        )
-        for p in (0.0, c)
-    ]
+    given = {"seed": 3, "noise": 0.05, "max_episode_steps": 12}
+    envs = [make_sb3_env(env_id, 2, "hocbf", intervention_penalty=p, **given) for p in (0.0, c)]
     for env in envs:
         env.reset()
     half = np.diff(np.array(envs[0].get_attr("problem")[0].input_bounds))[:, 0] / 2.0
     reduced = 0
     for action in drawn_actions(envs[0], 24):
         (_, plain, dones, infos), (_, rewards, _, penalised) = (env.step(action) for env in envs)
-        distances = np.array(
-            [
-                np.linalg.norm((info["safe_action"] - info["nominal_action"]) / half)
-                for info in infos
-            ]
-        )
+        moved = [(info["safe_action"] - info["nominal_action"]) / half for info in infos]
+        distances = np.linalg.norm(moved, axis=1)
         np.testing.assert_allclose(rewards, plain - c * distances, rtol=1e-5, atol=1e-6)
         assert rewards.dtype == np.float32
         reduced += (distances[dones] > 0.0).sum()
@@ -351,10 +314,7 @@ def test_filters_are_texts_conditions_or_nothing(given):
         ({"env_id": "CartPole-v1"}, "CartPole-v1"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"num_envs": 2.0}, r"num_envs = 2\.0"),
-        ({"filter": "scfb"}, "scbf"),
         ({"filter": 3}, "3"),
-        ({"filter": "scbf", "knowledge": "oracle"}, "oracle"),
-        ({"filter": "scbf", "objective": "fastest"}, "fastest"),
         ({"filter": "scbf", "intervention_penalty": -0.1}, r"intervention_penalty = -0\.1"),
         ({"filter": "scbf", "intervention_penalty": float("nan")}, "intervention_penalty = nan"),
         ({"filter": "scbf", "intervention_penalty": "1"}, "intervention_penalty = '1'"),
@@ -496,20 +456,18 @@ def test_infos_are_made_as_far_as_they_are_read():
         assert dict.keys(twin) == {"barrier"}
 
 
-@pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
-def test_every_way_to_read_an_info_gives_all_of_it(reading):
+def test_every_way_to_read_an_info_gives_all_of_it():
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=1)
     env.reset()
     info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
-    wanted = {
-        **{key: values[1] for key, values in env.batch_info.items()},
-        "terminal_observation": dict.get(info, "terminal_observation"),
-    }
-    read = reading(info)
-    assert len(read) == len(wanted) == 18
-    for key, value in wanted.items():
-        # The text of an array has eight digits.
-        np.testing.assert_allclose(read[key], value, rtol=1e-7, err_msg=key)
+    wanted = {key: values[1] for key, values in env.batch_info.items()}
+    wanted["terminal_observation"] = dict.get(info, "terminal_observation")
+    for name, reading in READINGS.items():
+        read = reading(info.copy())
+        assert len(read) == len(wanted) == 18, name
+        for key, value in wanted.items():
+            # The text of an array has eight digits.
+            np.testing.assert_allclose(read[key], value, rtol=1e-7, err_msg=f"{name}: {key}")
 
 
 def test_infos_are_equal_if_their_entries_are():
@@ -538,13 +496,6 @@ def test_infos_are_equal_if_their_entries_are():
         ):
             assert ((a == b), (a != b)) == (same, not same)
     assert info.copy() != 3
-
-
-def test_a_dict_of_an_info_is_written_as_json():
-    env = make_sb3_env(DUBINS, 2, seed=0)
-    env.reset()
-    info = env.reset_infos[1]
-    assert set(json.loads(json.dumps(dict(info), default=list))) == set(env.batch_info)
 
 
 def test_infos_can_be_changed_without_changing_the_batch():

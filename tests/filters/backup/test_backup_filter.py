@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 import pickle
 from dataclasses import replace
 
@@ -15,10 +16,16 @@ from safe_envs import ConfigurationError, InvalidInputError, SystemDefinitionErr
 from safe_envs.agents import make_policy
 from safe_envs.agents.evaluation.compiled_episodes import CompiledEpisodes
 from safe_envs.agents.evaluation.episodes import play
+from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.backup import Backup, BackupLaw
-from safe_envs.proofs.backup_filter import BackupFilter
-from safe_envs.wrappers import SafetyFilterVectorWrapper
+from safe_envs.proofs.backup_filter import BackupFilter, BackupSettings
+from safe_envs.registry import make_problem
+from safe_envs.values.promise_filter import PromiseSettings
+from safe_envs.wrappers import SafetyFilterVectorWrapper, parse_conditions
+from safe_envs.wrappers.filter_layers import settings_of
+from tests.conftest import problem_of
 from tests.oracles.carts import (
     BRAKE,
     DT,
@@ -230,24 +237,6 @@ def test_a_plan_that_overflows_is_not_allowed():
         assert np.isfinite(found.action).all()
 
 
-def test_states_that_plans_do_not_need_are_not_simulated():
-    y = sp.Symbol("y", real=True)
-    wider = replace(
-        cart(),
-        states=(y, x, v),
-        drift=sp.Matrix([v**2, v, 0]),
-        input_matrix=sp.Matrix([x, 0, 1]),
-        diffusion=sp.zeros(3, 1),
-    )
-    guard = BackupFilter(wider, 1 - x, backup(), BOUNDS, DT)
-    states, proposed = drawn(200)
-    wide = np.column_stack([np.full(200, 5.0), states])
-    assert len(guard.plans.part(tuple(wide.T))) == 2
-    assert np.array_equal(
-        guard.filter(wide, proposed).action, cart_filter().filter(states, proposed).action
-    )
-
-
 def test_with_noise_plans_are_of_the_mean_and_promise_nothing():
     problem = cart_problem(noise=0.1)
     guard = BackupFilter.for_problem(problem)
@@ -258,12 +247,6 @@ def test_with_noise_plans_are_of_the_mean_and_promise_nothing():
     assert "differs" in BackupFilter.for_problem(cart_problem()).why_not(
         replace(cart(), drift=sp.Matrix([v, 1]))
     )
-
-
-def test_for_a_problem_it_takes_text():
-    found = BackupFilter.for_problem(cart_problem(), "backup:horizon=0.2:margin=0.1")
-    assert found.settings == settings(horizon=0.2, margin=0.1)
-    assert not found.filter([-9.0, 3.0], [0.0]).feasible
 
 
 def test_knowledge_says_whose_plans_are_simulated():
@@ -401,3 +384,175 @@ def test_the_compiled_text_plays_the_episodes_of_numpy():
     for field in dataclasses.fields(one):
         pair = getattr(one, field.name), getattr(other, field.name)
         np.testing.assert_allclose(*pair, rtol=1e-7, atol=1e-12, err_msg=field.name)
+
+
+# The text of the backup filter.
+
+
+@pytest.mark.parametrize(
+    ("text", "settings"),
+    [
+        ("backup", BackupSettings()),
+        ("backup:horizon=2", BackupSettings(2.0)),
+        ("backup:margin=0.1", BackupSettings(margin=0.1)),
+        ("backup:horizon=2.5:margin=1e-3", BackupSettings(2.5, 0.001)),
+    ],
+)
+def test_text_and_settings_are_the_same(text, settings):
+    assert BackupSettings.of_text(text) == settings == settings_of(text)
+    assert BackupSettings.of_text(settings.text) == settings
+
+
+def test_the_text_says_which_filter_is_meant():
+    assert isinstance(settings_of("promise:p=0.9"), PromiseSettings)
+    assert settings_of("scbf") is None
+    assert settings_of("backups") is None
+
+
+SCALAR = problem_of("safe_envs/Scalar-v0")
+
+
+@pytest.mark.parametrize(
+    ("call", "fragment"),
+    [
+        *(
+            (lambda text=text: settings_of(text), fragment)
+            for text, fragment in (
+                ("backup:horizont=2", "'horizont'"),
+                ("backup:horizon", "horizon no value"),
+                ("backup:horizon=2:horizon=3", "twice"),
+                ("backup:horizon=-1", "-1"),
+                ("backup:horizon=nan", "horizon"),
+                ("backup:horizon=x", "horizon"),
+                ("backup:margin=-1", "margin = -1"),
+                ("backup+scbf", "alone"),
+                ("backup:horizon=2+hocbf:alpha=2,8", "alone"),
+            )
+        ),
+        (lambda: parse_conditions("backup", cart_problem()), "backup"),
+        (lambda: parse_conditions("hocbf+backup", cart_problem(barriers=(1 - x,) * 2)), "backup"),
+        (lambda: BackupSettings().require_fit(SCALAR), "Scalar.*BackupLaw"),
+        (lambda: BackupSettings().require_fit(cart_problem(), "clf"), "nearest"),
+        (lambda: BackupSettings(horizon=1001.0).require_fit(cart_problem()), "10000 control"),
+    ],
+)
+def test_what_is_no_backup_filter_of_the_problem_is_refused(call, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        call()
+
+
+# From the domain of a system's backup no filtered step is infeasible, whatever is proposed.
+
+
+SYSTEMS = {
+    "DubinsDisk": ({}, (-1, -1, -4), (1, 1, 4)),
+    "ACCGap": ({"noise": 0.0}, (0, 10), (50, 200)),
+    "ACC": ({"noise": 0.0}, (0, 0, 0), (50, 50, 300)),
+    "Pendulum": ({"noise": 0.0}, (-0.5, -0.5), (0.5, 0.5)),
+    "QuadrotorAltitude": ({}, (3, -6), (7, 6)),
+    "QuadrotorLimits": (
+        {},
+        (-5, -5, 3, -5, -5, -6, -0.5, -0.5, -3, -6, -6, -3),
+        (5, 5, 7, 5, 5, 6, 0.5, 0.5, 3, 6, 6, 3),
+    ),
+}
+
+
+class Pressed:
+    """A system behind its backup filter, and those that propose its inputs."""
+
+    def __init__(self, name, size, seed):
+        options, low, high = SYSTEMS[name]
+        self.problem = make_problem(f"safe_envs/{name}-v0", **options)
+        plant = self.problem.plant
+        self.filter = BackupFilter.for_problem(self.problem, knowledge="plant")
+        self.rng, self.size = np.random.default_rng(seed), size
+        self.low, self.high = np.array(self.problem.input_bounds).T
+        self._step = Integrator(plant, self.problem.dt, self.problem.substeps, "arrays")
+        expressions = [b.expression for b in self.problem.barriers]
+        self._barriers = compile_function(plant.states, expressions, "arrays")
+        self.corners = np.array(list(itertools.product(*self.problem.input_bounds)))
+        self.held = self.corners[self.rng.integers(len(self.corners), size=size)]
+        self.start = np.empty((0, plant.n))
+        while len(self.start) < size:
+            x = self.rng.uniform(low, high, (size, plant.n))
+            at_rest = np.broadcast_to(0.5 * (self.low + self.high), (size, plant.m))
+            kept = self.filter.filter(x, at_rest).feasible & (self.barrier(x) >= 0.0)
+            self.start = np.concatenate([self.start, x[kept]])[:size]
+
+    def barrier(self, x):
+        return stacked(self._barriers(*x.T), len(x)).min(axis=1)
+
+    def moved(self, x, u):
+        columns = (tuple(np.ascontiguousarray(part.T)) for part in (x, u))
+        return np.stack(self._step.step(*columns, ()), axis=1)
+
+    def random(self, x):
+        return self.rng.uniform(self.low, self.high, (len(x), len(self.low)))
+
+    def bang_bang(self, x):
+        switched = self.rng.random((len(x), 1)) < 0.1
+        drawn = self.corners[self.rng.integers(len(self.corners), size=len(x))]
+        self.held = np.where(switched, drawn, self.held)
+        return self.held
+
+    def adversary(self, x):
+        """Propose the extreme input that brings the system nearest to the edge in two periods."""
+        worst, chosen = np.full(len(x), np.inf), np.empty((len(x), len(self.low)))
+        for corner in self.corners:
+            u = np.broadcast_to(corner, chosen.shape)
+            h = self.barrier(self.moved(self.moved(x, u), u))
+            chosen[h < worst] = corner
+            worst = np.minimum(worst, h)
+        return chosen
+
+    def run(self, proposes, steps):
+        """Return the numbers of infeasible and of unsafe steps."""
+        x, infeasible, unsafe = self.start, 0, 0
+        for _ in range(steps):
+            found = self.filter.filter(x, proposes(x))
+            infeasible += int((~found.feasible).sum())
+            assert (found.action >= self.low).all()
+            assert (found.action <= self.high).all()
+            x = self.moved(x, found.action)
+            unsafe += int((self.barrier(x) < 0.0).sum())
+        return infeasible, unsafe
+
+
+POLICIES = ("random", "bang_bang", "adversary")
+QUICK = [("DubinsDisk", "adversary"), ("ACCGap", "bang_bang")]
+
+
+@pytest.mark.parametrize(("name", "policy"), QUICK)
+def test_no_step_is_infeasible_or_unsafe(name, policy):
+    pressed = Pressed(name, 40, seed=0)
+    assert pressed.run(getattr(pressed, policy), 20) == (0, 0)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_no_step_of_a_million_is_infeasible_or_unsafe(name, policy):
+    pressed = Pressed(name, 4000, seed=1)
+    assert pressed.run(getattr(pressed, policy), 250) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n == "DubinsDisk" else pytest.mark.oracle) for n in SYSTEMS],
+)
+def test_every_start_of_the_env_is_in_the_domain(name):
+    pressed = Pressed(name, 10, seed=2)
+    problem = pressed.problem
+    x = problem.starts[problem.start].proposals(1000)
+    x = x[pressed.barrier(x) >= 0.0]
+    at_rest = np.broadcast_to(0.5 * (pressed.low + pressed.high), (len(x), problem.plant.m))
+    kept = pressed.filter.filter(x, at_rest).feasible
+    if name == "DubinsDisk":  # Starts near the edge, heading outwards, are lost for every law.
+        r_dot = x[:, 0] * np.cos(x[:, 2]) + x[:, 1] * np.sin(x[:, 2])
+        assert kept[r_dot < 0].mean() > 0.99
+        assert kept.mean() > 0.8
+    elif name == "Pendulum":  # So are those that fall towards the edge.
+        assert kept.mean() > 0.8
+    else:
+        assert kept.all()

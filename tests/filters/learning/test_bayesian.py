@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import sympy as sp
-from scipy.stats import norm
+from scipy.integrate import quad
+from scipy.optimize import minimize_scalar
+from scipy.stats import kstest, norm
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import generator, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
-from safe_envs.filters.learning.bayesian import Prior, Rows, fit, identify, posterior
-from safe_envs.filters.learning.collection import collect, draw_states
+from safe_envs.filters.learning.bayesian import (
+    IdentifiabilityWarning,
+    Prior,
+    Rows,
+    fit,
+    identify,
+    posterior,
+)
+from safe_envs.filters.learning.collection import collect, draw_states, plant_step
 from safe_envs.filters.learning.data import LearnedFileError, Signature, Transitions, load
+from safe_envs.filters.learning.models.distributions import (
+    Gaussian,
+    sigma_map,
+    sigma_quantile,
+    sigma_samples,
+)
 from safe_envs.filters.learning.models.features import Features
 from safe_envs.filters.learning.models.posterior import Posterior
 from safe_envs.problem.problem import SafetyProblem
@@ -294,3 +310,203 @@ def test_the_same_seed_identifies_the_same():
     assert found.record.observed == pytest.approx(2.4)
     assert found.signature == Signature.of(CUBIC)
     assert np.array_equal(found.mean, identify(CUBIC, **settings).mean)
+
+
+# The posterior of weights against other ways to it, and that of a noise level.
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def brute_force(design, y, variance, prior):
+    """Thesis Eq. (6.7) output by output, with any diagonal noise."""
+    eye = np.eye(design.shape[1])
+    covariances = [
+        np.linalg.inv(design.T @ (design / v[:, None]) + eye / prior) for v in variance.T
+    ]
+    return [
+        c @ design.T @ (y[:, i] / variance[:, i]) for i, c in enumerate(covariances)
+    ], covariances
+
+
+@pytest.mark.parametrize("rows", [3, 40])
+@pytest.mark.parametrize("shape", ["one for each output", "one for each row", "proportional"])
+def test_the_posterior_is_that_of_the_formula(rng, rows, shape):
+    design, y = rng.normal(size=(rows, 5)), rng.normal(size=(rows, 3))
+    variance = {
+        "one for each output": rng.uniform(0.1, 2.0, 3),
+        "one for each row": rng.uniform(0.1, 2.0, (rows, 3)),
+        "proportional": rng.uniform(0.1, 2.0, (rows, 1)) * rng.uniform(0.1, 2.0, 3),
+    }[shape]
+    found = posterior(design, y, variance, prior=7.0)
+    mean, covariance = brute_force(design, y, np.broadcast_to(variance, y.shape), 7.0)
+    assert found.mean == pytest.approx(np.array(mean), rel=1e-9, abs=1e-12)
+    assert found.covariance == pytest.approx(np.array(covariance), rel=1e-9, abs=1e-12)
+
+
+def test_what_is_not_seen_keeps_the_prior_even_without_noise(rng):
+    design = rng.normal(size=(50, 4))
+    design[:, 3] = design[:, 2]
+    found = posterior(design, design[:, :1], np.array([1e-18]), prior=9.0)
+    unseen = np.array([0.0, 0.0, 1.0, -1.0]) / np.sqrt(2.0)
+    assert unseen @ found.covariance[0] @ unseen == pytest.approx(9.0, rel=1e-6)
+    assert found.mean[0] == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-7)
+
+
+def test_draws_of_the_weights_have_their_covariance(rng):
+    root = rng.normal(size=(2, 3, 3))
+    gaussian = Gaussian(rng.normal(size=(2, 3)), root @ root.transpose(0, 2, 1))
+    draws = np.array([gaussian.sample(rng) for _ in range(20_000)])
+    assert draws.mean(axis=0) == pytest.approx(gaussian.mean, abs=0.1)
+    for i in range(2):
+        assert np.cov(draws[:, i].T) == pytest.approx(gaussian.covariance[i], abs=0.25)
+
+
+def log_density(sigma, squares, count, alpha, beta):
+    return -(count + alpha + 1) * np.log(sigma) - squares / (2 * sigma**2) - beta / sigma
+
+
+@pytest.mark.parametrize("count", [1, 1_000, 10**7])
+@pytest.mark.parametrize("level", [1e-3, 30.0])
+@pytest.mark.parametrize(("alpha", "beta"), [(1.0, 1.0), (3.0, 0.1), (0.5, 20.0)])
+def test_the_most_probable_sigma_maximises_its_density(count, level, alpha, beta):
+    squares = count * level**2
+    found = float(sigma_map(np.array(squares), np.array(count), alpha, beta))
+    best = minimize_scalar(
+        lambda d: -log_density(found * np.exp(d), squares, count, alpha, beta),
+        bounds=(-3.0, 3.0),
+        method="bounded",
+        options={"xatol": 1e-10},
+    )
+    # How exactly a maximum can be found that is as flat as the rounding of its height.
+    assert abs(float(best.x)) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("squares", "count", "alpha", "beta"),
+    [(0.4, 10, 1.0, 1.0), (40.0, 1000, 1.0, 1.0), (0.0, 10, 1.0, 1.0), (0.3, 1, 1.0, 0.0)],
+)
+def test_quantiles_of_sigma_are_those_of_its_density(squares, count, alpha, beta):
+    mode = float(sigma_map(np.array(squares), np.array(count), alpha, beta))
+    top = log_density(mode, squares, count, alpha, beta)
+
+    def mass(low, high):
+        # Over log sigma.
+        def height(t):
+            return np.exp(log_density(np.exp(t), squares, count, alpha, beta) - top + t)
+
+        return quad(
+            height,
+            np.log(low),
+            np.log(high),
+            limit=500,
+            points=[np.log(mode)] if low < mode < high else None,
+        )[0]
+
+    whole = mass(mode * 1e-2, mode * 1e5)
+    for level in (0.01, 0.3, 0.5, 0.9, 0.999):
+        quantile = float(sigma_quantile(np.array(level), squares, count, alpha, beta))
+        assert mass(mode * 1e-2, quantile) / whole == pytest.approx(level, abs=2e-5)
+
+
+@pytest.mark.parametrize("count", [10, 10**4, 10**7])
+def test_draws_of_sigma_spread_as_the_data_allow(rng, count):
+    draws = sigma_samples(0.04 * count, count, 1.0, 1.0, 4000, rng)
+    assert np.median(draws) == pytest.approx(
+        float(sigma_quantile(np.array(0.5), 0.04 * count, count)), rel=0.1
+    )
+    if count > 10:
+        assert draws.std() == pytest.approx(0.2 / np.sqrt(2 * count), rel=0.05)
+        assert kstest(draws, "norm", args=(0.2, 0.2 / np.sqrt(2 * count))).statistic < 0.05
+
+
+@pytest.mark.parametrize(
+    ("variance", "prior"), [(0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, 0.0), (1.0, np.inf)]
+)
+def test_a_variance_that_is_none_is_refused(rng, variance, prior):
+    with pytest.raises(ConfigurationError, match="positive and finite"):
+        posterior(rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), np.array([variance]), prior)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(1.0, 10, -1.0, 1.0), (1.0, 10, 1.0, np.nan), (0.0, 10, 1.0, 0.0), (-1.0, 10, 1.0, 1.0)],
+)
+def test_no_distribution_of_sigma(arguments):
+    with pytest.raises(ConfigurationError, match="sigma"):
+        sigma_quantile(np.array(0.5), *arguments)
+
+
+# What data leave open is told, with the names of the terms and states.
+
+
+PROBLEM = cubic_sde_disk()
+
+
+def told(problem: SafetyProblem = PROBLEM, **arguments) -> tuple[Posterior, str]:
+    with pytest.warns(IdentifiabilityWarning) as caught:
+        found = identify(problem, **arguments)
+    assert tuple(str(w.message) for w in caught) == found.record.warnings
+    return found, "\n".join(found.record.warnings)
+
+
+def data_at(x: np.ndarray, levels: tuple[float, ...], repetitions: int = 5) -> Transitions:
+    """Transitions from given states (B, 2) under some inputs."""
+    rows, u = np.repeat(x, len(levels), axis=0), np.tile(levels, len(x))[:, None]
+    step, rng = plant_step(PROBLEM), np.random.default_rng(1)
+    successors = np.stack([step(rows, u, rng) for _ in range(repetitions)], axis=1)
+    return Transitions(Signature.of(PROBLEM), rows, u, successors, np.array(PROBLEM.dt))
+
+
+def test_inputs_of_both_signs_are_enough():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert identify(PROBLEM, starts=200, steps=1, repetitions=10).record.warnings == ()
+
+
+STILL = draw_states(PROBLEM, 60, np.random.default_rng(0)) * [0.0, 1.0] + [0.3, 0.0]
+FEW = draw_states(PROBLEM, 8, np.random.default_rng(0))
+LEFT_OPEN = {
+    "one input": (
+        lambda: {"data": collect(PROBLEM, 200, 10, inputs=[[0.1]])},
+        ("input u stays within", "1 and u; x_1 and u x_1; x_2 and u x_2", "6 more"),
+    ),
+    "no input": (lambda: {"data": collect(PROBLEM, 200, 10, inputs=[[0.0]])}, ("never excited",)),
+    "a state that never varies": (
+        lambda: {"data": data_at(STILL, (-1.0, 1.0))},
+        ("the state x_1 is always 0.3", "x_2 and x_1 x_2 and x_1^2 x_2"),
+    ),
+    "few rows": (
+        lambda: {"data": data_at(FEW, (-1.0, 1.0)), "degree": 3},
+        ("16 different rows of data are too few for 20 weights",),
+    ),
+    "what the noise drowns": (
+        lambda: {"starts": 50, "steps": 1, "repetitions": 2, "prior": 1e-3},
+        ("the noise drowns", "x_1, x_2: "),
+    ),
+    "features that miss something": (
+        lambda: {"starts": 400, "steps": 1, "repetitions": 400, "degree": 1},
+        ("x_2: features of degree 1 miss",),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LEFT_OPEN)
+def test_what_the_data_leave_open_is_named(name):
+    arguments, parts = LEFT_OPEN[name]
+    found, text = told(**arguments())
+    assert all(part in text for part in parts)
+    assert "x_1: features" not in text
+    assert name != "no input" or found.pruned.all()
+
+
+def test_noise_that_varies_is_identified_where_the_data_show_it():
+    problem = cubic_sde()
+    _, text = told(problem, starts=200, steps=1, repetitions=20)
+    assert "x_2: the variance of its noise varies by" in text
+    assert "x_1" not in text
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        identify(problem, starts=200, steps=1, repetitions=20, diffusion_degree=2)

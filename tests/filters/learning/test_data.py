@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from dataclasses import replace
 
@@ -168,23 +167,18 @@ def test_a_step_of_ones_own():
     ("arguments", "error", "told"),
     [
         ({"points": 0}, ConfigurationError, "points = 0"),
-        ({"points": 2.0}, ConfigurationError, r"points = 2\.0"),
         ({"repetitions": 0}, ConfigurationError, "repetitions = 0"),
-        ({"steps": True}, ConfigurationError, "steps = True"),
         ({"seed": -1}, ConfigurationError, "seed = -1"),
         ({"dt": 0.0}, ConfigurationError, r"dt = 0\.0 s"),
-        ({"dt": math.nan}, ConfigurationError, "dt = nan"),
         ({"points": 10**9, "repetitions": 100}, ConfigurationError, "1000000000 points"),
         ({"inputs": [(10.5,)]}, ConfigurationError, r"\[10\.5\] is outside the bounds"),
         ({"inputs": [(math.nan,)]}, ConfigurationError, "outside the bounds"),
         ({"inputs": [(1.0, 1.0)]}, ConfigurationError, "vectors of 1 numbers"),
-        ({"inputs": [1.0]}, ConfigurationError, "vectors of 1 numbers"),
         ({"inputs": []}, ConfigurationError, "vectors"),
         ({"step": lambda x, u, rng: x[0]}, InvalidInputError, r"\(4, 2\) returned \(2,\)"),
         ({"step": at_rest, "inputs": [(1.0,)] * 2}, InvalidInputError, "rows 0 and 1"),
         ({"step": lambda x, u, rng: x + np.inf}, NumericalError, r"u = .* led to \[inf inf\]"),
         ({"problem": "safe_envs/Pendulum-v0"}, ConfigurationError, "problem = "),
-        ({"problem": None}, ConfigurationError, "problem = "),
         (
             {"problem": replace(DISK, barriers=(Barrier(-1 - DISK.plant.states[0] ** 2),))},
             ConfigurationError,
@@ -248,7 +242,6 @@ def test_noise_of_paths_is_of_their_seed():
     ("arguments", "error", "message"),
     [
         ({"steps": 0}, ConfigurationError, "steps = 0"),
-        ({"dt": -1.0}, ConfigurationError, r"dt = -1\.0 s"),
         ({"inputs": [[11.0]]}, ConfigurationError, "outside the bounds"),
         ({"states": [0.1, 0.2]}, InvalidInputError, r"shape \(2,\); give \(1, 2\)"),
         ({"states": [[0.1, 0.2]] * 2}, InvalidInputError, "a row for each of the inputs"),
@@ -310,14 +303,6 @@ def test_a_step_of_ones_own_may_be_that_of_any_plant():
     assert collect(DISK, 3, step=shifted).signature.plant == ()
 
 
-def test_numbers_of_numpy_are_numbers(tmp_path):
-    data = collect(DISK, np.int64(3), repetitions=np.int32(2), seed=np.int64(1))
-    same = collect(DISK, 3, repetitions=2, seed=1)
-    np.testing.assert_array_equal(data.successors, same.successors)
-    data.save(tmp_path / "data.npz")
-    assert Transitions.load(tmp_path / "data.npz").seed == 1
-
-
 # As they are given.
 
 
@@ -350,7 +335,6 @@ def test_sizes_and_time():
     ("changes", "told"),
     [
         ({"x": [[0.0], [0.2], [0.4]]}, r"x \(3, 1\)"),
-        ({"x": [0.0, 0.2]}, r"x \(2,\)"),
         ({"u": [[1.0], [1.0]]}, r"u \(2, 1\)"),
         ({"successors": np.ones((3, 2))}, r"successors \(3, 2\).*give .*\(P, K, 2\)"),
         ({"dt": [0.01, 0.01]}, r"dt \(2,\)"),
@@ -360,7 +344,6 @@ def test_sizes_and_time():
         ),
         ({"successors": np.empty((3, 0, 2))}, "there are no data"),
         ({"x": [[0.0, 0.1], [0.2]]}, "x is no array of numbers"),
-        ({"u": [["fast"], [1.0], [1.0]]}, "u is no array of numbers"),
         (
             {"x": np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45)},
             "x has masked entries",
@@ -370,7 +353,6 @@ def test_sizes_and_time():
             "x has masked entries",
         ),
         ({"u": np.array([[1.0], [1j], [1.0]])}, "u is complex; give real numbers"),
-        ({"u": [[1.0], [1j], [1.0]]}, "u is complex"),
         ({"x": [[0.0, 0.1], [0.2, np.nan], [0.4, 0.5]]}, r"x\[1, 1\] = nan, one of 1 entries"),
         (
             {"successors": np.full((3, 2, 2), np.inf)},
@@ -463,13 +445,6 @@ def test_files_of_something_else_are_refused(kind, details, arrays, told, tmp_pa
     save(tmp_path / "data.npz", kind, SIGNATURE, details, arrays)
     with pytest.raises(LearnedFileError, match=told):
         Transitions.load(tmp_path / "data.npz")
-
-
-def test_a_saved_file_is_plain_numbers(tmp_path):
-    logged().save(tmp_path / "data.npz")
-    with np.load(tmp_path / "data.npz", allow_pickle=False) as archive:
-        assert set(archive.files) == {"header", "x", "u", "successors", "dt"}
-        assert json.loads(archive["header"].tobytes())["details"] == {"seed": None}
 
 
 LOG = ([[0.0, 0.1]], [[1.0]], [[0.1, 0.1]], 0.01)

@@ -74,18 +74,6 @@ def test_the_covariance_is_recovered_with_its_degree(problem, degrees):
     assert all(0 < error < 0.1 for error in errors.values())
 
 
-def test_constant_entries_are_the_mean_of_the_estimates():
-    problem = problem_of("safe_envs/ACCGap-v0")
-    data = collect(problem, 300, 1000, [(0.0,)])
-    rate = rates(problem.model, data)
-    diffusion, _ = learn_diffusion(problem, data, rate)
-    np.testing.assert_allclose(
-        np.array(diffusion.covariance, dtype=float),
-        np.diag(np.diag(covariances(data, rate).mean(axis=0))),
-        rtol=1e-12,
-    )
-
-
 def test_covariances_have_their_law():
     problem = made_up(CORRELATED)
     data = collect(problem, 400, 100, [(-1.0,)], seed=4)

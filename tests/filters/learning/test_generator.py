@@ -116,18 +116,6 @@ def test_the_models_own_noise_is_not_looked_at(gap):
     assert one.covariance == other.covariance
 
 
-@pytest.mark.parametrize("name", ["first_order", "recursion"])
-def test_floats_are_arrays(name, request):
-    model = request.getfixturevalue(name)
-    problem = request.getfixturevalue("top" if name == "first_order" else "gap")
-    terms, x = model.generators[0], states_in(problem, 40)
-    whole = np.column_stack(terms.arrays(tuple(np.ascontiguousarray(x.T))))
-    assert whole.shape == (len(x), len(terms.symbols))
-    np.testing.assert_allclose(
-        [terms.floats(row) for row in x.tolist()], whole, rtol=1e-5, atol=1e-9 * np.abs(whole).max()
-    )
-
-
 def test_slopes_are_derivatives(gap, recursion):
     terms, x, step = recursion.generators[0], states_in(gap, 40), 1e-4
     first = replace(terms, networks=terms.networks[:1])

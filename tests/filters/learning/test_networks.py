@@ -227,20 +227,12 @@ def test_a_target_that_is_constant_is_answered_by_the_constant(value):
     assert both.epochs == 3
 
 
-def test_training_stops_when_the_validation_loss_does_not_fall():
-    rng = np.random.default_rng(0)
-    trained = fitted(
-        rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), hidden=(60, 30), epochs=2000, rate=1e-2
-    )
-    assert 60 < trained.epochs < 1000
-
-
-def test_the_weights_are_those_of_the_least_validation_loss():
+def test_training_stops_at_the_weights_of_the_least_validation_loss():
     # Noise cannot be learned: the loss of other rows soon rises.
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(100, 2)), rng.normal(size=(100, 1))
-    trained = fitted(x, y, hidden=(20,), rate=0.01, batch=10)
-    assert trained.epochs > 60
+    trained = fitted(x, y, hidden=(20,), rate=0.01, batch=10, epochs=2000)
+    assert 60 < trained.epochs < 1000
     validation = random_stream(0, Purpose.TRAINING).permutation(100)[70:85]
     predicted = trained.network.arrays(tuple(x[validation].T))[0]
     loss = np.mean((predicted - y[validation, 0]) ** 2) / trained.network.output_scale[0] ** 2
@@ -268,12 +260,9 @@ def test_bad_data_are_refused(inputs, targets):
     ("setting", "told"),
     [
         ({"epochs": 0}, "epochs"),
-        ({"batch": 1.5}, "batch"),
         ({"hidden": (5, 0)}, "hidden"),
-        ({"hidden": 100}, "hidden = 100"),
         ({"hidden": [10**11]}, "parameters"),
         ({"rate": 0.0}, "rate"),
-        ({"rate": np.nan}, "rate"),
         ({"seed": -1}, "seed"),
         ({"activation": "gelu"}, "gelu"),
     ],
@@ -290,19 +279,6 @@ COORDINATES = (STATES[0] * STATES[2], sp.sin(STATES[1]), sp.cos(STATES[1]) + STA
 POINTS = np.random.default_rng(0).normal(size=(40, 3))
 
 
-def network_of(outputs, activation, hidden=(6, 5), inputs=3):
-    rng, sizes = np.random.default_rng(5), [inputs, *hidden, outputs]
-    return Network(
-        tuple(0.5 * rng.normal(size=(b, a)) for a, b in itertools.pairwise(sizes)),
-        tuple(rng.normal(size=b) for b in sizes[1:]),
-        activation,
-        rng.normal(size=inputs),
-        np.arange(1.0, inputs + 1.0),
-        rng.normal(size=outputs),
-        np.arange(1.0, outputs + 1.0),
-    )
-
-
 def assert_close(found, expected):
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-14)
 
@@ -317,20 +293,20 @@ def values_of(source, data, points=POINTS):
     return np.array([function((tuple(x), numbers, work)) for x in points.tolist()])
 
 
-@pytest.mark.parametrize("hidden", [(), (4,), (6, 5), (3, 7, 4)])
+@pytest.mark.parametrize("hidden", [(), (3, 7, 4)])
 @pytest.mark.parametrize("activation", ["identity", "tanh", "relu", "leaky_relu", "elu", "silu"])
 def test_networks(activation, hidden):
-    network, data = network_of(2, activation, hidden), Data()
+    network, data = random_network(activation, (3, *hidden, 2)), Data()
     data.add([1.0, 2.0])
     found = values_of(network_source(network, "found", data), data)
     assert_close(found, network.outputs(POINTS))
     assert np.ptp(found, axis=0).min() > 1e-3
 
 
-@pytest.mark.parametrize("hidden", [(), (4,), (3, 7, 4)])
+@pytest.mark.parametrize("hidden", [(), (3, 7, 4)])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_slopes(activation, hidden):
-    network, data = network_of(2, activation, hidden), Data()
+    network, data = random_network(activation, (3, *hidden, 2)), Data()
     found = values_of(slopes_source(network, "found", data, 1), data)
     expected = [network.values_and_slopes_floats(x, 1)[1] for x in POINTS.tolist()]
     assert_close(found, expected)
@@ -339,7 +315,7 @@ def test_slopes(activation, hidden):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_gives_nan(bad):
-    network, data = network_of(1, "tanh"), Data()
+    network, data = random_network("tanh", (3, 6, 5, 1)), Data()
     points = np.array([[0.1, bad, 0.2]])
     assert np.isnan(values_of(network_source(network, "found", data), data, points)).all()
     data = Data()
@@ -350,10 +326,10 @@ def test_what_is_not_finite_gives_nan(bad):
 @pytest.mark.parametrize("kind", ["residual", "generator"])
 def test_terms(kind, degree):
     if kind == "residual":
-        network = network_of(degree + 2, "relu")
+        network = random_network("relu", (3, 6, 5, degree + 2))
         terms = LearnedResidual(STATES, COORDINATES, degree, network, np.ones((9, degree + 2)))
     else:
-        networks = tuple(network_of(1, "tanh", (4 + j,)) for j in range(degree))
+        networks = tuple(random_network("tanh", (3, 4 + j, 1)) for j in range(degree))
         terms = LearnedGenerator(STATES, COORDINATES, networks)
     data = Data()
     found = values_of(terms_source(terms, "found", data), data)
