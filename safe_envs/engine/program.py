@@ -10,6 +10,7 @@ import importlib.util
 import inspect
 import logging
 import math
+import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -74,25 +75,28 @@ def definitions(entries: Sequence[Callable[..., Any]], generated: Source) -> Def
     return link.definitions()
 
 
-def linked(entries: Sequence[Callable[..., Any]], generated: Source) -> str:
+def linked(
+    entries: Sequence[Callable[..., Any]],
+    generated: Source,
+    marks: tuple[str, str] = ("entry", "kernel"),
+) -> str:
     """Return the text of a module with entry points and all that they call.
 
     Functions that the generated ones define take the place of functions of the same name, which the
     kernel modules import as a declaration.
 
     Args:
-        entries: functions of kernel modules; they are marked `@entry`, all others `@kernel`.
+        entries: functions of kernel modules.
         generated: functions of this program alone.
+        marks: what entry points are marked with, and all others; see `numba_natives`.
 
     Raises:
         SystemDefinitionError: Two functions have one name, or a generated one is missing.
     """
     link = _Link(generated)
-    for function in entries:
+    for function in (*entries, *generated.uses):
         link.need(function.__module__, function.__name__)
-    for function in generated.uses:
-        link.need(function.__module__, function.__name__)
-    return link.text({function.__name__ for function in entries})
+    return link.text({function.__name__ for function in entries}, marks)
 
 
 class _Link:
@@ -150,14 +154,15 @@ class _Link:
         constants = {n: d for n, d in found.items() if not isinstance(d, ast.FunctionDef)}
         return Definitions(functions | self._generated, constants)
 
-    def text(self, entries: set[str]) -> str:
+    def text(self, entries: set[str], marks: tuple[str, str]) -> str:
         """Return the module."""
         functions, constants = self.definitions()
         parts = [f"from math import {', '.join(sorted(self._math))}"] * bool(self._math)
         parts += [ast.unparse(constants[name]) for name in sorted(constants)]
-        for name, node in sorted(functions.items()):
-            mark = "entry" if name in entries else "kernel"
-            parts.append(f"@{mark}\n{ast.unparse(_bare(node))}\n")
+        # Entry points come last: some are compiled where they are defined.
+        for name in sorted(functions, key=lambda name: (name in entries, name)):
+            mark = marks[name not in entries]
+            parts.append(f"@{mark}\n{ast.unparse(_bare(functions[name]))}\n")
         return "\n".join(parts)
 
 
@@ -256,6 +261,8 @@ def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
 @lru_cache(maxsize=64)
 def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     natives = _natives()
+    if "decide_at(" in text:
+        register_decide()
     stamp = f"{inspect.getsource(natives)}\n{text}"
     digest = hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
     folder = cache_folder(FOLDER)
@@ -284,6 +291,40 @@ def _natives() -> ModuleType:
     return numba_natives
 
 
+SWITCH = "SAFE_ENVS_COMPILE"
+"""Environment variable; 0 has the decisions of filters interpreted."""
+
+
+def compiles() -> bool:
+    """Return whether decisions are made in machine code: Numba is there, and `SWITCH` is not 0."""
+    return os.environ.get(SWITCH) != "0" and is_available()
+
+
+@lru_cache(maxsize=1)
+def register_decide() -> int:
+    """Return the address of `safe_envs.engine.decide.decide_columns`, which programs call.
+
+    It is compiled once for each machine and version of the text.
+    """
+    from safe_envs.engine.decide import decide_columns
+
+    natives = _natives()
+    text = linked([decide_columns], Source(""), ("c_entry", "part"))
+    digest = hashlib.sha256(f"{inspect.getsource(natives)}\n{text}".encode()).hexdigest()
+    folder, title = cache_folder(FOLDER), "the decisions of filters, once for this machine"
+    try:
+        if folder is None:
+            raise OSError
+        place = folder / digest[:_DIGITS]
+        if not any(place.glob("**/*.nbi")):
+            _LOG.warning("compiling %s, which takes some ten seconds", title)
+        found = _KeptProgram(place, text, title).functions["decide_columns"]
+    except (OSError, ConfigurationError):  # The disk may be full.
+        found = _not_kept(text)["decide_columns"]
+    natives.add_symbol("safe_envs_decide_columns", found.address)
+    return found.address
+
+
 def _not_kept(text: str) -> dict[str, Any]:
     natives = _natives()
     names = {**vars(natives), "entry": natives.passing_entry}
@@ -297,11 +338,11 @@ class _KeptProgram:
     def __init__(self, folder: Path, text: str, title: str) -> None:
         self._folder, self._title, self._told = folder, title, False
         self._text = text
-        self._functions = self._load()
+        self.functions = self._load()
 
     def entry(self, name: str) -> Callable[..., Any]:
         """Return an entry point, which says so where it has to be compiled first."""
-        function = self._functions[name]
+        function = self.functions[name]
         is_new = True
 
         def call(*arguments: Any) -> Any:

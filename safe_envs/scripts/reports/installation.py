@@ -186,7 +186,7 @@ def solvers() -> Iterator[Check]:
 
 
 def _solve(qp: KnownQP, solver: str) -> tuple[bool, str]:
-    from safe_envs.engine.qp.dispatch import project_floats
+    from safe_envs.engine.oldqp.dispatch import project_floats
 
     m, k = len(qp.proposed), len(qp.b)
     low, high, ones = [-qp.bound] * m, [qp.bound] * m, [1.0] * m
