@@ -188,6 +188,11 @@ def decide(
     """
     k, m, goal = int(shape[K]), int(shape[M]), int(shape[GOAL])
     want, own, aim, flags, forms, wide, rows, result, work = scratch[:9]
+    total = 0.0
+    for j in range(m):
+        total += u[j]
+    if not isfinite(total):
+        return UNDEFINED
     if shape[KIND] == PLAIN:
         feasible = project(k, m, values, u, ends, weights, out, work)
         if k == 1:  # the rule, which takes no longer than it must
@@ -585,9 +590,10 @@ def hold(
     k, m, count = int(shape[K]), int(shape[M]), int(shape[K] + shape[SAMPLED])
     flags, forms, rows, work = scratch[3], scratch[4], scratch[6], scratch[8]
     held, tangent, priorities, state, line, target = scratch[9:15]
+    goal = int(shape[GOAL])
     width, place = 1 + m + (m * (m + 1) >> 1), k
-    for c in range(m + k):
-        priorities[c] = weights[c]
+    for j in range(m):
+        priorities[j] = weights[j]
     for c in range(2 * count):
         state[c] = 0.0
     for c in range(3 * (k if shape[KIND] != UNCERTAIN else 0)):
@@ -595,9 +601,10 @@ def hold(
     for c in range(3 * k, 3 * count):
         forms[c] = 0.0
     for i in range(k):
-        held[i * width] = rows[k * m + i]
+        priorities[m + i] = weights[m + goal + i]
+        held[i * width] = rows[(k + goal) * (m + goal) + i]
         for c in range(1, width):
-            held[i * width + c] = rows[i * m + c - 1] if c <= m else 0.0
+            held[i * width + c] = rows[i * (m + goal) + c - 1] if c <= m else 0.0
         if shape[COUNTS + IS_SAMPLED * k + i] > 0.0:
             end, change = place * width, int(flags[2 * k + i])
             counts = flags[i] > 0.0 and flags[k + i] > 0.0
@@ -607,7 +614,7 @@ def hold(
             for c in range(1, width):
                 held[end + c] = held[i * width + c]
                 held[end + c] += shape[PERIOD] * values[change + c] if counts else 0.0
-            priorities[m + place] = weights[m + i]
+            priorities[m + place] = priorities[m + i]
             place += 1
     feasible = all_hold(count, m, held, forms, out, tangent, state)
     for _ in range(ROUNDS):

@@ -25,7 +25,6 @@ from safe_envs.errors import (
     ConfigurationError,
     NotCompilableError,
     SystemDefinitionError,
-    install_extra,
     shortened,
 )
 from safe_envs.files import cache_folder, make_room, mark_used, write_atomically
@@ -196,7 +195,7 @@ def _bare(node: ast.FunctionDef) -> ast.FunctionDef:
     return bare
 
 
-ADVICE = f"{install_extra('fast')}, or use the engine 'numpy'"
+ADVICE = "pip install numba, or use the engine 'numpy'"
 
 _LOG = logging.getLogger("safe_envs")
 _FILE = "program.py"

@@ -27,6 +27,7 @@ from safe_envs.engine.program import compiles, register_decide
 from safe_envs.engine.qp import ROUNDING
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
+from safe_envs.filters.other_solvers import TOLERANCE, require_solver, solve_with
 from safe_envs.filters.qp import FilterDecision, FilterQP, UndefinedConstraintError
 
 Bounds = tuple[Sequence[Any], Sequence[Any]]
@@ -106,16 +107,32 @@ class QPValues:
 
 
 class Decisions:
-    """Decides for states given component by component, as floats or as arrays of a batch."""
+    """Decides for states given component by component, as floats or as arrays of a batch.
 
-    def __init__(self, qp: FilterQP) -> None:
-        self._qp, self.values = qp, QPValues(qp)
+    Args:
+        qp: the QP.
+        solver: of it, one of `qpsolvers.available_solvers`; ours by default.
+
+    Raises:
+        ConfigurationError: There is no such solver, or it cannot solve the QP.
+    """
+
+    def __init__(self, qp: FilterQP, solver: str | None = None) -> None:
+        self._qp, self.values, self._solver = qp, QPValues(qp), solver
+        if solver is not None:
+            require_solver(solver)
+            if self.values.shape[text.KIND] != text.PLAIN:
+                raise ConfigurationError(
+                    f"solver = {solver!r} solves filters of affine constraints; take no solver with"
+                    " reciprocal, learned or first-order conditions, goals, maxima and barriers"
+                    " without a value"
+                )
         shape = self.values.shape
         k, m, goal = (int(shape[i]) for i in (text.K, text.M, text.GOAL))
         self._k, self._m, self._goal = k, m, goal
         self._barriers = int(shape[text.OWNED]) or k
         several = k + goal > 1 or shape[text.SAMPLED] > 0.0
-        self._compiles = compiles()
+        self._compiles = compiles() and solver is None
         self._in_machine_code = self._compiles and several and m + goal > 1
         self._fresh()
 
@@ -226,8 +243,10 @@ class Decisions:
             answer = frame.decide(self._run, values, u, ends)
             self._machine_frames.append(frame)
             return answer
-        # Each call has scratch arrays to itself, also in threads.
         made = self.values
+        if self._solver is not None:
+            return self._by_library(self._solver, values, u, made.ends if ends is None else ends)
+        # Each call has scratch arrays to itself, also in threads.
         scratch = self._frames.pop() if self._frames else [[0.0] * n for n in made.lengths]
         out, bounds = [0.0] * made.answer, made.ends if ends is None else ends
         try:
@@ -240,6 +259,25 @@ class Decisions:
             out = arrays[5].tolist()
         self._frames.append(scratch)
         return code, out
+
+    def _by_library(
+        self, solver: str, values: Sequence[float], u: Sequence[float], ends: Sequence[float]
+    ) -> _Answer:
+        """Return the answer of another solver, in the form of ours."""
+        k, m, weights = self._k, self._m, self.values.weights
+        if not math.isfinite(sum(values) + sum(u)):
+            return text.UNDEFINED, []
+        a, b = np.reshape(values[: k * m], (k, m)), np.array(values[k * m :])
+        action, feasible = solve_with(solver, np.column_stack([a, b]), u, ends, weights)
+        margin, start = a @ action + b, np.clip(u, ends[:m], ends[m:])
+        slack = np.zeros(k) if feasible else np.maximum(-margin, 0.0)
+        near = margin <= TOLERANCE * (np.abs(a) @ np.abs(action) + np.abs(b))
+        active = near & bool((a @ start + b < 0.0).any())
+        out = [*action, *margin.tolist(), *active.astype(float).tolist(), *slack.tolist()]
+        cause = text.furthest(k, m, list(values), list(values), k * m, list(u), weights, out)
+        if self.values.shape[text.OWNED] > 0.0:
+            cause = text.gather_barriers(k, m, self.values.shape, cause, out)
+        return 2 * cause + 2 + int(feasible), out
 
     def _frame(self) -> Frame:
         made = self.values

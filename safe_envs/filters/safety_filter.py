@@ -54,9 +54,9 @@ class SafetyFilter:
     by the priorities, is as small as can be. A constraint counts as met where it is violated by no
     more than the rounding of its terms; see `safe_envs.engine.qp`.
 
-    One constraint has a closed form, and any number an exact solution for one and two inputs. For
-    others DAQP proposes which constraints and bounds hold the answer, and their equations prove it,
-    so that answers are right to rounding; else a slower active-set method decides.
+    One constraint and one input have closed forms, and for all else an active-set method finds the
+    answer up to rounding; see `safe_envs.engine.qp`. With machine code each decision takes some
+    microseconds, and a batch a fraction of one for each state.
 
     With a control Lyapunov function the filter solves its joint QP instead: min w_u |u|^2 + w_d d^2
     subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2).
@@ -89,6 +89,8 @@ class SafetyFilter:
         estimator: of the state, for `filter_measurement`.
         instants: control instants of an episode, for conditions with `belief`.
         region: (low, high) of each state, for conditions with `measurement_error`.
+        solver: of the QP, one of `qpsolvers.available_solvers`, such as "proxqp", for comparison:
+            one state after the other, of affine constraints; ours by default.
 
     Attributes:
         model: the system, as given.
@@ -119,6 +121,7 @@ class SafetyFilter:
         estimator: Estimator | None = None,
         instants: int | None = None,
         region: Sequence[tuple[float, float]] | None = None,
+        solver: str | None = None,
         **unknown: Never,
     ) -> None:
         arguments.refuse_unknown(unknown, SafetyFilter.__init__)
@@ -146,6 +149,7 @@ class SafetyFilter:
             arguments.runtime_symbols(known, self.pairs, self.constraints, clf),
             owners if len(owners) > len(self.pairs) else (),
         )
+        self._solver = solver
         self._solve_by(qp, [barrier.name for barrier, _ in self.pairs])
         fixed = [p.name for p in known.parameters]
         self._given = RuntimeArguments(qp, system.parameters, fixed, endless)
@@ -352,7 +356,7 @@ class SafetyFilter:
     def _solve_by(self, qp: FilterQP, names: Sequence[str]) -> None:
         """Solve a QP; the barriers' names are for messages."""
         self.qp, self._names = qp, names
-        self._decisions = Decisions(qp)
+        self._decisions = Decisions(qp, self._solver)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)

@@ -36,7 +36,7 @@ def test_a_sound_installation_is_sound(safe_envs_command, quick):
     assert names == [
         f"{program.name}{by}"
         for program in installation.KNOWN_QPS
-        for by in ([""] if program.in_closed_form else [", by DAQP", ", by PROXQP"])
+        for by in ["", ", by DAQP", ", by PROXQP"]
     ]
     assert [check["name"] for check in checks["envs"]] == [
         "safe_envs/Scalar-v0",
