@@ -9,8 +9,14 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError, nearest
 
-TOLERANCE = 1e-6
+TOLERANCE = 1e-7
 """Part of the terms of a constraint by which these solvers may violate it, and say it is met."""
+
+_SETTINGS: dict[str, dict[str, float]] = {
+    "proxqp": {"eps_abs": 1e-9},
+    "daqp": {"primal_tol": 1e-9, "dual_tol": 1e-10},
+}
+"""Of solvers whose own tolerances are wider."""
 
 
 def require_solver(solver: str) -> None:
@@ -66,7 +72,8 @@ def solve_with(
                 f"solver = {solver!r} finds no answer for the constraints {rows.tolist()}; take"
                 " another one, or none"
             )
-        slack = np.maximum(least[m:], 0.0) + TOLERANCE * (abs(a) @ abs(least[:m]) + abs(b))
+        terms = abs(a) @ (1.0 + abs(least[:m])) + abs(b)
+        slack = np.maximum(least[m:], 0.0) + TOLERANCE * terms
         closest = _solve(solver, *near, -a, b + slack, low, high)
         u = least[:m] if closest is None else closest
     return np.clip(u, low, high).tolist(), feasible
@@ -77,5 +84,5 @@ def _solve(solver: str, w: Any, v: Any, g: Any, h: Any, low: Any, high: Any) -> 
     import qpsolvers
 
     problem = qpsolvers.Problem(np.diag(w), -w * v, g, h, lb=low, ub=high)
-    found = qpsolvers.solve_problem(problem, solver=solver)
+    found = qpsolvers.solve_problem(problem, solver=solver, **_SETTINGS.get(solver, {}))
     return found.x if found.found else None

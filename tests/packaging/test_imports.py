@@ -41,7 +41,7 @@ import sympy as sp
 
 x, y, u = sp.symbols("x y u", real=True)
 system = safe_envs.ControlAffineSDE([x, y], [u], [-x, -y], [1, 1])
-one = SafetyFilter(system, [1 - x, 1 + x, 2 - y], "cbf:alpha=1", (-1, 1)).filter([0.9, 0], [1.0])
+one = SafetyFilter(system, [1 - x, 1 + x, 2 - y], "cbf:alpha=0.5", (-1, 1)).filter([0.9, 0], [1.0])
 assert one.feasible and one.active[0]
 assert not loaded("numba", "qpsolvers", "daqp", *HEAVY), "several constraints on one input"
 

@@ -68,7 +68,7 @@ def test_a_wrong_answer_ends_with_status_1(safe_envs_command, quick, monkeypatch
     assert status == 1
     assert "WRONG" in out
     document = strictly("found.json")
-    assert document["checks"]["solvers"][0]["advice"] == "reinstall numpy and scipy"
+    assert document["checks"]["solvers"][0]["advice"] == "reinstall safe-envs, numba and numpy"
     assert not document["healthy"]
     assert document["steps_per_second"] == {}
 
