@@ -27,7 +27,7 @@ from safe_envs.engine.program import compiles, register_decide
 from safe_envs.engine.qp import ROUNDING
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
-from safe_envs.filters.other_solvers import TOLERANCE, require_solver, solve_with
+from safe_envs.filters.other_solvers import BINDING, require_solver, solve_with
 from safe_envs.filters.qp import FilterDecision, FilterQP, UndefinedConstraintError
 
 Bounds = tuple[Sequence[Any], Sequence[Any]]
@@ -271,7 +271,7 @@ class Decisions:
         action, feasible = solve_with(solver, np.column_stack([a, b]), u, ends, weights)
         margin, start = a @ action + b, np.clip(u, ends[:m], ends[m:])
         slack = np.zeros(k) if feasible else np.maximum(-margin, 0.0)
-        near = margin <= TOLERANCE * (np.abs(a) @ np.abs(action) + np.abs(b))
+        near = margin <= BINDING * (np.abs(a) @ np.abs(action) + np.abs(b))
         active = near & bool((a @ start + b < 0.0).any())
         out = [*action, *margin.tolist(), *active.astype(float).tolist(), *slack.tolist()]
         cause = text.furthest(k, m, list(values), list(values), k * m, list(u), weights, out)

@@ -9,12 +9,15 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError, nearest
 
-TOLERANCE = 1e-7
+TOLERANCE = 1e-8
 """Part of the terms of a constraint by which these solvers may violate it, and say it is met."""
 
+BINDING = 1e-4
+"""Part of its terms below which the value of a constraint is taken for 0: it binds."""
+
 _SETTINGS: dict[str, dict[str, float]] = {
-    "proxqp": {"eps_abs": 1e-9},
-    "daqp": {"primal_tol": 1e-9, "dual_tol": 1e-10},
+    "proxqp": {"eps_abs": 1e-10},
+    "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-10},
 }
 """Of solvers whose own tolerances are wider."""
 
