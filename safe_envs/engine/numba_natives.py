@@ -141,7 +141,7 @@ def decide_at(_: Any, data: Any, work: Any, place: Any) -> Any:
     """See `plain_natives`."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        whole, double = ir.IntType(64), ir.DoubleType()
+        whole = ir.IntType(64)
         data, work = (
             make_array(kind)(context, builder, argument).data
             for kind, argument in zip(signature.args, arguments[:2], strict=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import ctypes
 import hashlib
 import importlib
 import importlib.util
@@ -294,34 +295,75 @@ SWITCH = "SAFE_ENVS_COMPILE"
 """Environment variable; 0 has the decisions of filters interpreted."""
 
 
-def compiles() -> bool:
-    """Return whether decisions are made in machine code: Numba is there, and `SWITCH` is not 0."""
-    return os.environ.get(SWITCH) != "0" and is_available()
+def decider(compiling: bool = True) -> Callable[[int], int] | None:
+    """Return `safe_envs.engine.decide.decide_columns` in machine code, a function of an address.
+
+    It is compiled once for each machine and version of its text.
+
+    Args:
+        compiling: whether to compile it where it has not been yet, which takes half a minute.
+
+    Returns:
+        None where there is none: it is not compiled, Numba cannot be used, or `SWITCH` is 0.
+    """
+    if os.environ.get(SWITCH) == "0" or not (compiling or _is_kept()):
+        return None
+    return _decider()
+
+
+@lru_cache(maxsize=1)
+def _decider() -> Callable[[int], int] | None:
+    try:
+        address = register_decide()
+    except NotCompilableError as error:
+        _LOG.warning("filters decide in plain Python, which is slow: %s", error)
+        return None
+    # A call takes some microseconds: it keeps other threads waiting no longer than Python would.
+    return ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(address)
+
+
+@lru_cache(maxsize=1)
+def _decide_text() -> tuple[str, str]:
+    """Return the text of `decide_columns`, and the name of its folder."""
+    from safe_envs.engine.decide import decide_columns
+
+    text = linked([decide_columns], Source(""), ("c_entry", "part"))
+    stamp = Path(__file__).with_name("numba_natives.py").read_text() + text
+    return text, hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
+
+
+def _is_kept() -> bool:
+    folder = cache_folder(FOLDER)
+    return folder is not None and any((folder / _decide_text()[1]).glob("**/*.nbi"))
 
 
 @lru_cache(maxsize=1)
 def register_decide() -> int:
     """Return the address of `safe_envs.engine.decide.decide_columns`, which programs call.
 
-    It is compiled once for each machine and version of the text.
+    Raises:
+        NotCompilableError: Numba cannot be used.
     """
-    from safe_envs.engine.decide import decide_columns
-
+    if not is_available():
+        raise NotCompilableError("Numba is missing; pip install numba")
     natives = _natives()
-    text = linked([decide_columns], Source(""), ("c_entry", "part"))
-    digest = hashlib.sha256(f"{inspect.getsource(natives)}\n{text}".encode()).hexdigest()
+    text, digest = _decide_text()
     folder, title = cache_folder(FOLDER), "the decisions of filters, once for this machine"
+    if not _is_kept():
+        _LOG.warning("compiling %s, which takes half a minute", title)
     try:
         if folder is None:
             raise OSError
-        place = folder / digest[:_DIGITS]
-        if not any(place.glob("**/*.nbi")):
-            _LOG.warning("compiling %s, which takes some ten seconds", title)
-        found = _KeptProgram(place, text, title).functions["decide_columns"]
+        found = _KeptProgram(folder / digest, text, title).functions["decide_columns"]
     except (OSError, ConfigurationError):  # The disk may be full.
         found = _not_kept(text)["decide_columns"]
     natives.add_symbol("safe_envs_decide_columns", found.address)
+    _KEPT.append(found)
     return found.address
+
+
+_KEPT: list[Any] = []
+"""What must live as long as its address is used."""
 
 
 def _not_kept(text: str) -> dict[str, Any]:

@@ -1,13 +1,12 @@
 """The decisions of a filter's QP: for one state in lists, and for a batch in arrays.
 
-`safe_envs.engine.decide` makes them. It is interpreted for the smallest QPs of one state, and where
-there is no machine code.
+`safe_envs.engine.decide` makes them: in machine code, or interpreted, with the same bits. A filter
+of one constraint, or of one input, begins interpreted, as few decisions take no time.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import itertools
 import math
 import struct
@@ -23,7 +22,7 @@ from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.engine import decide as text
 from safe_envs.engine.decide import answer_length, decide, scratch_lengths, shape_of
-from safe_envs.engine.program import compiles, register_decide
+from safe_envs.engine.program import decider
 from safe_envs.engine.qp import ROUNDING
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
@@ -34,6 +33,11 @@ Bounds = tuple[Sequence[Any], Sequence[Any]]
 """m lower and m upper input bounds, floats or arrays (B,)."""
 
 _Answer = tuple[int, Sequence[float]]
+
+_FEW = 20_000
+"""Decisions of a filter from which on machine code is read from disk, which takes a second."""
+_MANY = 2_000_000
+"""Decisions from which on it is compiled: they have taken some ten seconds."""
 
 
 class QPValues:
@@ -132,13 +136,23 @@ class Decisions:
         self._k, self._m, self._goal = k, m, goal
         self._barriers = int(shape[text.OWNED]) or k
         several = k + goal > 1 or shape[text.SAMPLED] > 0.0
-        self._compiles = compiles() and solver is None
-        self._in_machine_code = self._compiles and several and m + goal > 1
+        self._at_once, self._made = several and m + goal > 1, 0
         self._fresh()
 
     def _fresh(self) -> None:
+        self._run: Callable[[int], int] | None = None
         self._frames: list[Any] = []
         self._machine_frames: list[Frame] = []
+
+    def _count(self, decisions: int) -> Callable[[int], int] | None:
+        """Count decisions; return the function that makes them in machine code, if it is due."""
+        if self._run is None and self._solver is None:
+            before, self._made = self._made, self._made + decisions
+            if self._at_once or before < _MANY <= self._made:
+                self._run = decider()
+            elif before < _FEW <= self._made:
+                self._run = decider(compiling=False)
+        return self._run
 
     def __getstate__(self) -> dict[str, Any]:
         made = {"_frames", "_machine_frames", "_floats", "_demands", "_arrays", "_run"}
@@ -151,8 +165,8 @@ class Decisions:
     def compile(self) -> None:
         """Compile all that a decision may need; else each part is at its first use."""
         _ = self._floats, self._demands, self._arrays
-        if self._in_machine_code:
-            _ = self._run
+        if self._at_once:
+            self._count(0)
         zero = np.zeros(1)
         for term in self._qp.terms:
             # Learned terms compile themselves when they are first read, wherever that is.
@@ -179,11 +193,6 @@ class Decisions:
         for place, _, demand in self.values.demands:
             expressions[place] = demand
         return self._compiled(expressions, "arrays")
-
-    @cached_property
-    def _run(self) -> Callable[[int], int]:
-        # A call of some microseconds keeps other threads waiting no longer than they would anyway.
-        return ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(register_decide())
 
     def floats(
         self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None = None
@@ -238,9 +247,10 @@ class Decisions:
     def _decide_one(
         self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
     ) -> _Answer:
-        if self._in_machine_code:
+        run = self._run or self._count(1)
+        if run is not None:
             frame = self._machine_frames.pop() if self._machine_frames else self._frame()
-            answer = frame.decide(self._run, values, u, ends)
+            answer = frame.decide(run, values, u, ends)
             self._machine_frames.append(frame)
             return answer
         made = self.values
@@ -311,9 +321,10 @@ class Decisions:
             ends = np.empty((2 * m, size))
             for row, entry in zip(ends, (*bounds[0], *bounds[1]), strict=True):
                 row[:] = entry
-        if self._compiles:
+        run = self._run or self._count(size)
+        if run is not None:
             frame = self._machine_frames.pop() if self._machine_frames else self._frame()
-            codes, out = frame.decide_all(self._run, table, inputs, ends)
+            codes, out = frame.decide_all(run, table, inputs, ends)
             self._machine_frames.append(frame)
         else:
             codes, out = self._interpret(table, inputs, ends)

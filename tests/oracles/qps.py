@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ import sympy as sp
 
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.engine.decide import PLAIN, answer_length, decide, scratch_lengths, shape_of
-from safe_envs.engine.program import register_decide
+from safe_envs.engine.program import decider
 from safe_envs.filters.decisions import Frame
 from safe_envs.wrappers import AffineConstraint, Condition, SafetyFilter
 from tests.oracles.programs import decision_of
@@ -162,7 +161,8 @@ def answer(qps: QPs, code: int, out: Sequence[float]) -> Any:
 def by_batch(qps: QPs, i: int) -> Any:
     """In machine code."""
     shape, weights, values, u, ends = numbers_of(qps, i)
-    run = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(register_decide())
+    run = decider()
+    assert run is not None
     return answer(qps, *Frame(shape, weights, ends, len(values)).decide(run, values, u, None))
 
 
