@@ -130,7 +130,6 @@ refused() {
 }
 refused '.[tensorboard]' safe-envs train Scalar-v0 --algo ppo --n-timesteps 512 --out other --tensorboard logs
 refused '.[render]' safe-envs render Scalar-v0 --out film.mp4
-refused '.[fast]' safe-envs evaluate Scalar-v0 --episodes 20 --engine compiled
 refused "did you mean 'scbf'" safe-envs evaluate Scalar-v0 --filter scfb
 
 step "passed"

@@ -5,21 +5,27 @@ See `plain_natives`. Only compiled programs import this module, which needs Numb
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numba
 import numpy as np
 from llvmlite import ir
+from llvmlite.binding import add_symbol as add_symbol
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
 __all__ = [
+    "c_entry",
+    "decide_at",
     "entry",
+    "floats_at",
     "kernel",
     "library_arc_tangent",
     "library_cosine",
     "library_sine",
+    "part",
     "philox_block",
     "single",
     "table_view",
@@ -34,6 +40,26 @@ _UNWRAPPED: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": Tr
 kernel = numba.njit(**_SETTINGS, **_UNWRAPPED, forceinline=True)
 entry = numba.njit(**_SETTINGS, cache=True)
 passing_entry = numba.njit(**_SETTINGS)
+_WHOLE_NUMBERS = numba.types.CPointer(numba.types.int64)
+
+
+def c_entry(function: Any) -> Any:
+    """Compile a function of addresses, which C calls and Numba keeps beside its file."""
+    is_kept = os.path.isfile(function.__code__.co_filename)
+    signature = numba.types.int64(_WHOLE_NUMBERS)
+    return numba.cfunc(signature, cache=is_kept, error_model="numpy")(function)
+
+
+def part(function: Any) -> Any:
+    """Compile a function that is too large for copies in each place that calls it."""
+    found = numba.njit(**_SETTINGS, **_UNWRAPPED)(function)
+    general = found.get_call_template
+    # Numba would compile it again for each number that is written in a call.
+    found.get_call_template = lambda arguments, kws: general(
+        tuple(map(numba.types.unliteral, arguments)), kws
+    )
+    return found
+
 
 _WORD = np.uint64
 _FIRST, _SECOND = _WORD(0xD2E7470EE14C6C93), _WORD(0xCA5A826395121157)
@@ -94,6 +120,46 @@ def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     entry_of = builder.gep(whole.data, [first])
     populate_array(view, entry_of, shape, strides, size, meminfo=None)
     return view._getvalue()
+
+
+@intrinsic
+def floats_at(_: Any, address: Any) -> Any:
+    """See `plain_natives`."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], ir.DoubleType().as_pointer())
+
+    return numba.types.CPointer(numba.types.float64)(address), generate
+
+
+_NUMBERS_OF_DECISION = 26
+_IN_DATA = (3, 4, 7)
+
+
+@intrinsic
+def decide_at(_: Any, data: Any, work: Any, place: Any) -> Any:
+    """See `plain_natives`."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        whole = ir.IntType(64)
+        data, work = (
+            make_array(kind)(context, builder, argument).data
+            for kind, argument in zip(signature.args, arguments[:2], strict=False)
+        )
+        numbers = cgutils.alloca_once(builder, whole, _NUMBERS_OF_DECISION)
+        for i in range(_NUMBERS_OF_DECISION):
+            at = builder.add(arguments[2], ir.Constant(whole, i))
+            number = builder.fptosi(builder.load(builder.gep(data, [at])), whole)
+            if i > 2:
+                base = data if i in _IN_DATA else work
+                number = builder.ptrtoint(builder.gep(base, [number]), whole)
+            builder.store(number, builder.gep(numbers, [ir.Constant(whole, i)]))
+        kind = ir.FunctionType(whole, [whole.as_pointer()])
+        function = cgutils.get_or_insert_function(builder.module, kind, "safe_envs_decide_columns")
+        return builder.call(function, [numbers])
+
+    number = numba.types.int64
+    return number(data, work, number), generate
 
 
 @intrinsic

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import copy
+import ctypes
 import hashlib
 import importlib
 import importlib.util
 import inspect
 import logging
 import math
+import os
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -24,7 +26,6 @@ from safe_envs.errors import (
     ConfigurationError,
     NotCompilableError,
     SystemDefinitionError,
-    install_extra,
     shortened,
 )
 from safe_envs.files import cache_folder, make_room, mark_used, write_atomically
@@ -74,25 +75,28 @@ def definitions(entries: Sequence[Callable[..., Any]], generated: Source) -> Def
     return link.definitions()
 
 
-def linked(entries: Sequence[Callable[..., Any]], generated: Source) -> str:
+def linked(
+    entries: Sequence[Callable[..., Any]],
+    generated: Source,
+    marks: tuple[str, str] = ("entry", "kernel"),
+) -> str:
     """Return the text of a module with entry points and all that they call.
 
     Functions that the generated ones define take the place of functions of the same name, which the
     kernel modules import as a declaration.
 
     Args:
-        entries: functions of kernel modules; they are marked `@entry`, all others `@kernel`.
+        entries: functions of kernel modules.
         generated: functions of this program alone.
+        marks: what entry points are marked with, and all others; see `numba_natives`.
 
     Raises:
         SystemDefinitionError: Two functions have one name, or a generated one is missing.
     """
     link = _Link(generated)
-    for function in entries:
+    for function in (*entries, *generated.uses):
         link.need(function.__module__, function.__name__)
-    for function in generated.uses:
-        link.need(function.__module__, function.__name__)
-    return link.text({function.__name__ for function in entries})
+    return link.text({function.__name__ for function in entries}, marks)
 
 
 class _Link:
@@ -151,16 +155,16 @@ class _Link:
         constants = {n: d for n, d in found.items() if not isinstance(d, ast.FunctionDef)}
         return Definitions(functions | self._generated, constants)
 
-    def text(self, entries: set[str]) -> str:
+    def text(self, entries: set[str], marks: tuple[str, str]) -> str:
         """Return the module."""
         functions, constants = self.definitions()
         parts = [f"from math import {', '.join(sorted(self._math))}"] * bool(self._math)
         parts += [ast.unparse(constants[name]) for name in sorted(constants)]
-        for name, node in sorted(functions.items()):
-            mark = "entry" if name in entries else "kernel"
-            own = name in self._generated
-            text = ast.unparse(_bare(node)) if own else _kernel(self._found[name][0], name)[0]
-            parts.append(f"@{mark}\n{text}\n")
+        # Entry points come last: some are compiled where they are defined.
+        for name in sorted(functions, key=lambda name: (name in entries, name)):
+            text = ast.unparse(_bare(functions[name])) if name in self._generated else ""
+            text = text or _kernel(self._found[name][0], name)[0]
+            parts.append(f"@{marks[name not in entries]}\n{text}\n")
         return "\n".join(parts)
 
 
@@ -201,7 +205,7 @@ def _bare(node: ast.FunctionDef) -> ast.FunctionDef:
     return bare
 
 
-ADVICE = f"{install_extra('fast')}, or use the engine 'numpy'"
+ADVICE = "pip install numba, or use the engine 'numpy'"
 
 _LOG = logging.getLogger("safe_envs")
 _FILE = "program.py"
@@ -266,6 +270,8 @@ def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
 @lru_cache(maxsize=64)
 def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     natives = _natives()
+    if "decide_at(" in text:
+        register_decide()
     stamp = f"{inspect.getsource(natives)}\n{text}"
     digest = hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
     folder = cache_folder(FOLDER)
@@ -294,6 +300,81 @@ def _natives() -> ModuleType:
     return numba_natives
 
 
+SWITCH = "SAFE_ENVS_COMPILE"
+"""Environment variable; 0 has the decisions of filters interpreted."""
+
+
+def decider(compiling: bool = True) -> Callable[[int], int] | None:
+    """Return `safe_envs.engine.decide.decide_columns` in machine code, a function of an address.
+
+    It is compiled once for each machine and version of its text.
+
+    Args:
+        compiling: whether to compile it where it has not been yet, which takes half a minute.
+
+    Returns:
+        None where there is none: it is not compiled, Numba cannot be used, or `SWITCH` is 0.
+    """
+    if os.environ.get(SWITCH) == "0" or not (compiling or _is_kept()):
+        return None
+    return _decider()
+
+
+@lru_cache(maxsize=1)
+def _decider() -> Callable[[int], int] | None:
+    try:
+        address = register_decide()
+    except NotCompilableError as error:
+        _LOG.warning("filters decide in plain Python, which is slow: %s", error)
+        return None
+    # A call takes some microseconds: it keeps other threads waiting no longer than Python would.
+    return ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(address)
+
+
+@lru_cache(maxsize=1)
+def _decide_text() -> tuple[str, str]:
+    """Return the text of `decide_columns`, and the name of its folder."""
+    from safe_envs.engine.decide import decide_columns
+
+    text = linked([decide_columns], Source(""), ("c_entry", "part"))
+    stamp = Path(__file__).with_name("numba_natives.py").read_text() + text
+    return text, hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
+
+
+def _is_kept() -> bool:
+    folder = cache_folder(FOLDER)
+    return folder is not None and any((folder / _decide_text()[1]).glob("**/*.nbi"))
+
+
+@lru_cache(maxsize=1)
+def register_decide() -> int:
+    """Return the address of `safe_envs.engine.decide.decide_columns`, which programs call.
+
+    Raises:
+        NotCompilableError: Numba cannot be used.
+    """
+    if not is_available():
+        raise NotCompilableError("Numba is missing; pip install numba")
+    natives = _natives()
+    text, digest = _decide_text()
+    folder, title = cache_folder(FOLDER), "the decisions of filters, once for this machine"
+    if not _is_kept():
+        _LOG.warning("compiling %s, which takes half a minute", title)
+    try:
+        if folder is None:
+            raise OSError
+        found = _KeptProgram(folder / digest, text, title).functions["decide_columns"]
+    except (OSError, ConfigurationError):  # The disk may be full.
+        found = _not_kept(text)["decide_columns"]
+    natives.add_symbol("safe_envs_decide_columns", found.address)
+    _KEPT.append(found)
+    return found.address
+
+
+_KEPT: list[Any] = []
+"""What must live as long as its address is used."""
+
+
 def _not_kept(text: str) -> dict[str, Any]:
     natives = _natives()
     names = {**vars(natives), "entry": natives.passing_entry}
@@ -307,11 +388,11 @@ class _KeptProgram:
     def __init__(self, folder: Path, text: str, title: str) -> None:
         self._folder, self._title, self._told = folder, title, False
         self._text = text
-        self._functions = self._load()
+        self.functions = self._load()
 
     def entry(self, name: str) -> Callable[..., Any]:
         """Return an entry point, which says so where it has to be compiled first."""
-        function = self._functions[name]
+        function = self.functions[name]
         is_new = True
 
         def call(*arguments: Any) -> Any:

@@ -13,8 +13,8 @@ from typing import Any, NoReturn
 import numpy as np
 
 from safe_envs.engine.formulas import Source
+from safe_envs.engine.oldqp.rounding import ROUNDING
 from safe_envs.engine.program import definitions
-from safe_envs.engine.qp.rounding import ROUNDING
 from safe_envs.engine.slots import Data
 from safe_envs.errors import NotCompilableError
 

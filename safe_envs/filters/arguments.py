@@ -29,8 +29,8 @@ from safe_envs.errors import (
 from safe_envs.filters.conditions.base import AffineConstraint, Condition, Pairs
 from safe_envs.filters.conditions.estimates import belief_places
 from safe_envs.filters.conditions.text import Conditions, conditions_for, parse_for_system
+from safe_envs.filters.decisions import Bounds
 from safe_envs.filters.qp import FilterQP
-from safe_envs.filters.solver import Bounds
 from safe_envs.problem.builder import named_barriers
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import Barrier, SafetyProblem

@@ -16,13 +16,11 @@ from safe_envs.dynamics.codegen import (
     Components,
     Flavour,
     compile_function,
-    filled,
     finite,
     stacked,
 )
 from safe_envs.dynamics.defined import NO_VALUE, defined_arrays
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.engine.qp import dispatch
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.filters import arguments
 from safe_envs.filters.arguments import (
@@ -39,11 +37,11 @@ from safe_envs.filters.conditions.estimates import (
     with_belief_signals,
 )
 from safe_envs.filters.conditions.text import Conditions, spec_of
+from safe_envs.filters.decisions import Bounds, Decisions
 from safe_envs.filters.estimation.estimator import Estimator
 from safe_envs.filters.estimation.registry import make_estimator
 from safe_envs.filters.measurement_filter import MeasurementFilter, certain_states
 from safe_envs.filters.qp import FilterDecision, FilterQP, UndefinedConstraintError
-from safe_envs.filters.solver import Bounds, FilterQPSolver, PerBarrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
 
@@ -54,11 +52,11 @@ class SafetyFilter:
     It minimises 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier and to the
     input bounds. Where the constraints cannot all be met, the sum of their squared slacks, weighted
     by the priorities, is as small as can be. A constraint counts as met where it is violated by no
-    more than the rounding of its terms; see `safe_envs.engine.qp.rounding`.
+    more than the rounding of its terms; see `safe_envs.engine.qp`.
 
-    One constraint has a closed form, and any number an exact solution for one and two inputs. For
-    others DAQP proposes which constraints and bounds hold the answer, and their equations prove it,
-    so that answers are right to rounding; else a slower active-set method decides.
+    One constraint and one input have closed forms, and for all else an active-set method finds the
+    answer up to rounding; see `safe_envs.engine.qp`. With machine code each decision takes some
+    microseconds, and a batch a fraction of one for each state.
 
     With a control Lyapunov function the filter solves its joint QP instead: min w_u |u|^2 + w_d d^2
     subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2).
@@ -91,6 +89,8 @@ class SafetyFilter:
         estimator: of the state, for `filter_measurement`.
         instants: control instants of an episode, for conditions with `belief`.
         region: (low, high) of each state, for conditions with `measurement_error`.
+        solver: of the QP, one of `qpsolvers.available_solvers`, such as "proxqp", for comparison:
+            one state after the other, of affine constraints; ours by default.
 
     Attributes:
         model: the system, as given.
@@ -121,6 +121,7 @@ class SafetyFilter:
         estimator: Estimator | None = None,
         instants: int | None = None,
         region: Sequence[tuple[float, float]] | None = None,
+        solver: str | None = None,
         **unknown: Never,
     ) -> None:
         arguments.refuse_unknown(unknown, SafetyFilter.__init__)
@@ -148,6 +149,7 @@ class SafetyFilter:
             arguments.runtime_symbols(known, self.pairs, self.constraints, clf),
             owners if len(owners) > len(self.pairs) else (),
         )
+        self._solver = solver
         self._solve_by(qp, [barrier.name for barrier, _ in self.pairs])
         fixed = [p.name for p in known.parameters]
         self._given = RuntimeArguments(qp, system.parameters, fixed, endless)
@@ -262,7 +264,7 @@ class SafetyFilter:
         states += tuple(values)
         with np.errstate(all="ignore"):
             require_finite(x, u)
-            decision = self._decide(states, inputs, own)
+            decision = self.decide_arrays(states, inputs, own)
             barriers = self._barriers_arrays(*states)
             action, margin, active, feasible, slack, cause, proposed, _ = decision
             given = () if proposed is inputs else (proposed,)
@@ -352,19 +354,9 @@ class SafetyFilter:
         return self.measured.filter(y, u_nominal, **given)
 
     def _solve_by(self, qp: FilterQP, names: Sequence[str]) -> None:
-        """Solve a QP by the fastest of its solvers; the barriers' names are for messages."""
+        """Solve a QP; the barriers' names are for messages."""
         self.qp, self._names = qp, names
-        self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
-        goal = int(qp.clf is not None)
-        self._size = len(qp.constraints) + goal, qp.model.m + goal
-        single = len(qp.constraints) == 1 and qp.plain
-        self._solve_arrays = self._arrays.solve_single if single else self._arrays.solve
-        self._solve_floats = self._floats.solve_single if single else self._floats.solve
-        if qp.plain and not single and not any(c.uncertainty for c in qp.constraints):
-            self._solve_floats = self._floats.solve_plain
-        if qp.owners:
-            self._solve_floats = PerBarrier(self._solve_floats, qp, "floats")
-            self._solve_arrays = PerBarrier(self._solve_arrays, qp, "arrays")
+        self._decisions = Decisions(qp, self._solver)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -373,9 +365,7 @@ class SafetyFilter:
 
     def compile(self) -> None:
         """Import and compile all that any decision may need."""
-        dispatch.prepare(*self._size)
-        for solver in (self._floats, self._arrays):
-            solver.compile()
+        self._decisions.compile()
 
     def decide_floats(
         self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None = None
@@ -394,25 +384,9 @@ class SafetyFilter:
             NumericalError: The constraint has no finite value.
         """
         try:
-            found = self._solve_floats(x, u, bounds)
+            return self._decisions.floats(x, u, bounds)
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, x) from error
-        except NO_VALUE:
-            # Plain floats raise where arrays overflow or give no number; the batch decides then.
-            found = self._decide_one_of_batch(x, u, bounds)
-        return found
-
-    def _decide_one_of_batch(
-        self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None
-    ) -> FilterDecision:
-        one, of_one = [tuple(np.array([c]) for c in part) for part in (x, u)]
-        found = self.decide_arrays(one, of_one, bounds)
-        *parts, cause, proposed = [
-            [filled(c, (1,)).item() for c in (part if isinstance(part, Sequence) else (part,))]
-            for part in found[:-1]
-        ]
-        action, margin, active, (feasible,), slack = parts
-        return FilterDecision(action, margin, active, feasible, slack, cause[0], proposed)
 
     def decide_arrays(
         self, x: Components, u: Components, bounds: Bounds | None = None
@@ -428,13 +402,8 @@ class SafetyFilter:
         Returns:
             The decisions in components.
         """
-        # What overflows or has no value is found below, which says where.
-        with np.errstate(all="ignore"):
-            return self._decide(x, u, bounds)
-
-    def _decide(self, x: Components, u: Components, bounds: Bounds | None) -> FilterDecision:
         try:
-            return self._solve_arrays(x, u, bounds)
+            return self._decisions.arrays(x, u, bounds)
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, [float(c[error.index]) for c in x]) from error
 
@@ -451,7 +420,7 @@ class SafetyFilter:
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.qp.symbols, x, strict=True))
         if which is None and "goal" not in what:
             owners = self.qp.owner_of_each
-            which = list(dict.fromkeys(owners[i] for i in self._arrays.undefined_at(x)))
+            which = list(dict.fromkeys(owners[i] for i in self._decisions.undefined_at(x)))
         names = f" on {', '.join([self._names[i] for i in which])}" if which else ""
         return NumericalError(
             f"{what}{names} has no finite value at {at}; check it and the model there"

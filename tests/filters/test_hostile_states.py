@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from safe_envs import Barrier, ControlAffineSDE, NumericalError
 from safe_envs.dynamics.codegen import compile_function, filled
-from safe_envs.engine.qp.rounding import ROUNDING
+from safe_envs.engine.qp import ROUNDING
 from safe_envs.systems import ENV_IDS
 from safe_envs.wrappers import CBF, RCBF, SCBF, SafetyFilter
 from tests.conftest import problem_of

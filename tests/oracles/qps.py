@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +12,9 @@ import numpy as np
 import sympy as sp
 
 from safe_envs import Barrier, ControlAffineSDE
-from safe_envs.engine.qp import dispatch
+from safe_envs.engine.decide import PLAIN, answer_length, decide, scratch_lengths, shape_of
+from safe_envs.engine.program import decider
+from safe_envs.filters.decisions import Frame
 from safe_envs.wrappers import AffineConstraint, Condition, SafetyFilter
 from tests.oracles.programs import decision_of
 
@@ -129,16 +132,6 @@ def random_qps(rng, size, k, m, kind, shift) -> QPs:
     return QPs(a, b, v, low, high, w, priority)
 
 
-def by_batch(qps: QPs, solver: str = "daqp") -> Answers:
-    """All states at once."""
-    rows = [list(row) for row in qps.a.transpose(1, 2, 0).copy()]
-    columns = [list(part.T.copy()) for part in qps[1:6]]
-    u, margin, active, feasible = dispatch.project_arrays(
-        rows, *columns, qps.priority.tolist(), solver
-    )
-    return Answers(np.array(u).T, np.array(margin).T, np.array(active).T, feasible)
-
-
 def one_by_one(solve: Callable[[QPs, int], Any]) -> Callable[[QPs], Answers]:
     """One state after the other."""
 
@@ -149,10 +142,38 @@ def one_by_one(solve: Callable[[QPs, int], Any]) -> Callable[[QPs], Answers]:
     return way
 
 
+def numbers_of(qps: QPs, i: int) -> tuple[list[float], ...]:
+    """The shape, weights, values, proposal and bounds of a QP, as the kernel takes them."""
+    k, m = qps.a.shape[1:]
+    shape = shape_of((k, m, 0), PLAIN, 0.0, 1.0, [[0] * 5 + [i] for i in range(k)])
+    values = [*qps.a[i].ravel().tolist(), *qps.b[i].tolist()]
+    weights = [*qps.w[i].tolist(), *qps.priority.tolist()]
+    return shape, weights, values, qps.v[i].tolist(), [*qps.low[i].tolist(), *qps.high[i].tolist()]
+
+
+def answer(qps: QPs, code: int, out: Sequence[float]) -> Any:
+    """Inputs, margins, active constraints and whether all are met."""
+    k, m = qps.a.shape[1:]
+    return out[:m], out[m : m + k], [x > 0.0 for x in out[m + k : m + 2 * k]], code & 1 == 1
+
+
+@one_by_one
+def by_batch(qps: QPs, i: int) -> Any:
+    """In machine code."""
+    shape, weights, values, u, ends = numbers_of(qps, i)
+    run = decider()
+    assert run is not None
+    return answer(qps, *Frame(shape, weights, ends, len(values)).decide(run, values, u, None))
+
+
 @one_by_one
 def by_floats(qps: QPs, i: int) -> Any:
-    """One state in floats."""
-    return dispatch.project_floats(*[part[i].tolist() for part in qps[:6]], qps.priority.tolist())
+    """Interpreted, on lists."""
+    shape, weights, values, u, ends = numbers_of(qps, i)
+    k, m = qps.a.shape[1:]
+    out = [math.nan] * answer_length(k, m, 0)
+    scratch = [[math.nan] * length for length in scratch_lengths(k, m, 0, 0)]
+    return answer(qps, decide(shape, weights, values, u, ends, out, scratch), out)
 
 
 @dataclass(frozen=True)

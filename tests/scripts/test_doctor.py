@@ -36,7 +36,7 @@ def test_a_sound_installation_is_sound(safe_envs_command, quick):
     assert names == [
         f"{program.name}{by}"
         for program in installation.KNOWN_QPS
-        for by in ([""] if program.in_closed_form else [", by DAQP", ", by PROXQP"])
+        for by in ["", ", by DAQP", ", by PROXQP"]
     ]
     assert [check["name"] for check in checks["envs"]] == [
         "safe_envs/Scalar-v0",
@@ -68,7 +68,7 @@ def test_a_wrong_answer_ends_with_status_1(safe_envs_command, quick, monkeypatch
     assert status == 1
     assert "WRONG" in out
     document = strictly("found.json")
-    assert document["checks"]["solvers"][0]["advice"] == "reinstall numpy and scipy"
+    assert document["checks"]["solvers"][0]["advice"] == "reinstall safe-envs, numba and numpy"
     assert not document["healthy"]
     assert document["steps_per_second"] == {}
 

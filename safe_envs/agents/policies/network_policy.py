@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.policies.actions_kernel import action_in_another_box, clip_to_bound
 from safe_envs.agents.policies.base import CHOOSE, BlockPolicy
-from safe_envs.agents.policies.clf_kernel import action_in_another_box, clip_to_bound
 from safe_envs.engine.formulas import Source
 from safe_envs.engine.slots import Data
 from safe_envs.errors import ConfigurationError, nearest, shown

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
-from safe_envs.agents.policies.clf_kernel import (
+from safe_envs.agents.policies.actions_kernel import (
     action_of_input,
-    best_inputs_for_goal,
     random_action,
-    work_of_goal,
 )
+from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.noise import POLICY, EpisodeUniforms, episode_seeds
 from safe_envs.engine.formulas import Source, formulas
 from safe_envs.engine.slots import Data
 from safe_envs.envs.spaces import center_and_half_width, observation_names
 from safe_envs.errors import ConfigurationError, NumericalError
+from safe_envs.filters.decision_source import filter_source
+from safe_envs.filters.decisions import Decisions
 from safe_envs.filters.qp import FilterQP, UndefinedConstraintError
-from safe_envs.filters.solver import FilterQPSolver
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.measurement import require_full_state
 from safe_envs.problem.problem import SafetyProblem
@@ -196,8 +194,7 @@ class CLFController(StatelessPolicy):
             [pair[1] for pair in problem.input_bounds],
         )
         qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
-        self._qp, self._goal = qp, goal
-        self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
+        self._qp, self._decisions = qp, Decisions(qp)
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Solve the QP; see `StatelessPolicy.actions`.
@@ -208,10 +205,11 @@ class CLFController(StatelessPolicy):
         x = np.ascontiguousarray(given[..., self._columns].T)
         try:
             if given.ndim == 1:
-                inputs = self._floats.best(tuple(x.tolist()), [0.0] * len(self._half))
+                found = self._decisions.floats(tuple(x.tolist()), [0.0] * len(self._half))
             else:
-                with np.errstate(all="ignore"):
-                    inputs = self._arrays.best(tuple(x), [np.zeros(len(given))] * len(self._half))
+                nothing = [np.zeros(len(given))] * len(self._half)
+                found = self._decisions.arrays(tuple(x), nothing)
+            inputs = found.proposed
         except (ArithmeticError, ValueError) as error:
             row = (
                 given[error.index]
@@ -227,26 +225,13 @@ class CLFController(StatelessPolicy):
 
     def source(self, data: Data) -> Source:
         """See `Policy.source`."""
-        model, m = self._qp.model, len(self._half)
-        growth, along = self._goal.growth(model)
-        rates = formulas(
-            "goal_rates", {"x": model.states}, [model.numeric(e) for e in (growth, *along)], data
-        )
-        weight, slack_weight = (
-            float(model.numeric(w)) for w in (self._goal.input_weight, self._goal.slack_weight)
-        )
-        unit = math.sqrt(weight / slack_weight)
-        place = data.add([*self._qp.low, *self._qp.high, weight, unit])
-        scales = data.add([*self._center, *self._half])
+        scales, m = data.add([*self._center, *self._half]), len(self._half)
         x = "".join(f"observation[{column}], " for column in self._columns)
-        entries = "".join(
-            f"(work[{j}] - data[{scales + j}]) / data[{scales + m + j}], " for j in range(m)
-        )
-        return rates + Source(
-            f"{CHOOSE}    best_inputs_for_goal(goal_rates(({x}), data), {place}, data, work)\n"
-            f"    return ({entries})\n",
-            (best_inputs_for_goal,),
-            work_of_goal(m),
+        inputs = enumerate(f"data[{scales + j}]) / data[{scales + m + j}]" for j in range(m))
+        entries = "".join(f"(best[1][{j}] - {scaled}, " for j, scaled in inputs)
+        return filter_source(self._qp, data, "pursue_goal") + Source(
+            f"{CHOOSE}    best = pursue_goal(({x}), ({'0.0, ' * m}), data, work)\n"
+            f"    if not best[6]:\n        return ({'nan, ' * m})\n    return ({entries})\n"
         )
 
 

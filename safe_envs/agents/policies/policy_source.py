@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from safe_envs.agents.policies.actions_kernel import input_of_action
 from safe_envs.agents.policies.base import Policy, not_compilable
-from safe_envs.agents.policies.clf_kernel import input_of_action
 from safe_envs.engine.formulas import Source
 from safe_envs.engine.program import has_own_source
 from safe_envs.engine.slots import Data

@@ -319,7 +319,7 @@ class Condition(ABC):
     along the flow (for stochastic conditions the generator: then it is the expectation that
     changes). `sampling_margin` "first-order" therefore asks for psi >= 0 and psi + dt psi' >= 0, so
     that psi stays nonnegative over the period up to O(dt^2). Both hold at the executed input, in
-    which psi' is quadratic; see `safe_envs.filters.solver`. A number asks for psi
+    which psi' is quadratic; see `safe_envs.engine.decide`. A number asks for psi
     >= that number.
 
     Attributes:

@@ -14,7 +14,7 @@ import sympy as sp
 
 from safe_envs.dynamics.polynomial import Polynomial
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.engine.qp.rounding import ROUNDING
+from safe_envs.engine.qp import ROUNDING
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.filters.certificates.certificate import BarrierCertificate
 from safe_envs.filters.certificates.files import load_certificate

@@ -27,7 +27,7 @@ class KnownQP:
     """The input nearest to a proposed one, within bounds, that meets constraints a u + b >= 0.
 
     Attributes:
-        name: of the kind of QP, which decides on the solver.
+        name: of the kind of QP.
         a: k constraints of m coefficients.
         b: k offsets.
         proposed: m inputs.
@@ -43,11 +43,6 @@ class KnownQP:
     bound: float
     answer: tuple[float, ...]
     feasible: bool = True
-
-    @property
-    def in_closed_form(self) -> bool:
-        """Whether no solver is needed."""
-        return len(self.b) == 1 or len(self.proposed) < 3
 
 
 KNOWN_QPS = (
@@ -102,10 +97,10 @@ KNOWN_QPS = (
 _NEEDED = ""
 """In place of an extra: what is needed in any case."""
 
-_PACKAGES = {"daqp": "daqp", "proxqp": "proxsuite"}
-"""Of the solvers of QPs without a closed form."""
+_OTHERS = {"daqp": "daqp", "proxqp": "proxsuite"}
+"""Other solvers of QPs, with their packages."""
 
-_TOLERANCE = 1e-6
+_TOLERANCE = 1e-5
 _STEPS = 20
 
 
@@ -174,28 +169,35 @@ def required() -> list[tuple[str, str]]:
 
 
 def solvers() -> Iterator[Check]:
-    """Check the solvers on QPs with known answers."""
+    """Check our QPs against known answers, and against the other solvers that are installed."""
+    import qpsolvers
+
+    others = [name for name in _OTHERS if name in qpsolvers.available_solvers]
     for qp in KNOWN_QPS:
-        if not qp.in_closed_form:
-            for solver, package in _PACKAGES.items():
-                name = f"{qp.name}, by {solver.upper()}"
-                advice = f"reinstall {package}, numpy and scipy"
-                yield _check(name, partial(_solve, qp, solver), advice)
-        else:
-            yield _check(qp.name, partial(_solve, qp, "daqp"), "reinstall numpy and scipy")
+        yield _check(qp.name, partial(_solve, qp, None), "reinstall safe-envs, numba and numpy")
+        for name in others:
+            advice = f"reinstall {_OTHERS[name]} and qpsolvers"
+            yield _check(f"{qp.name}, by {name.upper()}", partial(_solve, qp, name), advice)
 
 
-def _solve(qp: KnownQP, solver: str) -> tuple[bool, str]:
-    from safe_envs.engine.qp.dispatch import project_floats
+def _solve(qp: KnownQP, solver: str | None) -> tuple[bool, str]:
+    import sympy as sp
 
-    m, k = len(qp.proposed), len(qp.b)
-    low, high, ones = [-qp.bound] * m, [qp.bound] * m, [1.0] * m
-    action, _, _, feasible = project_floats(
-        qp.a, qp.b, list(qp.proposed), low, high, ones, [1.0] * k, solver
+    from safe_envs.dynamics.sde import ControlAffineSDE
+    from safe_envs.filters.safety_filter import SafetyFilter
+
+    x, u = (sp.symbols(f"{name}:{len(qp.proposed)}", real=True) for name in ("x", "u"))
+    # h' = a u, and h = b at the state 0.
+    system = ControlAffineSDE(x, u, [0] * len(x), sp.eye(len(x)))
+    rows = [sp.Add(*[ai * xi for ai, xi in zip(a, x, strict=True)]) for a in qp.a]
+    barriers = [row + b for row, b in zip(rows, qp.b, strict=True)]
+    safety_filter = SafetyFilter(
+        system, barriers, "cbf:alpha=1", (-qp.bound, qp.bound), solver=solver
     )
-    if feasible != qp.feasible:
-        return False, f"said to be {'' if feasible else 'in'}feasible, and is not"
-    error = float(np.abs(np.subtract(action, qp.answer)).max())
+    found = safety_filter.filter([0.0] * len(x), list(qp.proposed))
+    if bool(found.feasible) != qp.feasible:
+        return False, f"said to be {'' if found.feasible else 'in'}feasible, and is not"
+    error = float(np.abs(np.subtract(found.action, qp.answer)).max())
     return error <= _TOLERANCE, f"off by {error:.1g}"
 
 
