@@ -52,7 +52,7 @@ def c_entry(function: Any) -> Any:
 
 def part(function: Any) -> Any:
     """Compile a function that is too large for copies in each place that calls it."""
-    found = numba.njit(**_SETTINGS, **_UNWRAPPED)(function)
+    found: Any = numba.njit(**_SETTINGS, **_UNWRAPPED)(function)
     general = found.get_call_template
     # Numba would compile it again for each number that is written in a call.
     found.get_call_template = lambda arguments, kws: general(

@@ -21,8 +21,8 @@ cannot be met, else 0 (k); none binds where the clipped proposal meets them all.
 
 from __future__ import annotations
 
-from collections.abc import MutableSequence
 from math import sqrt
+from typing import Any
 
 ROUNDING = 3.552713678800501e-15
 """Relative error of a constraint's value: 16 times the spacing of doubles at 1. The sum of n
@@ -53,7 +53,7 @@ BISECTIONS = 200
 ENDLESS = 1.7976931348623157e308
 """In place of infinity."""
 
-Floats = MutableSequence[float]
+Floats = Any
 """A flat array of numbers: a list where text is interpreted, an array in machine code."""
 
 

@@ -142,7 +142,7 @@ class Decisions:
     def _fresh(self) -> None:
         self._run: Callable[[int], int] | None = None
         self._frames: list[Any] = []
-        self._machine_frames: list[Frame] = []
+        self._machine_frames: list[CallFrame] = []
 
     def _count(self, decisions: int) -> Callable[[int], int] | None:
         """Count decisions; return the function that makes them in machine code, if it is due."""
@@ -263,10 +263,10 @@ class Decisions:
             code = decide(made.shape, made.weights, values, u, bounds, out, scratch)
         except ArithmeticError:  # NumPy's numbers overflow, and have quotients by 0
             with np.errstate(all="ignore"):
-                parts = (made.shape, made.weights, values, u, bounds, out, *scratch)
-                arrays = [np.array(part, dtype=float) for part in parts]
-                code = decide(*arrays[:6], arrays[6:])
-            out = arrays[5].tolist()
+                given, proposed, answer = np.array(values), np.array(u), np.array(out)
+                rooms = [np.array(room) for room in scratch]
+                code = decide(made.shape, made.weights, given, proposed, bounds, answer, rooms)
+            out = answer.tolist()
         self._frames.append(scratch)
         return code, out
 
@@ -289,9 +289,9 @@ class Decisions:
             cause = text.gather_barriers(k, m, self.values.shape, cause, out)
         return 2 * cause + 2 + int(feasible), out
 
-    def _frame(self) -> Frame:
+    def _frame(self) -> CallFrame:
         made = self.values
-        return Frame(made.shape, made.weights, made.ends, len(made.expressions))
+        return CallFrame(made.shape, made.weights, made.ends, len(made.expressions))
 
     def _table(self, x: Sequence[Any], size: int) -> np.ndarray:
         """Return the values at a batch, shape (values, B)."""
@@ -369,7 +369,7 @@ class Decisions:
         return found or list(range(self._k))
 
 
-class Frame:
+class CallFrame:
     """Arrays of one call in machine code.
 
     Args:
@@ -386,13 +386,14 @@ class Frame:
         self._ends, self._length = ends, answer_length(k, m, goal)
         lengths = scratch_lengths(k, m, goal, int(shape[text.SAMPLED]))
         starts = [0, *itertools.accumulate([size, m, 2 * m, self._length, *lengths])]
-        self._block = np.zeros(starts[-1])
+        block = np.zeros(starts[-1])
+        self._block = block.data
         self._constants = np.array(shape), np.array(weights), np.array(ends)
         self._given = struct.Struct(f"{size + m}d")
         self._bounds = struct.Struct(f"{2 * m}d")
         self._answer = struct.Struct(f"{self._length}d")
         self._places = [8 * start for start in starts]
-        places = [_address(self._block) + place for place in self._places[:-1]]
+        places = [_address(block) + place for place in self._places[:-1]]
         of_shape, of_weights, self._own_ends = map(_address, self._constants)
         numbers = [1, size, 0, of_shape, of_weights, *places[:4], 0, places[0], *places[4:]]
         self._one, self._many = array("q", numbers), array("q", numbers)

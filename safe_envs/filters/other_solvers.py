@@ -15,7 +15,7 @@ TOLERANCE = 1e-8
 BINDING = 1e-4
 """Part of its terms below which the value of a constraint is taken for 0: it binds."""
 
-_SETTINGS: dict[str, dict[str, float]] = {
+_SETTINGS: dict[str, dict[str, Any]] = {
     "proxqp": {"eps_abs": 1e-10},
     "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-10},
 }
@@ -79,6 +79,7 @@ def solve_with(
         slack = np.maximum(least[m:], 0.0) + TOLERANCE * terms
         closest = _solve(solver, *near, -a, b + slack, low, high)
         u = least[:m] if closest is None else closest
+    assert u is not None
     return np.clip(u, low, high).tolist(), feasible
 
 

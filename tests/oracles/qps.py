@@ -14,7 +14,7 @@ import sympy as sp
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.engine.decide import PLAIN, answer_length, decide, scratch_lengths, shape_of
 from safe_envs.engine.program import decider
-from safe_envs.filters.decisions import Frame
+from safe_envs.filters.decisions import CallFrame
 from safe_envs.wrappers import AffineConstraint, Condition, SafetyFilter
 from tests.oracles.programs import decision_of
 
@@ -163,7 +163,7 @@ def by_batch(qps: QPs, i: int) -> Any:
     shape, weights, values, u, ends = numbers_of(qps, i)
     run = decider()
     assert run is not None
-    return answer(qps, *Frame(shape, weights, ends, len(values)).decide(run, values, u, None))
+    return answer(qps, *CallFrame(shape, weights, ends, len(values)).decide(run, values, u, None))
 
 
 @one_by_one

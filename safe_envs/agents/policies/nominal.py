@@ -207,7 +207,7 @@ class CLFController(StatelessPolicy):
             if given.ndim == 1:
                 found = self._decisions.floats(tuple(x.tolist()), [0.0] * len(self._half))
             else:
-                nothing = [np.zeros(len(given))] * len(self._half)
+                nothing = (np.zeros(len(given)),) * len(self._half)
                 found = self._decisions.arrays(tuple(x), nothing)
             inputs = found.proposed
         except (ArithmeticError, ValueError) as error:

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from safe_envs.agents.evaluation.frontier import Frontier, FrontierPoint, FrontierSpec, frontier
+from safe_envs.values.frontier import FrontierSettings
 
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import attainable
@@ -21,11 +23,9 @@ from safe_envs.agents.evaluation.attainable import (
     simulate,
     times_unavoidable,
 )
-from safe_envs.agents.evaluation.frontier import Frontier, FrontierPoint, FrontierSpec, frontier
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import VARIABLE, entries
 from safe_envs.registry import make_problem
-from safe_envs.values.frontier import FrontierSettings
 from tests.agents.policies.coarse import COARSE, SHORT, coarse
 
 NEAR_THE_EDGE = {**SHORT, "start": [0.8], "noise": 1.5}
