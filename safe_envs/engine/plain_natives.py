@@ -8,7 +8,6 @@ Source: J. Salmon, M. Moraes, R. Dror, D. Shaw, Parallel Random Numbers: As Easy
 
 from __future__ import annotations
 
-import math
 import struct
 from typing import Any
 
@@ -105,23 +104,3 @@ def decide_at(data: np.ndarray, work: np.ndarray, place: int) -> int:
     shape, weights, ends = (data[places[i] :] for i in (3, 4, 7))
     values, u, out = (work[places[i] :] for i in (5, 6, 8))
     return decide(shape, weights, values, u, ends, out, [work[at:] for at in places[11:]])
-
-
-def library_sine(x: float) -> float:
-    """Return the sine of an angle in rad by the C library."""
-    return math.sin(x)
-
-
-def library_cosine(x: float) -> float:
-    """Return the cosine of an angle in rad by the C library."""
-    return math.cos(x)
-
-
-def library_arc_tangent(y: float, x: float) -> float:
-    """Return the angle of a vector in rad by the C library.
-
-    Args:
-        y: its second component.
-        x: its first component.
-    """
-    return math.atan2(y, x)
