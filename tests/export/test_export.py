@@ -285,7 +285,7 @@ def test_without_a_compiler_the_files_are_written(
     monkeypatch.delenv("CC", raising=False)
     export_filter(cart(), tmp_path / "new")
     assert {f.name for f in (tmp_path / "new").iterdir()} == {
-        *("filter.h", "filter.c", "selftest.c", "CMakeLists.txt", "README.md")
+        *("filter.h", "filter.c", "filter_core.c", "selftest.c", "CMakeLists.txt", "README.md")
     }
     assert not compare(tmp_path / "new", cart(), states=10).was_made
 
