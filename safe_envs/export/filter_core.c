@@ -434,12 +434,13 @@ static bool project_interval(
     }
     /* Two constraints that meet in one point may miss each other by the rounding of their roots. */
     u[0] = clip(smaller(larger(v, first), last), low, high);
-    for (int i = 0; i < p->k; i++) {
+    /* Where one alone is missed, its interval is beyond a bound, which is the answer. */
+    for (int i = 0; (p->k > 1 || forms) && i < p->k; i++) {
         const real value = interval_residual(p, forms, i, u[0], &allowed);
         const bool silent = !forms && p->a[i] == 0;
         solvable = solvable || (value < -allowed && !silent);
     }
-    if (solvable && (p->k > 1 || forms)) {
+    if (solvable) {
         u[0] = least_slack(p, forms);
     }
     bool feasible = true;
@@ -1704,6 +1705,9 @@ static int furthest_constraint(const decision *d)
 {
     int cause = -1;
     real most = 0;
+    if (CONSTRAINTS == 1) {
+        return d->active[0] ? 0 : -1;
+    }
     for (int i = 0; i < CONSTRAINTS; i++) {
         if (d->active[i]) {
             const real nearest = -(real)INFINITY, *a = d->values + i * INPUTS;

@@ -271,14 +271,14 @@ def without_effect(safety_filter: SafetyFilter, region: Region, rng: np.random.G
 
 
 def spoilt(cases: Cases, rng: np.random.Generator) -> Cases:
-    """Return cases with an entry of each state, or of each proposed input, that is not finite.
+    """Return cases with an entry of each state or proposed input that is not finite, tiny or huge.
 
     Args:
         cases: any cases.
         rng: source of random numbers.
     """
     count, n = cases.states.shape
-    bad = np.array([np.nan, np.inf, -np.inf])[np.arange(count) % 3]
+    bad = np.resize([np.nan, np.inf, -np.inf, 1e-200, 1e6], count)
     states, proposed = cases.states.copy(), cases.proposed.copy()
     of_state = rng.random(count) < 0.7
     rows = np.flatnonzero(of_state)
@@ -300,8 +300,8 @@ def at_ends(cases: Cases, region: Region, rng: np.random.Generator) -> Cases:
     ends = np.array(region, dtype=float)[: states.shape[1]]
     for values, low, high in ((states, *ends.T), (proposed, cases.low, cases.high)):
         side = rng.random(values.shape)
-        values[:] = np.where(side < 0.4, low, np.where(side > 0.6, high, values))
-    # An input without a bound is proposed at a huge size.
+        chosen = np.where(side < 0.4, low, np.where(side > 0.6, high, values))
+        values[:] = np.where(np.abs(chosen) < WIDEST, chosen, values)
     return Cases(states, cases.runtime, proposed, cases.low, cases.high)
 
 
@@ -343,7 +343,7 @@ def golden_cases(
         if sorts[sort] <= _OF_A_SORT and len(sorts) <= 40:
             kept.append(int(i))
     flat = rounded(flat) if is_single else flat
-    chosen = cases.at(kept) + flat + spoilt(cases.at(slice(0, 6)), rng)
+    chosen = cases.at(kept) + flat + spoilt(cases.at(slice(0, 3)), rng)
     crossed = cases.at(slice(0, 1))
     low, high = crossed.high, crossed.low - 1.0
     chosen += Cases(crossed.states, crossed.runtime, crossed.proposed, low, high)

@@ -72,9 +72,9 @@ def run_selftest(directory: Path, *flags: str, compiler: Sequence[str] = COMPILE
 
 
 def assert_equal(found: CComparison, error: float = 1e-11) -> None:
-    """Flags are equal, and actions but for rounding."""
+    """Flags are equal but where they hang on rounding, and actions but for rounding."""
     assert found.was_made
-    assert found.flags_different == 0
+    assert found.flags_different == found.flags_close <= found.states // 500
     assert found.out_of_bounds == 0
     assert found.largest_error <= error
 
@@ -214,8 +214,10 @@ PIECES = sp.Piecewise((x**2, x < 0), (sp.sqrt(1 + x), x < 1), (2, True))
 FORMULAS = {
     "remainders": sp.Mod(x, 2) + sp.Mod(3 * y, -1.5) + sp.frac(x * y),
     "steps": sp.floor(3 * x) - sp.ceiling(2 * y) / 3 + sp.sign(x - y) * x,
+    "conditions": sp.Piecewise((x, (x > 1) & (y > 0) | (x < y)), (y**2, sp.Ne(y, x)), (1, True)),
     "pieces": PIECES + sp.Max(x, y, -x) - sp.Min(x * y, 1) + sp.Heaviside(x),
-    "powers": x**9 + sp.cbrt(1 + x**2) + (1 + y**2) ** sp.Rational(-5, 2) + 2**y / 3,
+    "powers": x**9 + sp.cbrt(1 + x**2) + (1 + y**2) ** sp.Rational(-5, 2) + 2**y / 3 + x**-2,
+    "roots": 1 / sp.sqrt(1 + x**2) + sp.sqrt(2 + y) ** 3 - sp.log(3 + x, 2) + sp.coth(3 + y),
     "functions": sp.tanh(x) + sp.atan2(y, x) + sp.exp(-(y**2)) * sp.erf(x) + sp.log(2 + y**2),
     "signs": -(-x - (y - (x - 1))) / (2 - -sp.Abs(y)) - sp.Rational(1, 3) * x / 7,
 }
@@ -250,6 +252,7 @@ NOWHERE_FINITE = ControlAffineSDE((x,), (u,), [sp.log(x)], [1 / (x - 1)], [0])
 DOUBLE = ControlAffineSDE.from_rate((x, y), (u,), [y, u])
 ROOTS = [sp.sqrt(2 - x) - y, sp.log(4 - y)]
 UNDEFINED = {
+    "a cube root": (DOUBLE, [2 - sp.cbrt(y)], "cbf", None, "infeasible"),
     "a constraint": (NOWHERE_FINITE, [2 - x], CBF(1.0), None, "invalid"),
     "a barrier": (DOUBLE, ROOTS, ["rcbf", "cbf:alpha=2"], ((-3.0, 5.0), (-3.0, 6.0)), "infeasible"),
 }
@@ -269,13 +272,19 @@ def test_states_without_a_value(name: str, tmp_path: Path) -> None:
 
 
 @NEEDS_COMPILER
-def test_fast_math_is_refused_by_the_compiler(tmp_path: Path) -> None:
+def test_what_compilers_refuse_and_what_they_may_take(tmp_path: Path) -> None:
     assert COMPILER is not None
     export_filter(cart(), tmp_path)
-    command = [*COMPILER, "-std=c99", "-ffast-math", "-c", "filter.c", "-o", "filter.o"]
-    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert built.returncode != 0
-    assert "-ffast-math" in built.stderr
+
+    def compiled(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [*COMPILER, "-std=c99", *arguments, "-c", "-o", "filter.o"]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    quick = compiled("-ffast-math", "filter.c")
+    assert quick.returncode != 0
+    assert "-ffast-math" in quick.stderr
+    # Builds that take every file of a folder give it to the compiler, too.
+    assert compiled(*WARNINGS, "filter_core.c").returncode == 0
 
 
 def test_without_a_compiler_the_files_are_written(
@@ -330,7 +339,7 @@ def test_the_compiler_of_the_environment(tmp_path: Path, monkeypatch: pytest.Mon
 
 @NEEDS_COMPILER
 @pytest.mark.oracle
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if "learned" not in name])
 def test_everything_that_a_filter_may_have(name: str, tmp_path: Path) -> None:
     safety_filter = case_of(name)[0]
     options = ExportOptions(region=((-2.5, 2.5),) * safety_filter.model.n)
@@ -340,7 +349,6 @@ def test_everything_that_a_filter_may_have(name: str, tmp_path: Path) -> None:
             assert "0 differences" in run_selftest(tmp_path, *flags)
         found = compare(tmp_path, safety_filter, options, states=20_000)
         assert found.out_of_bounds == 0
-        # The plane above an uncertainty has rounding of its own.
         unexplained = found.flags_different - found.flags_close
         assert unexplained <= (found.states // 1000 if float32 else 0)
         assert float32 or found.largest_error <= 1e-10
