@@ -20,7 +20,6 @@
 
 #if SINGLE_PRECISION
 #define EPSILON FLT_EPSILON
-#define SMALLEST FLT_MIN
 #define LARGEST FLT_MAX
 #define SMALL_SQUARE FLT_MIN
 #define LARGE_SQUARE 1e18F
@@ -31,7 +30,6 @@
 #define TANH tanhf
 #else
 #define EPSILON DBL_EPSILON
-#define SMALLEST 1e-300
 #define LARGEST DBL_MAX
 #define SMALL_SQUARE 1e-200
 #define LARGE_SQUARE 1e200
@@ -1365,8 +1363,9 @@ static void take_plane(const decision *d, const real *q, real *a, real *b)
         for (int c = 0; c < corners; c++) {
             rise += c >> j & 1 ? roots[c] : -roots[c];
         }
-        /* An input whose bounds are equal has two equal faces and no slope. */
-        slopes[j] = rise / ((real)0.5 * (real)corners * larger(d->high[j] - d->low[j], SMALLEST));
+        /* An input whose bounds are equal has no slope, whatever the rounding of its two faces. */
+        const real width = d->high[j] - d->low[j];
+        slopes[j] = width > 0 ? rise / ((real)0.5 * (real)corners * width) : 0;
         a[j] -= slopes[j];
     }
     for (int c = 0; c < corners; c++) {

@@ -271,14 +271,14 @@ def without_effect(safety_filter: SafetyFilter, region: Region, rng: np.random.G
 
 
 def spoilt(cases: Cases, rng: np.random.Generator) -> Cases:
-    """Return cases with an entry of each state or proposed input that is not finite, tiny or huge.
+    """Return cases with an entry of each state or proposed input that is not finite, or far away.
 
     Args:
         cases: any cases.
         rng: source of random numbers.
     """
     count, n = cases.states.shape
-    bad = np.resize([np.nan, np.inf, -np.inf, 1e-200, 1e6], count)
+    bad = np.resize([np.nan, np.inf, -np.inf, 1e3], count)
     states, proposed = cases.states.copy(), cases.proposed.copy()
     of_state = rng.random(count) < 0.7
     rows = np.flatnonzero(of_state)

@@ -379,3 +379,18 @@ def test_a_million_states(
     for compiler in COMPILERS:
         for flags in (("-O0",), ("-O3",), SANITIZED):
             assert "0 differences" in run_selftest(tmp_path, *flags, compiler=compiler)
+
+
+@NEEDS_COMPILER
+def test_a_held_input_has_no_part_in_a_plane(tmp_path: Path) -> None:
+    # Rounding of two equal faces, over a width of 0, once gave a slope of 1e284.
+    safety_filter = case_of("planes above")[0]
+    options = ExportOptions(region=((-2.5, 2.5),) * 3)
+    export_filter(safety_filter, tmp_path, options=options)
+    assert_equal(compare(tmp_path, safety_filter, options, states=3000))
+    x, u = [-1.426, 1.23, -0.286], [-0.57, -0.79]
+    held = safety_filter.filter(x, u, input_bounds=[(-0.65, 0.42), (-0.64, -0.64)])
+    nearly = safety_filter.filter(x, u, input_bounds=[(-0.65, 0.42), (-0.64, -0.64 + 1e-9)])
+    assert held.feasible == nearly.feasible
+    np.testing.assert_allclose(held.action, nearly.action, atol=1e-6)
+    np.testing.assert_allclose(held.margin, nearly.margin, atol=1e-6)

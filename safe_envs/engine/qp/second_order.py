@@ -359,12 +359,15 @@ def majorant(
         square: Any = added([q[i][j] * (w[i] * w[j]) for i in range(m + 1) for j in range(m + 1)])
         roots.append(np.sqrt(np.maximum(square, 0.0)))
     half = 2.0 ** (m - 1)
-    # An input that is held, its two bounds being equal, has two equal faces and no slope.
-    slopes = [
-        added([r if k >> j & 1 else -r for k, r in enumerate(roots)])
-        / (half * np.maximum(high[j] - low[j], _TINY))
-        for j in range(m)
-    ]
+    slopes = []
+    for j in range(m):
+        rise, width = (
+            added([r if k >> j & 1 else -r for k, r in enumerate(roots)]),
+            high[j] - low[j],
+        )
+        # An input that is held, its two bounds being equal, has no slope, whatever the rounding of
+        # its two faces.
+        slopes.append(np.where(width > 0.0, rise / (half * np.maximum(width, _TINY)), 0.0))
     above = [
         r - added([c * e for c, e in zip(slopes, corner, strict=True)])
         for r, corner in zip(roots, corners, strict=True)

@@ -317,10 +317,6 @@ def uncertain_maximiser(
     return end
 
 
-NO_WIDTH = 1e-300
-"""A distance that can divide."""
-
-
 def work_of_majorant(m: int) -> int:
     """Return the length of the scratch array of `majorant_plane`: the corners of the bounds.
 
@@ -358,8 +354,10 @@ def majorant_plane(
         rise = 0.0
         for c in range(corners):
             rise += work[c] if c >> j & 1 else -work[c]
-        # An input that is held, its two bounds being equal, has two equal faces and no slope.
-        slopes[j] = rise / (0.5 * corners * max(high[j] - low[j], NO_WIDTH))
+        # An input that is held, its two bounds being equal, has no slope, whatever the rounding of
+        # its two faces.
+        width = high[j] - low[j]
+        slopes[j] = rise / (0.5 * corners * width) if width > 0.0 else 0.0
     above = 0.0
     for c in range(corners):
         plane = 0.0
