@@ -19,9 +19,9 @@
 #ifdef CONSTRAINTS
 
 #if SINGLE_PRECISION
-#define EPSILON FLT_EPSILON
-#define LARGEST FLT_MAX
-#define SMALL_SQUARE FLT_MIN
+#define EPSILON 1.1920929e-7F
+#define LARGEST 3.4028235e38F
+#define SMALL_SQUARE 1.1754944e-38F
 #define LARGE_SQUARE 1e18F
 #define COARSER 536870912.0F /* times that float is coarser than double */
 #define ABS fabsf
@@ -29,8 +29,8 @@
 #define FMOD fmodf
 #define TANH tanhf
 #else
-#define EPSILON DBL_EPSILON
-#define LARGEST DBL_MAX
+#define EPSILON 2.220446049250313e-16
+#define LARGEST 1.7976931348623157e308
 #define SMALL_SQUARE 1e-200
 #define LARGE_SQUARE 1e200
 #define COARSER 1.0

@@ -265,6 +265,10 @@ class _Table:
         return cls(tuple(sizes), network.activation == "relu", np.concatenate(parts))
 
 
+_LEARNED = (LearnedResidual, LearnedGenerator)
+"""Not their subclasses, which may compute something else."""
+
+
 def _learned(
     qp: FilterQP, names: Sequence[str], single: bool, functions: list[str]
 ) -> tuple[list[dict[str, Any]], list[_Table]]:
@@ -273,7 +277,7 @@ def _learned(
     tables: list[_Table] = []
     place = 0
     for i, term in enumerate(qp.terms):
-        if type(term) not in (LearnedResidual, LearnedGenerator):
+        if not isinstance(term, LearnedResidual | LearnedGenerator) or type(term) not in _LEARNED:
             raise NotCompilableError(
                 f"the learned terms {type(term).__name__} have no compiled form in C, which only"
                 " networks have that safe-envs has trained"
