@@ -9,7 +9,7 @@ from pathlib import Path
 import sympy as sp
 
 from safe_envs.dynamics.symbols import declared_sign
-from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.errors import ConfigurationError, NotCompilableError, shortened, shown
 from safe_envs.export.interface import Interface
 from safe_envs.export.program import MARK, exported, rendered
 from safe_envs.export.reference import Region, golden_cases
@@ -60,6 +60,10 @@ def export_filter(
         NotCompilableError: Something in the filter has no form in C, such as an estimator.
     """
     folder, options = Path(directory), options or ExportOptions()
+    if not isinstance(safety_filter, SafetyFilter):
+        raise NotCompilableError(
+            f"a {type(safety_filter).__name__} has no form in C; export a SafetyFilter"
+        )
     _require_own(folder)
     safety_filter = safety_filter.by_constraint()
     interface, texts = exported(safety_filter, float32, options.name, options.units)

@@ -673,8 +673,7 @@ typedef struct {
     real margin[ROWS];
     bool violated[ROWS];        /* which take part in a step */
     signed char fixed[COLUMNS]; /* which inputs do not, not 0 */
-    bool barred_rows[ROWS];     /* once let go and stopped at once */
-    bool barred_inputs[COLUMNS];
+    bool barred[ROWS + COLUMNS]; /* constraints, and inputs, once let go and stopped at once */
 } slacks;
 
 /* Write the weighted margins; return the sum of squared slacks. */
@@ -738,7 +737,7 @@ static int release(const qp *p, slacks *s, const real *u)
         if (s->violated[i]) {
             const real pull = size_of(m, s->a + i * m) * s->margin[i];
             largest = larger(largest, ABS(pull));
-            if (!s->barred_rows[i] && pull > strongest) {
+            if (!s->barred[i] && pull > strongest) {
                 freed = i;
                 strongest = pull;
             }
@@ -751,7 +750,7 @@ static int release(const qp *p, slacks *s, const real *u)
     freed = -1;
     strongest = 0;
     for (int j = 0; j < m; j++) {
-        if (s->fixed[j] && !s->barred_inputs[j]) {
+        if (s->fixed[j] && !s->barred[k + j]) {
             real push = 0, terms = 0;
             for (int i = 0; i < k; i++) {
                 if (s->violated[i]) {
@@ -798,7 +797,6 @@ static void reduce_slacks(const qp *p, bool corner, real *u, signed char *hard)
             s.a[i * m + j] = unit * p->a[i * m + j] / size;
         }
         s.b[i] = size_of(m, p->a + i * m) > 0 ? unit * p->b[i] / size : 0;
-        s.barred_rows[i] = false;
     }
     (void)slack_margins(p, &s, u);
     for (int i = 0; i < k; i++) {
@@ -806,7 +804,9 @@ static void reduce_slacks(const qp *p, bool corner, real *u, signed char *hard)
     }
     for (int j = 0; j < m; j++) {
         s.fixed[j] = corner && (u[j] == p->low[j] || u[j] == p->high[j]);
-        s.barred_inputs[j] = false;
+    }
+    for (int c = 0; c < k + m; c++) {
+        s.barred[c] = false;
     }
     int freed = -1;
     bool done = false;
@@ -847,16 +847,14 @@ static void reduce_slacks(const qp *p, bool corner, real *u, signed char *hard)
             break; /* all constraints can be met */
         }
         if (length < 1) {
-            /* Let go and stopped at once: once is enough. */
-            const bool stopped = freed >= 0 && !(length > 0);
             for (int i = 0; i < k; i++) {
                 s.violated[i] = s.violated[i] || reach[i] <= length;
-                s.barred_rows[i] = (s.barred_rows[i] && !(length > 0))
-                    || (stopped && freed == i && s.violated[i]);
             }
-            for (int j = 0; j < m; j++) {
-                s.barred_inputs[j] = (s.barred_inputs[j] && !(length > 0))
-                    || (stopped && freed == k + j && s.fixed[j]);
+            if (freed >= 0 && !(length > 0)) { /* let go and stopped at once: once is enough */
+                s.barred[freed] = freed < k ? s.violated[freed] : s.fixed[freed - k] != 0;
+            }
+            for (int c = 0; length > 0 && c < k + m; c++) {
+                s.barred[c] = false;
             }
             freed = -1;
         } else {

@@ -71,6 +71,16 @@ def run_selftest(directory: Path, *flags: str, compiler: Sequence[str] = COMPILE
     return done.stdout
 
 
+def run_hostile(directory: Path, *flags: str, number: str = "double") -> None:
+    """Decide at tiny, huge and undefined numbers, and look at all actions."""
+    program, source = directory / "hostile", Path(__file__).with_name("hostile.c")
+    command = [*(COMPILER or ()), "-std=c99", *flags, f"-DNUMBER={number}", "-I."]
+    built = [*command, str(source), "filter.c", "-o", str(program), "-lm"]
+    subprocess.run(built, cwd=directory, check=True)
+    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (done.stdout + done.stderr)[:2000]
+
+
 def assert_equal(found: CComparison, error: float = 1e-11) -> None:
     """Flags are equal but where they hang on rounding, and actions but for rounding."""
     assert found.was_made
@@ -91,6 +101,7 @@ def test_what_a_filter_may_have(name: str, tmp_path: Path) -> None:
     assert found.without_effect > 0
     assert found.invalid > 0
     assert "0 differences" in run_selftest(tmp_path)
+    run_hostile(tmp_path, *SANITIZED)
 
 
 @NEEDS_COMPILER
@@ -186,6 +197,11 @@ def test_learned_filters(
     # A matrix product of NumPy adds in another order.
     assert_equal(compare(tmp_path, safety_filter, options, states=3000), error=1e-6)
     assert "0 differences" in run_selftest(tmp_path)
+
+
+def test_filters_of_other_kinds_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(NotCompilableError, match="DelayedFilter has no form in C"):
+        export_filter(DelayedFilter(cart(), 1, 0.01), tmp_path)  # pyright: ignore[reportArgumentType]
 
 
 def test_learned_terms_without_a_compiled_form_are_refused(tmp_path: Path) -> None:
@@ -347,6 +363,7 @@ def test_everything_that_a_filter_may_have(name: str, tmp_path: Path) -> None:
         export_filter(safety_filter, tmp_path, float32, options)
         for flags in (("-O0",), ("-O3",), SANITIZED):
             assert "0 differences" in run_selftest(tmp_path, *flags)
+        run_hostile(tmp_path, *SANITIZED, number="float" if float32 else "double")
         found = compare(tmp_path, safety_filter, options, states=20_000)
         assert found.out_of_bounds == 0
         unexplained = found.flags_different - found.flags_close
