@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 
 from safe_envs.errors import ConfigurationError, require_whole, shortened
-from safe_envs.export.c_files import Interface
-from safe_envs.export.export import ExportOptions, region_of, sources
+from safe_envs.export.export import ExportOptions, region_of
+from safe_envs.export.interface import Interface
+from safe_envs.export.program import OK, exported
 from safe_envs.export.reference import (
-    OK,
     Cases,
     Constraints,
     Decisions,
+    at_ends,
     decided,
     random_cases,
     rounded,
@@ -38,6 +39,7 @@ from safe_envs.filters.safety_filter import SafetyFilter
 _KNOWN = ("cc", "gcc", "clang")
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
 _SECONDS = 300
+_COMPILED = ("filter.h", "filter.c", "filter_core.c")
 
 
 def c_compiler() -> list[str] | None:
@@ -78,7 +80,7 @@ CLOSE = 1e-12
 CLOSE_SINGLE = 1e-5
 """The same in single precision."""
 
-_SHARE_SPOILT = 100
+_SHARE_SPECIAL = 100
 _SHARE_BOUNDED = 0.1
 _NOTHING = 1e-300
 _REAL_PARTS = ("action", "pursued", "barrier", "margin", "slack")
@@ -133,8 +135,9 @@ def compare(
 ) -> CComparison:
     """Build an exported filter, and hold it against the filter in Python at many states.
 
-    Among the states are some that are not finite, and some where a constraint says nothing of the
-    input. Code is compiled and run only if it is what the filter exports.
+    Among the states are some that are not finite or at the ends of the region, some where a
+    constraint says nothing of the input, and some with other input bounds. Code is compiled and run
+    only if it is what the filter exports.
 
     Args:
         directory: where `export_filter` has written its files.
@@ -154,12 +157,12 @@ def compare(
     if compiler is None:
         return CComparison("")
     cases = _cases(safety_filter, options, states, seed)
-    if interface.precision.is_single:
+    if interface.single:
         cases = rounded(cases)
     with tempfile.TemporaryDirectory() as folder:
         found, nanoseconds = _run(Path(folder), compiler, interface, texts, cases)
     wanted = decided(safety_filter, cases)
-    close = CLOSE_SINGLE if interface.precision.is_single else CLOSE
+    close = CLOSE_SINGLE if interface.single else CLOSE
     return _compared(
         Constraints(safety_filter), cases, wanted, found, close, " ".join(compiler), nanoseconds
     )
@@ -170,13 +173,13 @@ def _matching(
 ) -> tuple[Interface, dict[str, str]]:
     """Return the interface and the texts of a directory, if they are those of the filter."""
     try:
-        there = {name: read_bytes(directory / name) for name in ("filter.h", "filter.c")}
+        there = {name: read_bytes(directory / name) for name in _COMPILED}
     except OSError as error:
         raise ConfigurationError(
             f"{shortened(directory)} holds no exported filter: {error.strerror}; export it first"
         ) from error
     for float32 in (False, True):
-        interface, texts = sources(safety_filter, float32, options)
+        interface, texts = exported(safety_filter, float32, options.name, options.units)
         if all(texts[name].encode() == content for name, content in there.items()):
             return interface, texts
     raise ConfigurationError(
@@ -188,17 +191,19 @@ def _matching(
 def _cases(safety_filter: SafetyFilter, options: ExportOptions, states: int, seed: int) -> Cases:
     rng, region = np.random.default_rng(seed), region_of(safety_filter, options)
     flat = without_effect(safety_filter, region, rng).at(slice(0, max(1, states // 10)))
-    bad = spoilt(random_cases(safety_filter, region, max(1, states // _SHARE_SPOILT), rng), rng)
-    rest = max(1, states - len(flat.states) - len(bad.states))
+    few = max(1, states // _SHARE_SPECIAL)
+    bad = spoilt(random_cases(safety_filter, region, few, rng), rng)
+    ends = at_ends(random_cases(safety_filter, region, few, rng), region, rng)
+    rest = max(1, states - len(flat.states) - 2 * few)
     cases = random_cases(safety_filter, region, rest, rng)
     changed = np.flatnonzero(rng.random(rest) < _SHARE_BOUNDED)
     kept = np.setdiff1d(np.arange(rest), changed)
-    return flat + bad + cases.at(kept) + with_other_bounds(cases.at(changed), rng)
+    return flat + bad + ends + cases.at(kept) + with_other_bounds(cases.at(changed), rng)
 
 
 def _driver(interface: Interface) -> str:
     """Return a function that decides for a table of cases."""
-    name, macro, real = interface.name, interface.macro, interface.precision.type
+    name, macro, real = interface.name, interface.macro, interface.real
     return f"""#include "filter.h"
 
 #include <string.h>
@@ -239,7 +244,7 @@ def _run(
         (folder / name).write_text(text)
     library = folder / "filter.so"
     build_library(compiler, [folder / "filter.c", folder / "driver.c"], library)
-    kind = np.float32 if interface.precision.is_single else np.float64
+    kind = np.float32 if interface.single else np.float64
     with np.errstate(over="ignore"):
         rows = np.ascontiguousarray(cases.rows(), dtype=kind)
     count, k, m = len(rows), len(interface.constraints), len(interface.inputs)

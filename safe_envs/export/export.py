@@ -10,25 +10,13 @@ import sympy as sp
 
 from safe_envs.dynamics.symbols import declared_sign
 from safe_envs.errors import ConfigurationError, NotCompilableError, shortened, shown
-from safe_envs.export.c_expressions import DOUBLE, SINGLE
-from safe_envs.export.c_files import (
-    MARK,
-    Interface,
-    cmake_text,
-    filter_program,
-    header_text,
-    interface_of,
-    readme_text,
-    source_text,
-)
-from safe_envs.export.reference import Region, golden_cases, selftest_text
+from safe_envs.export.interface import Interface
+from safe_envs.export.program import MARK, exported, rendered
+from safe_envs.export.reference import Region, golden_cases
 from safe_envs.files import open_regular, write_atomically, writing
 from safe_envs.filters.safety_filter import SafetyFilter
 
-LARGEST_TABLE = 2**21
-"""Constants that an export may hold: 16 MB in double precision."""
-
-NAMES = ("filter.h", "filter.c", "selftest.c", "CMakeLists.txt", "README.md")
+NAMES = ("filter.h", "filter.c", "filter_core.c", "selftest.c", "CMakeLists.txt", "README.md")
 _SEEN = 200
 
 
@@ -55,7 +43,7 @@ def export_filter(
     float32: bool = False,
     options: ExportOptions | None = None,
 ) -> Interface:
-    """Write a filter as C99: filter.h, filter.c, selftest.c, CMakeLists.txt and README.md.
+    """Write a filter as C99: filter.h, filter.c, filter_core.c and what belongs to them.
 
     Args:
         safety_filter: the filter.
@@ -69,74 +57,25 @@ def export_filter(
     Raises:
         ConfigurationError: The directory holds files of these names that no export has written, or
             it cannot be written; or an option is not allowed.
-        NotCompilableError: Something in the filter has no form in C, such as a table of values.
+        NotCompilableError: Something in the filter has no form in C, such as an estimator.
     """
     folder, options = Path(directory), options or ExportOptions()
-    require_own(folder)
+    if not isinstance(safety_filter, SafetyFilter):
+        raise NotCompilableError(
+            f"a {type(safety_filter).__name__} has no form in C; export a SafetyFilter"
+        )
+    _require_own(folder)
     safety_filter = safety_filter.by_constraint()
-    interface, texts = sources(safety_filter, float32, options)
-    region = region_of(safety_filter, options)
-    golden = golden_cases(safety_filter, region, is_single=float32)
-    texts |= {
-        "selftest.c": selftest_text(interface, *golden),
-        "CMakeLists.txt": cmake_text(interface),
-        "README.md": readme_text(interface),
-    }
-    write_files(folder, texts)
-    return interface
-
-
-def write_files(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write the files of an export.
-
-    Args:
-        folder: where; it is created where its parent exists.
-        texts: by the names of `NAMES`.
-
-    Raises:
-        ConfigurationError: It cannot be written.
-    """
+    interface, texts = exported(safety_filter, float32, options.name, options.units)
+    golden = golden_cases(safety_filter, region_of(safety_filter, options), is_single=float32)
+    texts["selftest.c"] = rendered("selftest.c", interface, golden=golden)
+    texts |= {name: rendered(name, interface) for name in ("CMakeLists.txt", "README.md")}
     with writing(folder):
         folder.mkdir(exist_ok=True)
-    for name in NAMES:
-        content = texts[name].encode()
+    for name, text in texts.items():
+        content = text.encode()
         write_atomically(folder / name, lambda part, content=content: part.write_bytes(content))
-
-
-def sources(
-    safety_filter: SafetyFilter, float32: bool, options: ExportOptions
-) -> tuple[Interface, dict[str, str]]:
-    """Return the interface of a filter, and the texts of its header and its source.
-
-    Args:
-        safety_filter: the filter.
-        float32: whether the C computes in single precision.
-        options: names and units.
-
-    Raises:
-        ConfigurationError: The name is no name of C.
-        NotCompilableError: Something in the filter has no form in C.
-    """
-    if safety_filter.of_measurements:
-        raise NotCompilableError(
-            f"the filter has {safety_filter.of_measurements}: estimators and beliefs have no form"
-            " in C. Export it without, and give the C your estimate as its state; a bound of its"
-            " error is measurement_error=... of the condition"
-        )
-    program = filter_program(safety_filter)
-    size = len(program.data.array())
-    if size > LARGEST_TABLE:
-        raise ConfigurationError(
-            f"the filter has {size} constants, more than {LARGEST_TABLE}; export a smaller network"
-        )
-    precision = SINGLE if float32 else DOUBLE
-    interface = interface_of(
-        safety_filter, options.name, precision, options.units, program.source.work
-    )
-    return interface, {
-        "filter.h": header_text(interface),
-        "filter.c": source_text(interface, program),
-    }
+    return interface
 
 
 def region_of(safety_filter: SafetyFilter, options: ExportOptions) -> Region:
@@ -166,12 +105,16 @@ def _about(symbol: sp.Symbol, default: float | None) -> tuple[float, float]:
     if default:
         low, high = sorted((0.5 * default, 1.5 * default))
         return low, high
-    ends = {"positive": (0.1, 2.0), "nonnegative": (0.0, 2.0), "negative": (-2.0, -0.1)}
-    word = declared_sign(symbol) or ""
-    return ends.get(word, (-2.0, 0.0) if word == "nonpositive" else (-2.0, 2.0))
+    ends = {
+        "positive": (0.1, 2.0),
+        "nonnegative": (0.0, 2.0),
+        "negative": (-2.0, -0.1),
+        "nonpositive": (-2.0, 0.0),
+    }
+    return ends.get(declared_sign(symbol) or "", (-2.0, 2.0))
 
 
-def require_own(folder: Path) -> None:
+def _require_own(folder: Path) -> None:
     """Raise ConfigurationError where files would be overwritten that no export has written."""
     if folder.exists() and not folder.is_dir():
         raise ConfigurationError(f"{shortened(folder)} is a file; name a folder")

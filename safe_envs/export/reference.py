@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -10,14 +10,10 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import NumericalError
-from safe_envs.export.c_files import MARK, Interface
-from safe_envs.export.c_statements import wrapped
+from safe_envs.export.program import INVALID_BOUNDS, INVALID_INPUT, OK, UNDEFINED
 from safe_envs.filters.arguments import WIDEST
 from safe_envs.filters.safety_filter import SafetyFilter
 from safe_envs.problem.signals import TIME
-
-OK, INVALID_BOUNDS, INVALID_INPUT, UNDEFINED = range(4)
-"""Status codes; see `safe_envs.export.c_files.STATUSES`."""
 
 _PART = 4096
 
@@ -95,6 +91,11 @@ class Cases:
     def rows(self) -> np.ndarray:
         """Return all in one table, in the order of the struct of C."""
         return np.hstack([self.states, self.runtime, self.proposed, self.low, self.high])
+
+    def groups(self, row: int) -> list[np.ndarray]:
+        """Return the numbers of one case by the member of the struct of C; none is empty."""
+        parts = (getattr(self, f.name)[row] for f in fields(self))
+        return [part for part in parts if part.size]
 
     def at(self, rows: Any) -> Cases:
         """Return some of the cases."""
@@ -270,14 +271,14 @@ def without_effect(safety_filter: SafetyFilter, region: Region, rng: np.random.G
 
 
 def spoilt(cases: Cases, rng: np.random.Generator) -> Cases:
-    """Return cases with an entry of each state, or of each proposed input, that is not finite.
+    """Return cases with an entry of each state or proposed input that is not finite, or far away.
 
     Args:
         cases: any cases.
         rng: source of random numbers.
     """
     count, n = cases.states.shape
-    bad = np.array([np.nan, np.inf, -np.inf])[np.arange(count) % 3]
+    bad = np.resize([np.nan, np.inf, -np.inf, 1e3], count)
     states, proposed = cases.states.copy(), cases.proposed.copy()
     of_state = rng.random(count) < 0.7
     rows = np.flatnonzero(of_state)
@@ -287,10 +288,27 @@ def spoilt(cases: Cases, rng: np.random.Generator) -> Cases:
     return Cases(states, cases.runtime, proposed, cases.low, cases.high)
 
 
+def at_ends(cases: Cases, region: Region, rng: np.random.Generator) -> Cases:
+    """Return cases with most entries of states at ends of the region, and inputs at their bounds.
+
+    Args:
+        cases: any cases.
+        region: from which states and measured quantities are drawn.
+        rng: source of random numbers.
+    """
+    states, proposed = cases.states.copy(), cases.proposed.copy()
+    ends = np.array(region, dtype=float)[: states.shape[1]]
+    for values, low, high in ((states, *ends.T), (proposed, cases.low, cases.high)):
+        side = rng.random(values.shape)
+        chosen = np.where(side < 0.4, low, np.where(side > 0.6, high, values))
+        values[:] = np.where(np.abs(chosen) < WIDEST, chosen, values)
+    return Cases(states, cases.runtime, proposed, cases.low, cases.high)
+
+
 def golden_cases(
     safety_filter: SafetyFilter, region: Region, *, is_single: bool
-) -> tuple[Cases, Decisions]:
-    """Return a few cases of every sort, and what Python decides there.
+) -> list[tuple[list[np.ndarray], Decisions]]:
+    """Return a few cases of every sort, as groups of numbers, and what Python decides there.
 
     Sorts are told by flags, by the constraints that are active, and by inputs at their bounds.
     Where a small change of the state changes a flag, rounding could too: such cases are left out.
@@ -325,12 +343,12 @@ def golden_cases(
         if sorts[sort] <= _OF_A_SORT and len(sorts) <= 40:
             kept.append(int(i))
     flat = rounded(flat) if is_single else flat
-    chosen = cases.at(kept) + flat + spoilt(cases.at(slice(0, 6)), rng)
+    chosen = cases.at(kept) + flat + spoilt(cases.at(slice(0, 3)), rng)
     crossed = cases.at(slice(0, 1))
-    chosen += Cases(
-        crossed.states, crossed.runtime, crossed.proposed, crossed.high, crossed.low - 1.0
-    )
-    return chosen, decided(safety_filter, chosen)
+    low, high = crossed.high, crossed.low - 1.0
+    chosen += Cases(crossed.states, crossed.runtime, crossed.proposed, low, high)
+    found = decided(safety_filter, chosen)
+    return [(chosen.groups(i), found.at(i)) for i in range(len(found.status))]
 
 
 def rounded(cases: Cases) -> Cases:
@@ -338,115 +356,3 @@ def rounded(cases: Cases) -> Cases:
     parts = (cases.states, cases.runtime, cases.proposed, cases.low, cases.high)
     with np.errstate(over="ignore", invalid="ignore"):
         return Cases(*(part.astype(np.float32).astype(float) for part in parts))
-
-
-def selftest_text(interface: Interface, cases: Cases, decisions: Decisions) -> str:
-    """Return selftest.c.
-
-    Args:
-        interface: of the filter.
-        cases: what it is asked.
-        decisions: what it is to decide.
-    """
-    name, macro, real = interface.name, interface.macro, interface.precision.type
-    tolerance = 2e-3 if interface.precision.is_single else 1e-9
-    golden = "\n".join(_case(interface, cases, decisions, i) for i in range(len(decisions.status)))
-    checks = "\n".join(
-        f"""        failed += differs(i, "{q.name}", result.action.{q.name},
-            cases[i].action.{q.name}, half_width(c->high.{q.name} - c->low.{q.name}));"""
-        for q in interface.inputs
-    )
-    number = interface.precision.number
-    return wrapped(
-        f"""/* {MARK}: golden cases of the filter, decided by Python.
- *
- * The program prints what differs, and ends with 1 if anything does.
- */
-#include "filter.h"
-
-#include <math.h>
-#include <stddef.h>
-#include <stdio.h>
-
-/* By how much an action may differ, in half widths of the input bounds. */
-static const {real} tolerance = {number(tolerance)};
-
-typedef struct {{
-    {name}_input input;
-    {name}_inputs action;
-    bool active[{macro}_CONSTRAINTS];
-    bool feasible;
-    int cause;
-    {name}_status status;
-}} golden_case;
-
-static const golden_case cases[] = {{
-{golden}
-}};
-
-static {real} half_width({real} width)
-{{
-    return width > 0 ? {number(0.5)} * width : 1;
-}}
-
-/* Return whether a number differs from the golden one, and say so. */
-static int differs(size_t place, const char *what, {real} found, {real} golden, {real} scale)
-{{
-    const {real} error = found > golden ? found - golden : golden - found;
-    if (error <= tolerance * scale) {{
-        return 0;
-    }}
-    printf("case %lu: %s is %.17g, not %.17g\\n", (unsigned long)place, what, (double)found,
-        (double)golden);
-    return 1;
-}}
-
-/* Return whether a flag differs from the golden one, and say so. */
-static int flag_differs(size_t place, const char *what, int found, int golden)
-{{
-    if (found == golden) {{
-        return 0;
-    }}
-    printf("case %lu: %s is %d, not %d\\n", (unsigned long)place, what, found, golden);
-    return 1;
-}}
-
-int main(void)
-{{
-    const size_t count = sizeof(cases) / sizeof(cases[0]);
-    int failed = 0;
-    for (size_t i = 0; i < count; i++) {{
-        const {name}_input *c = &cases[i].input;
-        {name}_result result;
-        const {name}_status status = {name}_decide(c, &result);
-        failed += flag_differs(i, "status", (int)status, (int)cases[i].status);
-        failed += flag_differs(i, "feasible", result.feasible, cases[i].feasible);
-        failed += flag_differs(i, "cause", result.cause, cases[i].cause);
-        for (int k = 0; k < {macro}_CONSTRAINTS; k++) {{
-            failed += flag_differs(i, "active", result.active[k], cases[i].active[k]);
-        }}
-{checks}
-    }}
-    printf("%lu golden cases, %d differences\\n", (unsigned long)count, failed);
-    return failed ? 1 : 0;
-}}
-"""
-    )
-
-
-def _case(interface: Interface, cases: Cases, decisions: Decisions, i: int) -> str:
-    groups = [cases.states[i], *([cases.runtime[i]] if interface.runtime else [])]
-    groups += [cases.proposed[i], cases.low[i], cases.high[i]]
-    given = ", ".join(_braced(interface, group) for group in groups)
-    active = ", ".join("true" if a else "false" for a in decisions.active[i])
-    status = int(decisions.status[i])
-    return (
-        f"    {{{{{given}}}, {_braced(interface, decisions.action[i])}, {{{active}}},"
-        f" {'true' if decisions.feasible[i] else 'false'}, {int(decisions.cause[i])},"
-        f" ({interface.name}_status){status}}},"
-    )
-
-
-def _braced(interface: Interface, values: Iterable[float] | np.ndarray) -> str:
-    number = interface.precision.number
-    return "{" + ", ".join(number(float(v)) for v in values) + "}"

@@ -99,9 +99,7 @@ class QPValues:
         if i in qp.partial:
             self.expressions.append(sp.Add(*c.functions))
         self.expressions += c.uncertainty or ()
-        for each in c.alternatives:
-            # The level is not negative in the set that the function's own condition keeps.
-            self.expressions += [*each.coefficient, each.offset, sp.Min(*each.chain)]
+        self.expressions += functions_of(c)
         if c.change is not None:
             self.expressions += change_coefficients(qp, i)
         self.owners[i] += range(place, len(self.expressions))
@@ -457,6 +455,16 @@ def solved_as_cones(qp: FilterQP) -> bool:
 def domain_of(constraint: AffineConstraint) -> tuple[sp.Expr, ...]:
     """Return what is positive where a constraint's demand has a meaning."""
     return constraint.domain or (_beyond_rounding(constraint.chain[0]),)
+
+
+def functions_of(constraint: AffineConstraint) -> list[sp.Expr]:
+    """Return a, b and the level of each function of a barrier that is their maximum.
+
+    The level is not negative in the set that the function's own condition keeps.
+    """
+    return [
+        e for c in constraint.alternatives for e in (*c.coefficient, c.offset, sp.Min(*c.chain))
+    ]
 
 
 def _beyond_rounding(h: sp.Expr) -> sp.Expr:

@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.scripts.options import completion, early_checks, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env_at_state
-
-if TYPE_CHECKING:
-    from safe_envs.export.c_files import Interface
-    from safe_envs.export.comparison import CComparison
-    from safe_envs.export.export import ExportOptions
-    from safe_envs.export.promise_comparison import PromiseComparison
-    from safe_envs.filters.safety_filter import SafetyFilter
-    from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.values.promise_filter import PromiseSettings
 
 
 @with_env_at_state
@@ -37,7 +28,7 @@ def export(
             metavar="NAME",
             callback=early_checks.known_filter,
             autocompletion=completion.filters,
-            help="As for evaluate: hocbf:alpha=2,8, promise:p=0.99, ... By default the env's own.",
+            help="As for evaluate: hocbf:alpha=2,8, scbf, ... By default the env's own.",
         ),
     ] = None,
     knowledge: text_options.Knowledge = "model",
@@ -66,18 +57,20 @@ def export(
     seed: text_options.Seed = 0,
     json: Json = None,
 ) -> None:
-    """Write a filter as C99: filter.h, filter.c, a self-test, CMakeLists.txt and README.md.
+    """Write a filter as C99: header, source, core, a self-test, CMakeLists.txt and README.md.
 
-    The C needs <math.h> alone and allocates nothing. It has the operations of the filter in the
-    same order, so that flags are equal and actions differ by rounding. The README has the names,
-    units and order of what goes in and comes out. Files of the same names that no export has
-    written are not overwritten.
+    The C needs <math.h> alone and allocates nothing. It solves the same quadratic program as the
+    filter in Python: flags are equal where they do not hang on rounding, and actions differ by
+    rounding. The README has the names, units and order of what goes in and comes out. Files of the
+    same names that no export has written are not overwritten.
     """
-    from safe_envs.export.export import ExportOptions
+    from safe_envs.export.comparison import compare as compare_filter
+    from safe_envs.export.export import ExportOptions, export_filter
     from safe_envs.filters.conditions.syntax import names_backup, names_promise
+    from safe_envs.filters.conditions.text import parse_conditions
+    from safe_envs.filters.safety_filter import SafetyFilter
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.export import ExportAnswer, print_export
-    from safe_envs.values.promise_filter import PromiseSettings
 
     require_whole("states", states, 1)
     require_whole("seed", seed, 0)
@@ -87,71 +80,22 @@ def export(
     problem = make_problem(known, **arguments)
     units = {v.symbol.name: v.unit for v in (*problem.states, *problem.inputs)}
     options = ExportOptions(name, units, problem.sampling_domain.region)
-    tried = (states, seed) if compare else None
-    if names_backup(text):
+    if names_backup(text) or names_promise(text):
+        why = "it simulates plans" if names_backup(text) else "its tables are not exported for now"
         raise ConfigurationError(
-            f"the filter {text} has no form in C: it simulates plans. Export a condition, such as"
-            f" {problem.filter}, or the promise filter"
+            f"the filter {text} has no form in C: {why}. Export a condition, such as"
+            f" {problem.filter}"
         )
-    if names_promise(text):
-        settings = PromiseSettings.of_text(text)
-        settings.require_fit(problem, objective)
-        interface, found = _promise(problem, settings, knowledge, out, float32, options, tried)
-    else:
-        safety_filter = _conditions(problem, text or problem.filter, knowledge, objective)
-        interface, found = _closed_form(safety_filter, out, float32, options, tried)
+    conditions = parse_conditions(text or problem.filter, problem)
+    safety_filter = SafetyFilter.for_problem(problem, conditions, knowledge, objective)
+    interface = export_filter(safety_filter, out, float32, options)
+    found = None
+    if compare:
+        found = compare_filter(out, safety_filter, options, states=states, seed=seed)
     config = {"env_id": known, "options": arguments, "filter": text or problem.filter, "seed": seed}
     answer = ExportAnswer(title_of(known, arguments), config, str(out), interface, found)
     print_export(stdout(), answer)
     write_result(json, answer.document)
-
-
-def _conditions(problem: SafetyProblem, text: str, knowledge: str, objective: str) -> SafetyFilter:
-    from safe_envs.filters.conditions.text import parse_conditions
-    from safe_envs.filters.safety_filter import SafetyFilter
-
-    conditions = parse_conditions(text, problem)
-    return SafetyFilter.for_problem(problem, conditions, knowledge, objective)
-
-
-def _closed_form(
-    safety_filter: SafetyFilter,
-    out: Path,
-    float32: bool,
-    options: ExportOptions,
-    tried: tuple[int, int] | None,
-) -> tuple[Interface, CComparison | None]:
-    """Export conditions in closed form, and compare at a number of states with a seed."""
-    from safe_envs.export.comparison import compare
-    from safe_envs.export.export import export_filter
-
-    interface = export_filter(safety_filter, out, float32, options)
-    if tried is None:
-        return interface, None
-    return interface, compare(out, safety_filter, options, states=tried[0], seed=tried[1])
-
-
-def _promise(
-    problem: SafetyProblem,
-    settings: PromiseSettings,
-    knowledge: str,
-    out: Path,
-    float32: bool,
-    options: ExportOptions,
-    tried: tuple[int, int] | None,
-) -> tuple[Interface, PromiseComparison | None]:
-    """Export a promise filter, and compare at a number of states with a seed."""
-    from safe_envs.export.promise_comparison import compare_promise
-    from safe_envs.export.promise_export import export_promise
-    from safe_envs.values.promise_filter import promise_filter_for
-
-    with progress_bar("Computing the table") as tell:
-        promise_filter = promise_filter_for(problem, settings, knowledge, tell)
-    interface = export_promise(promise_filter, out, float32, options)
-    if tried is None:
-        return interface, None
-    found = compare_promise(out, promise_filter, options, states=tried[0], seed=tried[1])
-    return interface, found
 
 
 if __name__ == "__main__":

@@ -71,10 +71,20 @@ def run_selftest(directory: Path, *flags: str, compiler: Sequence[str] = COMPILE
     return done.stdout
 
 
+def run_hostile(directory: Path, *flags: str, number: str = "double") -> None:
+    """Decide at tiny, huge and undefined numbers, and look at all actions."""
+    program, source = directory / "hostile", Path(__file__).with_name("hostile.c")
+    command = [*(COMPILER or ()), "-std=c99", *flags, f"-DNUMBER={number}", "-I."]
+    built = [*command, str(source), "filter.c", "-o", str(program), "-lm"]
+    subprocess.run(built, cwd=directory, check=True)
+    done = subprocess.run([str(program)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, (done.stdout + done.stderr)[:2000]
+
+
 def assert_equal(found: CComparison, error: float = 1e-11) -> None:
-    """Flags are equal, and actions but for rounding."""
+    """Flags are equal but where they hang on rounding, and actions but for rounding."""
     assert found.was_made
-    assert found.flags_different == 0
+    assert found.flags_different == found.flags_close <= found.states // 500
     assert found.out_of_bounds == 0
     assert found.largest_error <= error
 
@@ -91,6 +101,7 @@ def test_what_a_filter_may_have(name: str, tmp_path: Path) -> None:
     assert found.without_effect > 0
     assert found.invalid > 0
     assert "0 differences" in run_selftest(tmp_path)
+    run_hostile(tmp_path, *SANITIZED)
 
 
 @NEEDS_COMPILER
@@ -188,6 +199,11 @@ def test_learned_filters(
     assert "0 differences" in run_selftest(tmp_path)
 
 
+def test_filters_of_other_kinds_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(NotCompilableError, match="DelayedFilter has no form in C"):
+        export_filter(DelayedFilter(cart(), 1, 0.01), tmp_path)  # pyright: ignore[reportArgumentType]
+
+
 def test_learned_terms_without_a_compiled_form_are_refused(tmp_path: Path) -> None:
     system = integrators(1)
     learned = Terms(system, 1, [1 + x**2, x])
@@ -214,8 +230,10 @@ PIECES = sp.Piecewise((x**2, x < 0), (sp.sqrt(1 + x), x < 1), (2, True))
 FORMULAS = {
     "remainders": sp.Mod(x, 2) + sp.Mod(3 * y, -1.5) + sp.frac(x * y),
     "steps": sp.floor(3 * x) - sp.ceiling(2 * y) / 3 + sp.sign(x - y) * x,
+    "conditions": sp.Piecewise((x, (x > 1) & (y > 0) | (x < y)), (y**2, sp.Ne(y, x)), (1, True)),
     "pieces": PIECES + sp.Max(x, y, -x) - sp.Min(x * y, 1) + sp.Heaviside(x),
-    "powers": x**9 + sp.cbrt(1 + x**2) + (1 + y**2) ** sp.Rational(-5, 2) + 2**y / 3,
+    "powers": x**9 + sp.cbrt(1 + x**2) + (1 + y**2) ** sp.Rational(-5, 2) + 2**y / 3 + x**-2,
+    "roots": 1 / sp.sqrt(1 + x**2) + sp.sqrt(2 + y) ** 3 - sp.log(3 + x, 2) + sp.coth(3 + y),
     "functions": sp.tanh(x) + sp.atan2(y, x) + sp.exp(-(y**2)) * sp.erf(x) + sp.log(2 + y**2),
     "signs": -(-x - (y - (x - 1))) / (2 - -sp.Abs(y)) - sp.Rational(1, 3) * x / 7,
 }
@@ -250,6 +268,7 @@ NOWHERE_FINITE = ControlAffineSDE((x,), (u,), [sp.log(x)], [1 / (x - 1)], [0])
 DOUBLE = ControlAffineSDE.from_rate((x, y), (u,), [y, u])
 ROOTS = [sp.sqrt(2 - x) - y, sp.log(4 - y)]
 UNDEFINED = {
+    "a cube root": (DOUBLE, [2 - sp.cbrt(y)], "cbf", None, "infeasible"),
     "a constraint": (NOWHERE_FINITE, [2 - x], CBF(1.0), None, "invalid"),
     "a barrier": (DOUBLE, ROOTS, ["rcbf", "cbf:alpha=2"], ((-3.0, 5.0), (-3.0, 6.0)), "infeasible"),
 }
@@ -269,13 +288,19 @@ def test_states_without_a_value(name: str, tmp_path: Path) -> None:
 
 
 @NEEDS_COMPILER
-def test_fast_math_is_refused_by_the_compiler(tmp_path: Path) -> None:
+def test_what_compilers_refuse_and_what_they_may_take(tmp_path: Path) -> None:
     assert COMPILER is not None
     export_filter(cart(), tmp_path)
-    command = [*COMPILER, "-std=c99", "-ffast-math", "-c", "filter.c", "-o", "filter.o"]
-    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert built.returncode != 0
-    assert "-ffast-math" in built.stderr
+
+    def compiled(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [*COMPILER, "-std=c99", *arguments, "-c", "-o", "filter.o"]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
+    quick = compiled("-ffast-math", "filter.c")
+    assert quick.returncode != 0
+    assert "-ffast-math" in quick.stderr
+    # Builds that take every file of a folder give it to the compiler, too.
+    assert compiled(*WARNINGS, "filter_core.c").returncode == 0
 
 
 def test_without_a_compiler_the_files_are_written(
@@ -285,7 +310,7 @@ def test_without_a_compiler_the_files_are_written(
     monkeypatch.delenv("CC", raising=False)
     export_filter(cart(), tmp_path / "new")
     assert {f.name for f in (tmp_path / "new").iterdir()} == {
-        *("filter.h", "filter.c", "selftest.c", "CMakeLists.txt", "README.md")
+        *("filter.h", "filter.c", "filter_core.c", "selftest.c", "CMakeLists.txt", "README.md")
     }
     assert not compare(tmp_path / "new", cart(), states=10).was_made
 
@@ -330,7 +355,7 @@ def test_the_compiler_of_the_environment(tmp_path: Path, monkeypatch: pytest.Mon
 
 @NEEDS_COMPILER
 @pytest.mark.oracle
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [name for name in CASES if "learned" not in name])
 def test_everything_that_a_filter_may_have(name: str, tmp_path: Path) -> None:
     safety_filter = case_of(name)[0]
     options = ExportOptions(region=((-2.5, 2.5),) * safety_filter.model.n)
@@ -338,9 +363,9 @@ def test_everything_that_a_filter_may_have(name: str, tmp_path: Path) -> None:
         export_filter(safety_filter, tmp_path, float32, options)
         for flags in (("-O0",), ("-O3",), SANITIZED):
             assert "0 differences" in run_selftest(tmp_path, *flags)
+        run_hostile(tmp_path, *SANITIZED, number="float" if float32 else "double")
         found = compare(tmp_path, safety_filter, options, states=20_000)
         assert found.out_of_bounds == 0
-        # The plane above an uncertainty has rounding of its own.
         unexplained = found.flags_different - found.flags_close
         assert unexplained <= (found.states // 1000 if float32 else 0)
         assert float32 or found.largest_error <= 1e-10
@@ -371,3 +396,18 @@ def test_a_million_states(
     for compiler in COMPILERS:
         for flags in (("-O0",), ("-O3",), SANITIZED):
             assert "0 differences" in run_selftest(tmp_path, *flags, compiler=compiler)
+
+
+@NEEDS_COMPILER
+def test_a_held_input_has_no_part_in_a_plane(tmp_path: Path) -> None:
+    # Rounding of two equal faces, over a width of 0, once gave a slope of 1e284.
+    safety_filter = case_of("planes above")[0]
+    options = ExportOptions(region=((-2.5, 2.5),) * 3)
+    export_filter(safety_filter, tmp_path, options=options)
+    assert_equal(compare(tmp_path, safety_filter, options, states=3000))
+    x, u = [-1.426, 1.23, -0.286], [-0.57, -0.79]
+    held = safety_filter.filter(x, u, input_bounds=[(-0.65, 0.42), (-0.64, -0.64)])
+    nearly = safety_filter.filter(x, u, input_bounds=[(-0.65, 0.42), (-0.64, -0.64 + 1e-9)])
+    assert held.feasible == nearly.feasible
+    np.testing.assert_allclose(held.action, nearly.action, atol=1e-6)
+    np.testing.assert_allclose(held.margin, nearly.margin, atol=1e-6)

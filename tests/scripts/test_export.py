@@ -41,3 +41,11 @@ def test_without_a_compiler_it_says_so(export, tmp_path, monkeypatch):
     assert "No comparison was made" in out
     assert "float theta;" in (tmp_path / "c" / "filter.h").read_text()
     assert "own_decide" in (tmp_path / "c" / "filter.c").read_text()
+
+
+@pytest.mark.parametrize("text", ["promise:p=0.9", "backup"])
+def test_filters_without_a_form_in_c_are_refused_in_one_line(export, text):
+    status, _, error = export("Scalar-v0 --filter", text, "--out", "c")
+    assert status == 2
+    assert f"the filter {text} has no form in C" in " ".join(error.split())
+    assert "Traceback" not in error

@@ -9,9 +9,8 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from safe_envs.export.c_files import Interface
 from safe_envs.export.comparison import CComparison
-from safe_envs.export.promise_comparison import PromiseComparison
+from safe_envs.export.interface import Interface
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table, print_whole
 from safe_envs.text import visible
@@ -33,7 +32,7 @@ class ExportAnswer:
     config: dict[str, Any]
     folder: str
     interface: Interface
-    comparison: CComparison | PromiseComparison | None
+    comparison: CComparison | None
 
     def document(self) -> dict[str, Any]:
         """Return all that was found, for JSON."""
@@ -48,7 +47,7 @@ class ExportAnswer:
             "name": self.interface.name,
             "filter": self.interface.title,
             "barriers": dict(zip(self.interface.barriers, self.interface.formulas, strict=True)),
-            "precision": self.interface.precision.type,
+            "precision": self.interface.real,
             **quantities,
             "constraints": list(self.interface.constraints),
             "comparison": dataclasses.asdict(self.comparison) if made and self.comparison else None,
@@ -68,7 +67,7 @@ def print_export(console: Console, answer: ExportAnswer) -> None:
     )
     say(
         console,
-        f"C99 in {interface.precision.type} precision is in {answer.folder}: {name}_decide takes"
+        f"C99 in {interface.real} precision is in {answer.folder}: {name}_decide takes"
         f" a state and a proposed input. README.md there has names, units and order, and says how"
         " to compile it.",
     )
@@ -83,14 +82,7 @@ def print_export(console: Console, answer: ExportAnswer) -> None:
         )
         return
     table = make_table("lr", f"built with {escape(found.compiler)}", "")
-    rows = _of_promise(found) if isinstance(found, PromiseComparison) else _of_conditions(found)
-    for what, number in rows:
-        table.add_row(what, number)
-    print_whole(console, table)
-
-
-def _of_conditions(found: CComparison) -> list[tuple[str, str]]:
-    return [
+    rows = [
         ("states", f"{found.states:,}"),
         ("  infeasible", f"{found.infeasible:,}"),
         ("  a constraint says nothing of the input", f"{found.without_effect:,}"),
@@ -103,19 +95,6 @@ def _of_conditions(found: CComparison) -> list[tuple[str, str]]:
         ("largest error of an action, of its size", f"{found.largest_relative_error:.2g}"),
         ("processor time of a call", f"{found.nanoseconds:,.0f} ns"),
     ]
-
-
-def _of_promise(found: PromiseComparison) -> list[tuple[str, str]]:
-    return [
-        ("single decisions", f"{found.states:,}"),
-        ("decisions in whole episodes", f"{found.steps:,}"),
-        ("  of both, where the proposed input is replaced", f"{found.replaced:,}"),
-        ("  where nothing is guaranteed", f"{found.infeasible:,}"),
-        ("refused: not finite", f"{found.invalid:,}"),
-        ("flags that differ", f"{found.flags_different:,}"),
-        ("actions outside their bounds", f"{found.out_of_bounds:,}"),
-        ("largest error of an action, in half-widths", f"{found.largest_error:.2g}"),
-        ("largest error of a probability", f"{found.largest_level_error:.2g}"),
-        ("  decisions beyond 1e-9, or 1e-12 of probabilities", f"{found.beyond:,}"),
-        ("processor time of a call", f"{found.nanoseconds:,.0f} ns"),
-    ]
+    for what, number in rows:
+        table.add_row(what, number)
+    print_whole(console, table)
