@@ -851,3 +851,18 @@ def decide_columns(numbers: Sequence[int]) -> int:
         for c in range(length):
             out[c * count + i] = answer[c]
     return code
+
+
+def decide_at(data: Floats, work: Floats, place: int) -> int:
+    """Decide on an input in a program that is executed as Python.
+
+    Args:
+        data: numbers of the program.
+        work: scratch array, which holds values and inputs, and receives the answer.
+        place: in the data, of the numbers of `decide_columns`, with places for addresses: of shape,
+            weights and bounds in the data, of all else in `work`.
+    """
+    places = [int(number) for number in data[place : place + 26]]
+    shape, weights, ends = (data[places[i] :] for i in (3, 4, 7))
+    values, u, out = (work[places[i] :] for i in (5, 6, 8))
+    return decide(shape, weights, values, u, ends, out, [work[at:] for at in places[11:]])

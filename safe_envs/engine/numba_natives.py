@@ -135,7 +135,7 @@ _IN_DATA = (3, 4, 7)
 
 @intrinsic
 def decide_at(_: Any, data: Any, work: Any, place: Any) -> Any:
-    """See `plain_natives`."""
+    """See `safe_envs.engine.decide`."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         whole = ir.IntType(64)

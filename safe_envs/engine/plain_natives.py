@@ -87,20 +87,3 @@ def table_view(array: np.ndarray, first: int, rows: int, columns: int) -> np.nda
 def floats_at(address: int) -> Any:
     """Return the numbers from an address of memory on, in machine code alone."""
     raise NotImplementedError
-
-
-def decide_at(data: np.ndarray, work: np.ndarray, place: int) -> int:
-    """Decide on an input; see `safe_envs.engine.decide`.
-
-    Args:
-        data: numbers of the program.
-        work: scratch array, which holds values and inputs, and receives the answer.
-        place: in the data, of the numbers of `decide_columns`, with places for addresses: of shape,
-            weights and bounds in the data, of all else in `work`.
-    """
-    from safe_envs.engine.decide import decide
-
-    places = [int(number) for number in data[place : place + 26]]
-    shape, weights, ends = (data[places[i] :] for i in (3, 4, 7))
-    values, u, out = (work[places[i] :] for i in (5, 6, 8))
-    return decide(shape, weights, values, u, ends, out, [work[at:] for at in places[11:]])

@@ -21,6 +21,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from safe_envs.engine import plain_natives, slots
+from safe_envs.engine.decide import decide_at, decide_columns
 from safe_envs.engine.formulas import Source
 from safe_envs.errors import (
     ConfigurationError,
@@ -247,7 +248,8 @@ class Program:
 
     def plain(self) -> Functions:
         """Return the entry points as plain Python functions, which are slow."""
-        names: dict[str, Any] = {**vars(plain_natives), "entry": _unchanged, "kernel": _unchanged}
+        marks = {"entry": _unchanged, "kernel": _unchanged}
+        names: dict[str, Any] = {**vars(plain_natives), **marks, "decide_at": decide_at}
         exec(self.text, names)
         return {name: names[name] for name in self._names}
 
@@ -334,8 +336,6 @@ def _decider() -> Callable[[int], int] | None:
 @lru_cache(maxsize=1)
 def _decide_text() -> tuple[str, str]:
     """Return the text of `decide_columns`, and the name of its folder."""
-    from safe_envs.engine.decide import decide_columns
-
     text = linked([decide_columns], Source(""), ("c_entry", "part"))
     stamp = Path(__file__).with_name("numba_natives.py").read_text() + text
     return text, hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]

@@ -35,9 +35,9 @@ Bounds = tuple[Sequence[Any], Sequence[Any]]
 _Answer = tuple[int, Sequence[float]]
 
 _FEW = 20_000
-"""Decisions of a filter from which on machine code is read from disk, which takes a second."""
+"""FilterQPSolver of a filter from which on machine code is read from disk, which takes a second."""
 _MANY = 2_000_000
-"""Decisions from which on it is compiled: they have taken some ten seconds."""
+"""FilterQPSolver from which on it is compiled: they have taken some ten seconds."""
 
 
 class QPValues:
@@ -108,7 +108,7 @@ class QPValues:
         return [len(domain), *map(int, flags), len(c.alternatives), qp.owner_of_each[i]]
 
 
-class Decisions:
+class FilterQPSolver:
     """Decides for states given component by component, as floats or as arrays of a batch.
 
     Args:

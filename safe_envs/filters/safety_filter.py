@@ -37,7 +37,7 @@ from safe_envs.filters.conditions.estimates import (
     with_belief_signals,
 )
 from safe_envs.filters.conditions.text import Conditions, spec_of
-from safe_envs.filters.decisions import Bounds, Decisions
+from safe_envs.filters.decisions import Bounds, FilterQPSolver
 from safe_envs.filters.estimation.estimator import Estimator
 from safe_envs.filters.estimation.registry import make_estimator
 from safe_envs.filters.measurement_filter import MeasurementFilter, certain_states
@@ -356,7 +356,7 @@ class SafetyFilter:
     def _solve_by(self, qp: FilterQP, names: Sequence[str]) -> None:
         """Solve a QP; the barriers' names are for messages."""
         self.qp, self._names = qp, names
-        self._decisions = Decisions(qp, self._solver)
+        self._decisions = FilterQPSolver(qp, self._solver)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)

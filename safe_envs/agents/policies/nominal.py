@@ -18,7 +18,7 @@ from safe_envs.engine.slots import Data
 from safe_envs.envs.spaces import center_and_half_width, observation_names
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.filters.decision_source import filter_source
-from safe_envs.filters.decisions import Decisions
+from safe_envs.filters.decisions import FilterQPSolver
 from safe_envs.filters.qp import FilterQP, UndefinedConstraintError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.measurement import require_full_state
@@ -194,7 +194,7 @@ class CLFController(StatelessPolicy):
             [pair[1] for pair in problem.input_bounds],
         )
         qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
-        self._qp, self._decisions = qp, Decisions(qp)
+        self._qp, self._decisions = qp, FilterQPSolver(qp)
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Solve the QP; see `StatelessPolicy.actions`.
