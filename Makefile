@@ -39,7 +39,7 @@ mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py
 
 golden: $(READY)
-	$(BIN)/python tests/golden/run.py
+	$(BIN)/python -m pytest -n 2 -m oracle tests/golden $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -1,16 +1,11 @@
-#!/usr/bin/env python3
-"""Compare what the commands and envs compute with stored rows: `python tests/golden/run.py
-[--write] [NAME ...]`.
+"""What the commands and envs compute, beside stored rows.
 
-For a change that is to alter names and structure only. Each case is a file in `rows`, with what its
-command lines wrote by --json, less times, versions, checksums and paths. Whole numbers and texts
-are compared exactly, floats to a relative 1e-9. Exit status: 0 where all is as stored, 1 where
-something differs, 2 where no case has a name that was given.
+Each case is a file in `rows`, with what its command lines wrote by --json, less times, versions,
+checksums and paths. Whole numbers and texts are compared exactly, floats to a relative 1e-9.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import json
@@ -18,36 +13,27 @@ import math
 import os
 import sys
 import tempfile
-import time
 import traceback
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import numpy as np
+from PIL import Image
+
+from safe_envs.scripts.cli import main as safe_envs_main
+from tests.golden.cases import SYSTEMS, cases
+from tests.golden.environments import rows
+from thesis.__main__ import main as thesis_main
+
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))  # This checkout, wherever the installed one is.
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
-import numpy as np  # noqa: E402
-from PIL import Image  # noqa: E402
-
-from safe_envs.files import own_cache  # noqa: E402
-from safe_envs.scripts.cli import main as safe_envs_main  # noqa: E402
-from tests.golden.cases import SYSTEMS, cases  # noqa: E402
-from tests.golden.environments import rows  # noqa: E402
-from thesis.__main__ import main as thesis_main  # noqa: E402
-
 ROWS = Path(__file__).parent / "rows"
 _TOLERANCE = 1e-9
 _LONGEST = 24
 """Numbers of an array that are stored; of a longer one its ends and sums are."""
 
-_SHOWN = 8
 _LEFT_OUT = (
     "versions",
     "timing",
@@ -227,69 +213,12 @@ def compared(name: str, found: Any) -> list[str]:
     if "error" in found:
         return [f"broke\n{found['error']}"]
     if not file.is_file():
-        return ["nothing is stored; write it with --write"]
+        return ["nothing is stored; `make golden ARGS=--write` stores it"]
     return list(differences(json.loads(file.read_text()), json.loads(json.dumps(found))))
 
 
-def _report(name: str, found: Any, write: bool) -> int:
-    """Store what a case found, or print how it differs from what is stored; return how many
-    differences there are."""
-    if write and "error" not in found:
-        file = ROWS / f"{name}.json"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text_of(found) + "\n")
-        return 0
-    different = compared(name, found)
-    for line in different[:_SHOWN]:
-        print(f"{name}: {line}")
-    if len(different) > _SHOWN:
-        print(f"{name}: and {len(different) - _SHOWN} more")
-    return len(different)
-
-
-def _timed(name: str) -> tuple[Any, float]:
-    began = time.process_time()
-    return compute(name), time.process_time() - began
-
-
-def main() -> int:
-    """Run what the command line names; return the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "names",
-        nargs="*",
-        help="parts of names of cases, such as evaluate/ or Scalar; all by default",
-    )
-    parser.add_argument("--write", action="store_true", help="store what is found")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument(
-        "--times", action="store_true", help="print the processor time of each case"
-    )
-    given = parser.parse_args()
-    chosen = [
-        name for name in names() if not given.names or any(part in name for part in given.names)
-    ]
-    if not chosen:
-        print(f"no case has a name with {' or '.join(given.names)}")
-        return 2
-    wrong = 0
-    with (
-        own_cache(),  # Tables that the user has would be read.
-        ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn"))
-        if given.jobs > 1
-        else contextlib.nullcontext() as pool,
-    ):
-        answers = pool.map(_timed, chosen) if pool else map(_timed, chosen)
-        for name, (found, seconds) in zip(chosen, answers, strict=True):
-            wrong += bool(_report(name, found, given.write))
-            if given.times:
-                print(f"{seconds:6.2f} s  {name}", flush=True)
-    done, failed = ("stored", "broke") if given.write else ("compared", "differ")
-    print(f"{len(chosen)} cases {done}, {wrong} {failed}")
-    return int(wrong > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def store(name: str, found: Any) -> None:
+    """Store what a case found."""
+    file = ROWS / f"{name}.json"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text_of(found) + "\n")
