@@ -38,7 +38,7 @@ PANELS: dict[str, str] = {
         "n-timesteps set action intervention-penalty promise-curriculum curriculum-part cost-limit"
         " violation-limit eval-freq eval-episodes resume"
     ),
-    "Tables and proofs": "best closed-loop bounds leaving cells inputs table spec check prices",
+    "Tables and proofs": "best closed-loop bounds leaving cells inputs table spec check",
     "Statistics": (
         "episodes seed seeds repeats confidence refine monitoring rare particles"
         " repetitions simulate states"
