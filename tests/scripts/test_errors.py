@@ -122,8 +122,7 @@ check changed.json | sha256
 check psi.json --state 0 | 2
 check psi.json --seconds 0 | seconds = 0
 check psi.json --json psi.json | would overwrite
-export Scalar-v0 --filter promise:p=0.9 --horizon 0.1 --out c --float32 | double precision
-export Scalar-v0 --filter promise:p=0.9 --horizon 0.1 --out c --objective clf | objective
+export Scalar-v0 --filter promise:p=0.9 --horizon 0.1 --out c | promise:p=0.9
 export Pendulum-v0 --filter scbf --out c --name 'a b' | a b
 export Pendulum-v0 --out no/such/c | no/such
 export DubinsDisk-v0 --filter backup --out c | simulates plans
