@@ -160,8 +160,8 @@ class _Printer(C99CodePrinter):
     def _print_Symbol(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
         return self._names[expr.name]
 
-    def _print_Float(self, expr: Any) -> str:  # noqa: N802
-        return c_number(float(expr), self._single)
+    def _print_Float(self, flt: Any) -> str:  # noqa: N802
+        return c_number(float(flt), self._single)
 
     def _print_Integer(self, expr: Any) -> str:  # noqa: N802
         return str(expr) if abs(expr) < _LARGE else self._print_Float(expr)
@@ -170,7 +170,9 @@ class _Printer(C99CodePrinter):
         return f"{c_number(expr.p, self._single)}/{c_number(expr.q, self._single)}"
 
     _print_Pi = _print_Exp1 = _print_NumberSymbol = _print_Float  # noqa: N815
-    _print_NaN = _print_Infinity = _print_NegativeInfinity = _print_Float  # noqa: N815
+    _print_NaN: Any = _print_Float  # noqa: N815
+    _print_Infinity: Any = _print_Float  # noqa: N815
+    _print_NegativeInfinity: Any = _print_Float  # noqa: N815
 
     def _print_Pow(self, expr: Any) -> str:  # noqa: N802
         suffix = "f" if self._single else ""
@@ -202,5 +204,5 @@ class _Printer(C99CodePrinter):
     def _print_Mod(self, expr: Any) -> str:  # noqa: N802
         return self._nested("modulo", expr)
 
-    def _print_sign(self, e: Any) -> str:
-        return f"sign({self._print(e.args[0])})"
+    def _print_sign(self, func: Any) -> str:
+        return f"sign({self._print(func.args[0])})"

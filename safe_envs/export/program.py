@@ -215,7 +215,7 @@ def _end(value: float) -> float:
     return math.copysign(math.inf, value) if abs(value) >= WIDEST else value
 
 
-def _expressions(safety_filter: SafetyFilter) -> dict[str, list[sp.Expr]]:
+def _expressions(safety_filter: SafetyFilter) -> dict[str, list[Any]]:
     """Return the formulas of a filter by the function that computes them, in the core's order."""
     qp = safety_filter.qp
     constraints = qp.constraints
