@@ -169,10 +169,9 @@ class _Printer(C99CodePrinter):
     def _print_Rational(self, expr: Any) -> str:  # noqa: N802
         return f"{c_number(expr.p, self._single)}/{c_number(expr.q, self._single)}"
 
-    _print_Pi = _print_Exp1 = _print_NumberSymbol = _print_Float  # noqa: N815
-    _print_NaN: Any = _print_Float  # noqa: N815
-    _print_Infinity: Any = _print_Float  # noqa: N815
-    _print_NegativeInfinity: Any = _print_Float  # noqa: N815
+    _constant: Any = _print_Float
+    _print_Pi = _print_Exp1 = _print_NumberSymbol = _constant  # noqa: N815
+    _print_NaN = _print_Infinity = _print_NegativeInfinity = _constant  # noqa: N815
 
     def _print_Pow(self, expr: Any) -> str:  # noqa: N802
         suffix = "f" if self._single else ""

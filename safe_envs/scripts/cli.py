@@ -94,7 +94,7 @@ COMMANDS = tuple(
             "export",
             _SHOW,
             "export:export",
-            "Write a filter as C99: header, source, core, a self-test, CMakeLists.txt and README.md.",
+            "Write a filter as C99: header, source, core, self-test, CMakeLists.txt and README.md.",
         ),
         (
             "render",

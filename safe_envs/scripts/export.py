@@ -57,7 +57,7 @@ def export(
     seed: text_options.Seed = 0,
     json: Json = None,
 ) -> None:
-    """Write a filter as C99: header, source, core, a self-test, CMakeLists.txt and README.md.
+    """Write a filter as C99: header, source, core, self-test, CMakeLists.txt and README.md.
 
     The C needs <math.h> alone and allocates nothing. It solves the same quadratic program as the
     filter in Python: flags are equal where they do not hang on rounding, and actions differ by
