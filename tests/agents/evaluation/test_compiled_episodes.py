@@ -43,19 +43,6 @@ def assert_columns_alike(found, expected, relative=1e-9):
             assert (found[name] == column).all(), name
 
 
-def assert_alike(found, expected, relative=1e-9):
-    """Batches of both engines are alike, and the states of them that are kept."""
-
-    def columns(batches):
-        results, visited = batches[0].results, batches[0].visited
-        for batch in batches[1:]:
-            visited = visited.joined(batch.visited)
-        results = type(results).joined([batch.results for batch in batches])
-        return vars(results) | vars(visited)
-
-    assert_columns_alike(columns(found), columns(expected), relative)
-
-
 def both(problem, name, policy, relative=1e-9, **given):
     """Return the columns, states and row of NumPy's evaluation, which are those of the other."""
     given = {"episodes": 8, "seed": 3, "num_envs": 8, "bounds": False, "jobs": 1, **given}
