@@ -304,7 +304,7 @@ SWITCH = "SAFE_ENVS_COMPILE"
 """Environment variable; 0 has the decisions of filters interpreted."""
 
 
-class Decider(NamedTuple):
+class MachineCode(NamedTuple):
     """`safe_envs.engine.decide.decide_columns` in machine code, a function of an address.
 
     Attributes:
@@ -316,7 +316,7 @@ class Decider(NamedTuple):
     many: Callable[[int], int]
 
 
-def decider(compiling: bool = True) -> Decider | None:
+def decider(compiling: bool = True) -> MachineCode | None:
     """Return what decides in machine code, which is compiled once for each machine and version.
 
     Args:
@@ -331,14 +331,14 @@ def decider(compiling: bool = True) -> Decider | None:
 
 
 @lru_cache(maxsize=1)
-def _decider() -> Decider | None:
+def _decider() -> MachineCode | None:
     try:
         address = register_decide()
     except NotCompilableError as error:
         _LOG.warning("filters decide in plain Python, which is slow: %s", error)
         return None
     kinds = (ctypes.PYFUNCTYPE, ctypes.CFUNCTYPE)
-    return Decider(*[kind(ctypes.c_int64, ctypes.c_void_p)(address) for kind in kinds])
+    return MachineCode(*[kind(ctypes.c_int64, ctypes.c_void_p)(address) for kind in kinds])
 
 
 @lru_cache(maxsize=1)

@@ -22,7 +22,7 @@ from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.engine import decide as text
 from safe_envs.engine.decide import answer_length, decide, scratch_lengths, shape_of
-from safe_envs.engine.program import Decider, decider
+from safe_envs.engine.program import MachineCode, decider
 from safe_envs.engine.qp import ROUNDING
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
@@ -141,12 +141,12 @@ class Decisions:
 
     def _fresh(self) -> None:
         # A copy counts for itself, since it may be in another process.
-        self._run: Decider | None = None
+        self._run: MachineCode | None = None
         self._made = 0
         self._frames: list[Any] = []
         self._machine_frames: list[CallFrame] = []
 
-    def _count(self, decisions: int) -> Decider | None:
+    def _count(self, decisions: int) -> MachineCode | None:
         """Count decisions; return what makes them in machine code, if it is due."""
         if self._run is None and self._solver is None:
             before, self._made = self._made, self._made + decisions
@@ -416,7 +416,7 @@ class CallFrame:
 
     def decide(
         self,
-        run: Decider,
+        run: MachineCode,
         values: Sequence[float],
         u: Sequence[float],
         ends: Sequence[float] | None,
@@ -433,7 +433,7 @@ class CallFrame:
 
     def decide_all(
         self,
-        run: Decider,
+        run: MachineCode,
         values: np.ndarray,
         inputs: np.ndarray,
         ends: np.ndarray | None,

@@ -63,9 +63,12 @@ def solve_with(
     a, b = rows[:, :m], rows[:, m]
     low, high = np.array(ends[:m]), np.array(ends[m:])
     near = np.array(weights[:m]), np.array(proposed)
+
+    def met_at(u: np.ndarray) -> bool:
+        return bool((a @ u + b >= -TOLERANCE * (abs(a) @ abs(u) + abs(b))).all())
+
     u = _solve(solver, *near, -a, b, low, high)
-    feasible = u is not None and bool((a @ u + b >= -TOLERANCE * (abs(a) @ abs(u) + abs(b))).all())
-    if not feasible:
+    if u is None or not met_at(u):
         # With the slacks as inputs of their own, which bounds of the constraints allow.
         both, nothing = np.concatenate([np.zeros(m), weights[m:]]), np.zeros(m + k)
         wide = [np.concatenate(part) for part in ((low, np.zeros(k)), (high, np.full(k, np.inf)))]
@@ -79,8 +82,9 @@ def solve_with(
         slack = np.maximum(least[m:], 0.0) + TOLERANCE * terms
         closest = _solve(solver, *near, -a, b + slack, low, high)
         u = least[:m] if closest is None else closest
-    assert u is not None
-    return np.clip(u, low, high).tolist(), feasible
+    u = np.clip(u, low, high)
+    # A solver may find no answer at first, and yet there is one without slacks.
+    return u.tolist(), met_at(u)
 
 
 def _solve(solver: str, w: Any, v: Any, g: Any, h: Any, low: Any, high: Any) -> np.ndarray | None:
