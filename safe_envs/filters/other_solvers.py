@@ -68,7 +68,8 @@ def solve_with(
         return bool((a @ u + b >= -TOLERANCE * (abs(a) @ abs(u) + abs(b))).all())
 
     u = _solve(solver, *near, -a, b, low, high)
-    if u is None or not met_at(u):
+    feasible = u is not None and met_at(u)
+    if not feasible:
         # With the slacks as inputs of their own, which bounds of the constraints allow.
         both, nothing = np.concatenate([np.zeros(m), weights[m:]]), np.zeros(m + k)
         wide = [np.concatenate(part) for part in ((low, np.zeros(k)), (high, np.full(k, np.inf)))]
@@ -82,9 +83,10 @@ def solve_with(
         slack = np.maximum(least[m:], 0.0) + TOLERANCE * terms
         closest = _solve(solver, *near, -a, b + slack, low, high)
         u = least[:m] if closest is None else closest
-    u = np.clip(u, low, high)
-    # A solver may find no answer at first, and yet there is one without slacks.
-    return u.tolist(), met_at(u)
+        # A solver may find no answer at first, and yet there is one without slacks.
+        feasible = met_at(np.clip(least[:m], low, high))
+    assert u is not None
+    return np.clip(u, low, high).tolist(), feasible
 
 
 def _solve(solver: str, w: Any, v: Any, g: Any, h: Any, low: Any, high: Any) -> np.ndarray | None:
