@@ -399,7 +399,8 @@ def _load_decide() -> None:
             _LOG.warning(f"{once}, once for this machine", title)
         try:
             _KeptProgram(folder / digest, text, title)
-            make_room()
+            if not is_kept:
+                make_room()
             return
         except (OSError, ConfigurationError):  # The disk may be full.
             break
