@@ -402,11 +402,9 @@ def _load_decide() -> None:
             if not is_kept:
                 make_room()
             return
-        except (OSError, ConfigurationError):  # The disk may be full.
-            break
-        except Exception:
-            if not is_kept:
-                raise
+        except Exception as error:
+            if not is_kept or isinstance(error, OSError | ConfigurationError):
+                break  # The disk may be full.
             # Kernels raise nothing: what is kept cannot be read.
             for place in _places_of_decide():
                 shutil.rmtree(place, ignore_errors=True)

@@ -151,7 +151,8 @@ def test_what_counts_of_the_text_is_noticed(monkeypatch) -> None:
 
 # In a process of its own: it replaces the decisions of the process by others that compile fast.
 _CACHES = """
-import ctypes, logging, os, pathlib, shutil
+import logging, os, pathlib
+from concurrent.futures import ThreadPoolExecutor
 from safe_envs.engine import program
 from safe_envs.errors import ConfigurationError
 
@@ -196,6 +197,12 @@ for ending in ("nbi", "nbc"):
     value, words = result("7")
     assert value == (7, 7) and len(words) == 1, (ending, words)
     assert result("7") == ((7, 7), [])
+
+for each in (program.register_decide, program._decider):
+    each.cache_clear()
+program._decide_text = lambda: (TEXT.replace("ANSWER", "6"), "6" * 32)
+with ThreadPoolExecutor(4) as pool:
+    assert [*pool.map(lambda _: program.decider().one(None), range(4))] == [6] * 4
 
 
 def full(*_):
