@@ -129,10 +129,13 @@ def shape_of(
     return [*map(float, head), *columns]
 
 
-def scratch_lengths(k: int, m: int, goal: int, sampled: int) -> tuple[int, ...]:
+def scratch_lengths(shape: Sequence[float]) -> tuple[int, ...]:
     """Return the lengths of the scratch arrays of `decide`, as it names them."""
+    k, m, goal, sampled = (int(shape[i]) for i in (K, M, GOAL, SAMPLED))
     n, count, width = k + goal, k + sampled, 1 + m + (m * (m + 1) >> 1)
-    search = sampled > 0
+    search, size = sampled > 0, scratch_size(max(n, count), m + goal)
+    if any(shape[COUNTS + IS_UNCERTAIN * k : COUNTS + IS_PARTIAL * k]):
+        size = max(size, 1 << m)  # the corners of the bounds
     return (
         m,  # want
         k * m + k,  # own
@@ -142,7 +145,7 @@ def scratch_lengths(k: int, m: int, goal: int, sampled: int) -> tuple[int, ...]:
         2 * m + 2,  # wide
         n * (m + goal) + n,  # rows
         m + 1 + 2 * n,  # result
-        max(scratch_size(max(n, count), m + goal), (1 << m) + m),  # work
+        size,  # work
         count * width if search else 0,  # held
         count * m + count if search else 0,  # tangent
         m + count if search else 0,  # priorities
@@ -188,7 +191,7 @@ def decide(
     want, own, aim, flags, forms, wide, rows, result, work = scratch[:9]
     total = 0.0
     for j in range(m):
-        total += u[j]
+        total += 0.0 * u[j]  # which does not overflow
     if not isfinite(total):
         return UNDEFINED
     if shape[KIND] == PLAIN:

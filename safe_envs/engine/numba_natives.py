@@ -11,7 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 from llvmlite import ir
-from llvmlite.binding import add_symbol as add_symbol
+from llvmlite.binding import add_symbol, address_of_symbol
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
@@ -37,14 +37,37 @@ _UNWRAPPED: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": Tr
 kernel = numba.njit(**_SETTINGS, **_UNWRAPPED, forceinline=True)
 entry = numba.njit(**_SETTINGS, cache=True)
 passing_entry = numba.njit(**_SETTINGS)
-_WHOLE_NUMBERS = numba.types.CPointer(numba.types.int64)
+_FLOATS = numba.types.CPointer(numba.types.float64)
+_WHOLE = numba.types.int64
+_SIGNATURES = {
+    "decide_columns": _WHOLE(numba.types.CPointer(_WHOLE)),
+    "project_rows": _WHOLE(_WHOLE, _WHOLE, *[_FLOATS] * 6),
+}
+_KEPT: list[Any] = []
+"""What must live as long as its address is used."""
+
+
+def address_of(name: str) -> int:
+    """Return the address of a function that `c_entry` has compiled."""
+    return address_of_symbol(symbol_of(name))
+
+
+def symbol_of(name: str) -> str:
+    """Return by which name C and other programs call an entry."""
+    return f"safe_envs_{name}"
 
 
 def c_entry(function: Any) -> Any:
-    """Compile a function of addresses, which C calls and Numba keeps beside its file."""
-    is_kept = os.path.isfile(function.__code__.co_filename)
-    signature = numba.types.int64(_WHOLE_NUMBERS)
-    return numba.cfunc(signature, cache=is_kept, error_model="numpy")(function)
+    """Compile a function that C calls, and keep it beside its file.
+
+    Others call it without a copy of it, each of which would be compiled again with its caller.
+    """
+    is_kept, name = os.path.isfile(function.__code__.co_filename), function.__name__
+    signature = _SIGNATURES[name]
+    found = numba.cfunc(signature, cache=is_kept, error_model="numpy")(function)
+    add_symbol(symbol_of(name), found.address)
+    _KEPT.append(found)
+    return numba.types.ExternalFunction(symbol_of(name), signature)
 
 
 def part(function: Any) -> Any:
@@ -152,7 +175,8 @@ def decide_at(_: Any, data: Any, work: Any, place: Any) -> Any:
                 number = builder.ptrtoint(builder.gep(base, [number]), whole)
             builder.store(number, builder.gep(numbers, [ir.Constant(whole, i)]))
         kind = ir.FunctionType(whole, [whole.as_pointer()])
-        function = cgutils.get_or_insert_function(builder.module, kind, "safe_envs_decide_columns")
+        name = symbol_of("decide_columns")
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
         return builder.call(function, [numbers])
 
     number = numba.types.int64

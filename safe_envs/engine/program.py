@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 from safe_envs.engine import plain_natives, slots
 from safe_envs.engine.decide import decide_at, decide_columns
 from safe_envs.engine.formulas import Source
+from safe_envs.engine.qp import project_rows
 from safe_envs.errors import (
     ConfigurationError,
     NotCompilableError,
@@ -30,6 +31,7 @@ from safe_envs.errors import (
     shortened,
 )
 from safe_envs.files import cache_folder, make_room, mark_used, write_atomically
+from safe_envs.lazy_attributes import package_version
 
 _MATH_FUNCTIONS = {name for name, value in vars(math).items() if not name.startswith("_")}
 
@@ -97,7 +99,7 @@ def linked(
     link = _Link(generated)
     for function in (*entries, *generated.uses):
         link.need(function.__module__, function.__name__)
-    return link.text({function.__name__ for function in entries}, marks)
+    return link.text([function.__name__ for function in entries], marks)
 
 
 class _Link:
@@ -156,13 +158,14 @@ class _Link:
         constants = {n: d for n, d in found.items() if not isinstance(d, ast.FunctionDef)}
         return Definitions(functions | self._generated, constants)
 
-    def text(self, entries: set[str], marks: tuple[str, str]) -> str:
+    def text(self, entries: Sequence[str], marks: tuple[str, str]) -> str:
         """Return the module."""
         functions, constants = self.definitions()
         parts = [f"from math import {', '.join(sorted(self._math))}"] * bool(self._math)
         parts += [ast.unparse(constants[name]) for name in sorted(constants)]
         # Entry points come last: some are compiled where they are defined.
-        for name in sorted(functions, key=lambda name: (name in entries, name)):
+        parts_of = sorted(name for name in functions if name not in entries)
+        for name in (*parts_of, *entries):
             text = ast.unparse(_bare(functions[name])) if name in self._generated else ""
             text = text or _kernel(self._found[name][0], name)[0]
             parts.append(f"@{marks[name not in entries]}\n{text}\n")
@@ -274,9 +277,7 @@ def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
     natives = _natives()
     if "decide_at(" in text:
         register_decide()
-    stamp = f"{inspect.getsource(natives)}\n{text}"
-    digest = hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
-    folder = cache_folder(FOLDER)
+    digest, folder = _digest(inspect.getsource(natives), text), cache_folder(FOLDER)
     try:
         if folder is not None:
             program = _KeptProgram(folder / digest, text, title)
@@ -306,13 +307,23 @@ SWITCH = "SAFE_ENVS_COMPILE"
 """Environment variable; 0 has the decisions of filters interpreted."""
 
 
-def decider(compiling: bool = True) -> Callable[[int], int] | None:
-    """Return `safe_envs.engine.decide.decide_columns` in machine code, a function of an address.
+class MachineCode(NamedTuple):
+    """`safe_envs.engine.decide.decide_columns` in machine code, a function of an address.
 
-    It is compiled once for each machine and version of its text.
+    Attributes:
+        one: for one state, which takes no longer than other threads may wait in any case.
+        many: for a batch; meanwhile other threads run.
+    """
+
+    one: Callable[[int], int]
+    many: Callable[[int], int]
+
+
+def decider(compiling: bool = True) -> MachineCode | None:
+    """Return what decides in machine code, which is compiled once for each machine and version.
 
     Args:
-        compiling: whether to compile it where it has not been yet, which takes half a minute.
+        compiling: whether to compile it where it has not been yet, which takes some 20 seconds.
 
     Returns:
         None where there is none: it is not compiled, Numba cannot be used, or `SWITCH` is 0.
@@ -323,27 +334,40 @@ def decider(compiling: bool = True) -> Callable[[int], int] | None:
 
 
 @lru_cache(maxsize=1)
-def _decider() -> Callable[[int], int] | None:
+def _decider() -> MachineCode | None:
     try:
         address = register_decide()
     except NotCompilableError as error:
         _LOG.warning("filters decide in plain Python, which is slow: %s", error)
         return None
-    # A call takes some microseconds: it keeps other threads waiting no longer than Python would.
-    return ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)(address)
+    kinds = (ctypes.PYFUNCTYPE, ctypes.CFUNCTYPE)
+    return MachineCode(*[kind(ctypes.c_int64, ctypes.c_void_p)(address) for kind in kinds])
 
 
 @lru_cache(maxsize=1)
 def _decide_text() -> tuple[str, str]:
     """Return the text of `decide_columns`, and the name of its folder."""
-    text = linked([decide_columns], Source(""), ("c_entry", "part"))
-    stamp = Path(__file__).with_name("numba_natives.py").read_text() + text
-    return text, hashlib.sha256(stamp.encode()).hexdigest()[:_DIGITS]
+    text = linked([project_rows, decide_columns], Source(""), ("c_entry", "part"))
+    natives = Path(__file__).with_name("numba_natives.py").read_text(encoding="utf-8")
+    # Numba keeps nothing for its other versions.
+    return text, _digest(package_version("numba"), natives, text)
+
+
+def _digest(*parts: str) -> str:
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:_DIGITS]
+
+
+def _places_of_decide() -> list[Path]:
+    """Return where Numba keeps its machine code: elsewhere if the user has set a folder."""
+    folder, digest = cache_folder(FOLDER), _decide_text()[1]
+    elsewhere = os.environ.get("NUMBA_CACHE_DIR")
+    found = [] if elsewhere is None else [*Path(elsewhere).glob(f"{digest}_*")]
+    return found if folder is None else [folder / digest, *found]
 
 
 def _is_kept() -> bool:
-    folder = cache_folder(FOLDER)
-    return folder is not None and any((folder / _decide_text()[1]).glob("**/*.nbi"))
+    index = f"**/*.decide_columns-*.py{sys.version_info[0]}{sys.version_info[1]}*.nbi"
+    return any(any(place.glob(index)) for place in _places_of_decide())
 
 
 @lru_cache(maxsize=1)
@@ -356,23 +380,36 @@ def register_decide() -> int:
     if not is_available():
         raise NotCompilableError("Numba is missing; pip install numba")
     natives = _natives()
-    text, digest = _decide_text()
-    folder, title = cache_folder(FOLDER), "the decisions of filters, once for this machine"
-    if not _is_kept():
-        _LOG.warning("compiling %s, which takes half a minute", title)
     try:
-        if folder is None:
-            raise OSError
-        found = _KeptProgram(folder / digest, text, title).functions["decide_columns"]
-    except (OSError, ConfigurationError):  # The disk may be full.
-        found = _not_kept(text)["decide_columns"]
-    natives.add_symbol("safe_envs_decide_columns", found.address)
-    _KEPT.append(found)
-    return found.address
+        _load_decide()
+        return natives.address_of("decide_columns")
+    except Exception as error:
+        raise NotCompilableError(
+            f"Numba cannot compile the decisions of filters: {shortened(error)}"
+        ) from error
 
 
-_KEPT: list[Any] = []
-"""What must live as long as its address is used."""
+def _load_decide() -> None:
+    """Compile the decisions of filters, or read them from disk."""
+    (text, digest), folder = _decide_text(), cache_folder(FOLDER)
+    once, title = "compiling %s, which takes some 20 seconds", "the decisions of filters"
+    for _ in range(2 if folder is not None else 0):
+        is_kept = _is_kept()
+        if not is_kept:
+            _LOG.warning(f"{once}, once for this machine", title)
+        try:
+            _KeptProgram(folder / digest, text, title)
+            if not is_kept:
+                make_room()
+            return
+        except Exception as error:
+            if not is_kept or isinstance(error, OSError | ConfigurationError):
+                break  # The disk may be full.
+            # Kernels raise nothing: what is kept cannot be read.
+            for place in _places_of_decide():
+                shutil.rmtree(place, ignore_errors=True)
+    _LOG.warning(f"{once}; there is no folder of yours to keep them in", title)
+    _not_kept(text)
 
 
 def _not_kept(text: str) -> dict[str, Any]:

@@ -184,15 +184,16 @@ def project_interval(
     """
     low, high, v = ends[0], ends[1], proposed[0]
     first, last = low, high
+    near, far = (low, high) if uncertain else (ENDLESS, -ENDLESS)
     for i in range(k):
         a = rows[i]
         start, end = -ENDLESS, ENDLESS
         if uncertain:
             start, end = uncertain_interval(i, k, rows, forms)
-        elif a > 0.0:
-            start = -rows[k + i] / a
-        elif a < 0.0:
-            end = -rows[k + i] / a
+        elif a != 0.0:
+            root = -rows[k + i] / a
+            start, end = (root, ENDLESS) if a > 0.0 else (-ENDLESS, root)
+            near, far = min(near, root), max(far, root)
         work[i] = start
         work[k + i] = end
         first = start if start > first else first
@@ -206,7 +207,9 @@ def project_interval(
         value, allowed = interval_residual(i, k, rows, forms, uncertain, u)
         solvable = solvable or (value < -allowed and (uncertain or rows[i] != 0.0))
     if solvable and (k > 1 or uncertain):
-        u = least_slack(k, rows, forms, uncertain, v, low, high, weights, work)
+        # The least sum lies between roots, and bounds may be infinite.
+        near, far = clip(near, 0, 1, ends), clip(far, 0, 1, ends)
+        u = least_slack(k, rows, forms, uncertain, v, near, far, weights)
     out[0] = u
     feasible = True
     for i in range(k):
@@ -280,7 +283,6 @@ def least_slack(
     low: float,
     high: float,
     weights: Floats,
-    work: Floats,
 ) -> float:
     """Return the input nearest to v of those with the least sum of squared slacks.
 
@@ -962,8 +964,9 @@ def approach(
     for j in range(m):
         whole = max(whole, abs(out[j] - proposed[j]) * work[root + j])
     for j in range(m):
-        # A constraint of an input alone may ask for 0, which rounding of the distance hides.
-        if abs(out[j]) <= ROUNDING * whole / work[root + j]:
+        # A constraint of an input alone may ask for 0, which rounding of the way hides. From the
+        # least-violating input that is no longer than the bounds are apart.
+        if abs(out[j]) <= ROUNDING * min(whole / work[root + j], ends[m + j] - ends[j]):
             out[j] = clip(0.0, j, m, ends)
     # Where constraints or inputs differ by many orders of magnitude, rounding may lead astray: then
     # the least-violating input is safer.

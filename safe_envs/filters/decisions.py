@@ -1,7 +1,8 @@
 """The decisions of a filter's QP: for one state in lists, and for a batch in arrays.
 
 `safe_envs.engine.decide` makes them: in machine code, or interpreted, with the same bits. A filter
-of one constraint, or of one input, begins interpreted, as few decisions take no time.
+of one constraint, or of one input, is interpreted for single states, which takes about as long; its
+batches get machine code when there are many.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import itertools
 import math
 import struct
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +23,7 @@ from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.engine import decide as text
 from safe_envs.engine.decide import answer_length, decide, scratch_lengths, shape_of
-from safe_envs.engine.program import decider
+from safe_envs.engine.program import MachineCode, decider
 from safe_envs.engine.qp import ROUNDING
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
@@ -35,9 +36,9 @@ Bounds = tuple[Sequence[Any], Sequence[Any]]
 _Answer = tuple[int, Sequence[float]]
 
 _FEW = 20_000
-"""FilterQPSolver of a filter from which on machine code is read from disk, which takes a second."""
+"""Decisions in batches from which on machine code is read from disk, which takes a second."""
 _MANY = 2_000_000
-"""FilterQPSolver from which on it is compiled: they have taken some ten seconds."""
+"""Decisions in batches from which on it is compiled: they have taken some ten seconds."""
 
 
 class QPValues:
@@ -84,7 +85,7 @@ class QPValues:
         self.shape = shape_of((k, m, goal), kind, qp.dt, unit, parts)
         self.weights = [*map(float, (*weights, *qp.priorities, *([1.0] * goal)))]
         self.ends = [*map(float, (*qp.low, *qp.high))]
-        self.lengths = scratch_lengths(k, m, goal, int(self.shape[text.SAMPLED]))
+        self.lengths = scratch_lengths(self.shape)
         self.answer = answer_length(k, m, goal)
 
     def _add(self, qp: FilterQP, i: int) -> list[int]:
@@ -134,16 +135,18 @@ class FilterQPSolver:
         self._k, self._m, self._goal = k, m, goal
         self._barriers = int(shape[text.OWNED]) or k
         several = k + goal > 1 or shape[text.SAMPLED] > 0.0
-        self._at_once, self._made = several and m + goal > 1, 0
+        self._at_once = several and m + goal > 1
         self._fresh()
 
     def _fresh(self) -> None:
-        self._run: Callable[[int], int] | None = None
+        # A copy counts for itself, since it may be in another process.
+        self._run: MachineCode | None = None
+        self._made = 0
         self._frames: list[Any] = []
         self._machine_frames: list[CallFrame] = []
 
-    def _count(self, decisions: int) -> Callable[[int], int] | None:
-        """Count decisions; return the function that makes them in machine code, if it is due."""
+    def _count(self, decisions: int) -> MachineCode | None:
+        """Count decisions; return what makes them in machine code, if it is due."""
         if self._run is None and self._solver is None:
             before, self._made = self._made, self._made + decisions
             if self._at_once or before < _MANY <= self._made:
@@ -153,7 +156,7 @@ class FilterQPSolver:
         return self._run
 
     def __getstate__(self) -> dict[str, Any]:
-        made = {"_frames", "_machine_frames", "_floats", "_demands", "_arrays", "_run"}
+        made = {"_frames", "_machine_frames", "_floats", "_demands", "_arrays", "_run", "_made"}
         return {name: value for name, value in vars(self).items() if name not in made}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -245,17 +248,26 @@ class FilterQPSolver:
     def _decide_one(
         self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
     ) -> _Answer:
-        run = self._run or self._count(1)
-        if run is not None:
-            frame = self._machine_frames.pop() if self._machine_frames else self._frame()
-            answer = frame.decide(run, values, u, ends)
-            self._machine_frames.append(frame)
-            return answer
+        # Where Python is as fast, a control loop waits for no compilation.
+        run = self._run or (self._count(0) if self._at_once else None)
+        if run is None:
+            return self._interpret(values, u, ends)
+        frame = self._machine_frame()
+        answer = frame.decide(run, values, u, ends)
+        self._machine_frames.append(frame)
+        return answer
+
+    def _interpret(
+        self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
+    ) -> _Answer:
         made = self.values
         if self._solver is not None:
             return self._by_library(self._solver, values, u, made.ends if ends is None else ends)
         # Each call has scratch arrays to itself, also in threads.
-        scratch = self._frames.pop() if self._frames else [[0.0] * n for n in made.lengths]
+        try:
+            scratch = self._frames.pop()
+        except IndexError:
+            scratch = [[0.0] * n for n in made.lengths]
         out, bounds = [0.0] * made.answer, made.ends if ends is None else ends
         try:
             code = decide(made.shape, made.weights, values, u, bounds, out, scratch)
@@ -287,9 +299,13 @@ class FilterQPSolver:
             cause = text.gather_barriers(k, m, self.values.shape, cause, out)
         return 2 * cause + 2 + int(feasible), out
 
-    def _frame(self) -> CallFrame:
-        made = self.values
-        return CallFrame(made.shape, made.weights, made.ends, len(made.expressions))
+    def _machine_frame(self) -> CallFrame:
+        """Return arrays that no other thread uses."""
+        try:
+            return self._machine_frames.pop()
+        except IndexError:
+            made = self.values
+            return CallFrame(made.shape, made.weights, made.ends, len(made.expressions))
 
     def _table(self, x: Sequence[Any], size: int) -> np.ndarray:
         """Return the values at a batch, shape (values, B)."""
@@ -321,11 +337,11 @@ class FilterQPSolver:
                 row[:] = entry
         run = self._run or self._count(size)
         if run is not None:
-            frame = self._machine_frames.pop() if self._machine_frames else self._frame()
+            frame = self._machine_frame()
             codes, out = frame.decide_all(run, table, inputs, ends)
             self._machine_frames.append(frame)
         else:
-            codes, out = self._interpret(table, inputs, ends)
+            codes, out = self._interpret_all(table, inputs, ends)
         if size and codes.min() < 0:
             bad = int(np.flatnonzero(codes < 0)[0])
             raise _undefined(int(codes[bad]), bad)
@@ -339,12 +355,12 @@ class FilterQPSolver:
             tuple(out[m + 3 * k :]) if self._goal else u,
         )
 
-    def _interpret(
+    def _interpret_all(
         self, table: np.ndarray, inputs: np.ndarray, ends: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         own = itertools.repeat(None) if ends is None else ends.T.tolist()
         rows = zip(table.T.tolist(), inputs.T.tolist(), own, strict=False)
-        found = [self._decide_one(*row) for row in rows]
+        found = [self._interpret(*row) for row in rows]
         out = np.array([out for _, out in found]).reshape(-1, self.values.answer)
         return np.array([code for code, _ in found], dtype=np.int64), out.T.copy()
 
@@ -382,8 +398,8 @@ class CallFrame:
     ) -> None:
         k, m, goal = (int(shape[i]) for i in (text.K, text.M, text.GOAL))
         self._ends, self._length = ends, answer_length(k, m, goal)
-        lengths = scratch_lengths(k, m, goal, int(shape[text.SAMPLED]))
-        starts = [0, *itertools.accumulate([size, m, 2 * m, self._length, *lengths])]
+        parts = [size, m, 2 * m, self._length, *scratch_lengths(shape)]
+        starts = [0, *itertools.accumulate(parts)]
         block = np.zeros(starts[-1])
         self._block = block.data
         self._constants = np.array(shape), np.array(weights), np.array(ends)
@@ -400,7 +416,7 @@ class CallFrame:
 
     def decide(
         self,
-        run: Callable[[int], int],
+        run: MachineCode,
         values: Sequence[float],
         u: Sequence[float],
         ends: Sequence[float] | None,
@@ -408,16 +424,16 @@ class CallFrame:
         """Decide for one state."""
         self._given.pack_into(self._block, 0, *values, *u)
         if ends is None:
-            code = run(self._of_one)
+            code = run.one(self._of_one)
         else:
             self._bounds.pack_into(self._block, self._places[2], *ends)
-            code = run(self._of_one)
+            code = run.one(self._of_one)
             self._bounds.pack_into(self._block, self._places[2], *self._ends)
         return code, self._answer.unpack_from(self._block, self._places[3])
 
     def decide_all(
         self,
-        run: Callable[[int], int],
+        run: MachineCode,
         values: np.ndarray,
         inputs: np.ndarray,
         ends: np.ndarray | None,
@@ -430,7 +446,7 @@ class CallFrame:
         numbers[5], numbers[6] = _address(values), _address(inputs)
         numbers[7] = self._own_ends if ends is None else _address(ends)
         numbers[8], numbers[9] = _address(out), _address(codes)
-        code = run(self._of_many)
+        code = run.many(self._of_many)
         if count == 1:
             codes[0] = code
         self._bounds.pack_into(self._block, self._places[2], *self._ends)

@@ -63,8 +63,12 @@ def solve_with(
     a, b = rows[:, :m], rows[:, m]
     low, high = np.array(ends[:m]), np.array(ends[m:])
     near = np.array(weights[:m]), np.array(proposed)
+
+    def met_at(u: np.ndarray) -> bool:
+        return bool((a @ u + b >= -TOLERANCE * (abs(a) @ abs(u) + abs(b))).all())
+
     u = _solve(solver, *near, -a, b, low, high)
-    feasible = u is not None and bool((a @ u + b >= -TOLERANCE * (abs(a) @ abs(u) + abs(b))).all())
+    feasible = u is not None and met_at(u)
     if not feasible:
         # With the slacks as inputs of their own, which bounds of the constraints allow.
         both, nothing = np.concatenate([np.zeros(m), weights[m:]]), np.zeros(m + k)
@@ -79,6 +83,8 @@ def solve_with(
         slack = np.maximum(least[m:], 0.0) + TOLERANCE * terms
         closest = _solve(solver, *near, -a, b + slack, low, high)
         u = least[:m] if closest is None else closest
+        # A solver may find no answer at first, and yet there is one without slacks.
+        feasible = met_at(np.clip(least[:m], low, high))
     assert u is not None
     return np.clip(u, low, high).tolist(), feasible
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from safe_envs.engine.qp import ROUNDING
-from tests.oracles.qps import KINDS, WAYS, Answers, QPs, by_batch, random_qps
+from tests.oracles.qps import KINDS, WAYS, Answers, QPs, by_batch, by_floats, random_qps
 from tests.oracles.rational_oracle import nearest_of_least_violating
 
 SIZES = [(1, 1), (1, 2), (1, 3), (3, 1), (7, 1), (2, 2), (5, 2), (2, 3), (5, 3), (3, 4), (7, 4)]
@@ -158,6 +158,25 @@ def test_the_order_of_constraints_inputs_and_states_does_not_matter(kind):
         assert_equal(qps, back, expected, 1e-8)
         alone = Answers(*[part[[3]] for part in expected])
         assert_equal(qps.states([3]), by_batch(qps.states([3])), alone, 1e-12)
+
+
+@pytest.mark.parametrize("top", [20, 150, 280])
+def test_proposals_far_beyond_the_bounds_have_the_nearest_answer(top):
+    for (k, m), kind in itertools.product(SIZES[4:], ("plain", "weights")):
+        rng = np.random.default_rng([k, m, top])
+        qps = random_qps(rng, 4, k, m, kind, 0.0)
+        far = qps.v * 10.0 ** rng.uniform(top - 10, top, (4, 1))
+        assert_right(qps._replace(v=far), by_floats(qps._replace(v=far)))
+
+
+@pytest.mark.parametrize(("k", "seed"), [(2, 0), (7, 18), (12, 1)])
+def test_one_input_without_bounds_violates_contradictory_constraints_least(k, seed):
+    qps = random_qps(
+        np.random.default_rng([KINDS.index("open"), 1, k, seed]), 60, k, 1, "open", 1.8
+    )
+    answers = by_floats(qps)
+    assert_right(qps, answers)
+    assert (np.isinf(qps.low) & np.isinf(qps.high))[~answers.feasible].any()
 
 
 @pytest.mark.oracle

@@ -197,3 +197,36 @@ def test_weights_count_in_the_distance_of_a_cause() -> None:
         for state, proposal in (([0, 0], [1, 1]), ([[0, 0]], [[1, 1]])):
             assert np.all(made.filter(state, proposal).cause == cause)
         assert decision_of(made)([0, 0], [1, 1]).cause == cause
+
+
+def test_a_plane_above_a_root_is_above_it_where_bounds_hold_an_input() -> None:
+    # The faces of an input that its bounds hold are equal but for rounding, which is no slope.
+    safety_filter, states, inputs = case_of("plane above")
+    (c,), form = safety_filter.constraints, np.array([[0.1, 0, 0], [0, 0.2, 0.1], [0, 0.1, 0.2]])
+    row = sp.lambdify(safety_filter.model.states, [*c.coefficient, c.offset])
+    low = np.random.default_rng(7).uniform(-1.0, 0.5, inputs.shape)
+    bounds = np.stack([low, low + np.array([1.0, 0.0])], axis=-1)
+    found = safety_filter.filter(states, inputs, input_bounds=bounds)
+    assert 20 < found.feasible.sum() < len(states)
+    for state, action, feasible in zip(states, found.action, found.feasible, strict=True):
+        whole = np.array([1.0, *action])
+        *slopes, offset = row(*state)
+        if feasible:
+            assert np.dot(slopes, action) + offset >= np.sqrt(whole @ form @ whole) - 1e-12
+
+
+def test_many_inputs_take_no_more_memory_than_their_constraints() -> None:
+    # Uncertain constraints need all corners of the bounds, of which 40 inputs have 1e12.
+    states, given = sp.symbols("x:40", real=True), sp.symbols("u:40", real=True)
+    system = ControlAffineSDE(states, given, [0] * 40, sp.eye(40).tolist(), [0] * 40)
+    made = SafetyFilter(system, [1 - states[0], 2 + sum(states)], "cbf", (-1, 1))
+    found = made.filter(np.full(40, 0.9), np.ones(40))
+    assert found.feasible
+    np.testing.assert_allclose(found.action, [0.1] + [1.0] * 39)
+
+
+def test_large_proposals_whose_sum_overflows_are_proposals() -> None:
+    system = ControlAffineSDE((x, y), (u, v), [0, 0], np.eye(2, dtype=int), [0, 0])
+    made = SafetyFilter(system, [0.5 - x, 0.5 - y], "cbf", (-2, 2))
+    for state, proposal in (([0, 0], [1.7e308] * 2), ([[0, 0]], [[1.7e308] * 2])):
+        np.testing.assert_allclose(np.ravel(made.filter(state, proposal).action), 0.5)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.filters import other_solvers
 from safe_envs.registry import make_problem
 from safe_envs.wrappers import SafetyFilter
 from tests.oracles.qps import QPs, filter_of, random_qps, state_of, system_of
@@ -45,3 +46,19 @@ def test_what_they_cannot_solve_is_refused():
         SafetyFilter(*given, solver="proxqp")
     with pytest.raises(ConfigurationError, match="prxqp"):
         SafetyFilter(*given[:2], "scbf", given[3], solver="prxqp")
+
+
+def test_a_solver_that_gives_up_at_first_does_not_make_constraints_infeasible(monkeypatch):
+    solve, calls = other_solvers._solve, []
+
+    def gives_up(*given):
+        calls.append(given)
+        return None if len(calls) == 1 else solve(*given)
+
+    monkeypatch.setattr(other_solvers, "_solve", gives_up)
+    rows = np.array([[1.0, 0.0, 0.5], [0.0, -1.0, 0.2]])
+    ones = [1.0] * 4
+    action, feasible = other_solvers.solve_with("daqp", rows, [-1, 1], [-1, -1, 1, 1], ones)
+    np.testing.assert_allclose(action, [-0.5, 0.2], atol=1e-6)
+    assert feasible
+    assert len(calls) == 3

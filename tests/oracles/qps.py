@@ -172,7 +172,7 @@ def by_floats(qps: QPs, i: int) -> Any:
     shape, weights, values, u, ends = numbers_of(qps, i)
     k, m = qps.a.shape[1:]
     out = [math.nan] * answer_length(k, m, 0)
-    scratch = [[math.nan] * length for length in scratch_lengths(k, m, 0, 0)]
+    scratch = [[math.nan] * length for length in scratch_lengths(shape)]
     return answer(qps, decide(shape, weights, values, u, ends, out, scratch), out)
 
 
