@@ -1,7 +1,8 @@
 """The decisions of a filter's QP: for one state in lists, and for a batch in arrays.
 
 `safe_envs.engine.decide` makes them: in machine code, or interpreted, with the same bits. A filter
-of one constraint, or of one input, begins interpreted, as few decisions take no time.
+of one constraint, or of one input, is interpreted for single states, which takes as long; its
+batches get machine code when there are many.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ Bounds = tuple[Sequence[Any], Sequence[Any]]
 _Answer = tuple[int, Sequence[float]]
 
 _FEW = 20_000
-"""Decisions of a filter from which on machine code is read from disk, which takes a second."""
+"""Decisions in batches from which on machine code is read from disk, which takes a second."""
 _MANY = 2_000_000
-"""Decisions from which on it is compiled: they have taken some ten seconds."""
+"""Decisions in batches from which on it is compiled: they have taken some ten seconds."""
 
 
 class QPValues:
@@ -247,7 +248,7 @@ class Decisions:
     def _decide_one(
         self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
     ) -> _Answer:
-        run = self._run or self._count(1)
+        run = self._run  # A control loop waits for no compilation.
         if run is not None:
             frame = self._machine_frames.pop() if self._machine_frames else self._frame()
             answer = frame.decide(run, values, u, ends)
