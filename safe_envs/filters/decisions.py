@@ -248,7 +248,8 @@ class Decisions:
     def _decide_one(
         self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
     ) -> _Answer:
-        run = self._run  # A control loop waits for no compilation.
+        # Where Python is as fast, a control loop waits for no compilation.
+        run = self._run or (self._count(0) if self._at_once else None)
         if run is not None:
             frame = self._machine_frames.pop() if self._machine_frames else self._frame()
             answer = frame.decide(run, values, u, ends)
