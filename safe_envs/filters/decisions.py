@@ -1,7 +1,7 @@
 """The decisions of a filter's QP: for one state in lists, and for a batch in arrays.
 
 `safe_envs.engine.decide` makes them: in machine code, or interpreted, with the same bits. A filter
-of one constraint, or of one input, is interpreted for single states, which takes as long; its
+of one constraint, or of one input, is interpreted for single states, which takes about as long; its
 batches get machine code when there are many.
 """
 
