@@ -208,17 +208,15 @@ def _bounds() -> Figure:
             label=f"{row.filter}: measured, {_EPISODES} episodes, with its 95 % band",
         )
     times = np.linspace(0.0, problem.horizon, 41)
-    at_times = zip(
+    for bounds in zip(
         *[verification.guarantee.applicable_bounds(starts, t) for t in times.tolist()], strict=True
-    )
-    for bounds, color in zip(at_times, (QUIET, COLORS[1]), strict=True):
-        label = f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}"
+    ):
         axes.plot(
             times,
             [bound.value or 0.0 for bound in bounds],
-            color=color,
+            color=COLORS[1],
             linestyle="--",
-            label=label,
+            label=f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}",
         )
     axes.set(
         xlim=(0.0, problem.horizon),

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from safe_envs.agents.policies.registry import make_policy
+from safe_envs.filters import decisions
 from safe_envs.filters.conditions.registry import LEARNED
 from safe_envs.filters.learning.bayesian import identify
 from safe_envs.filters.learning.generator import learn_generator
@@ -160,3 +161,17 @@ assert not late, late
 def test_nothing_is_imported_or_compiled():
     done = subprocess.run([sys.executable, "-c", _SCRIPT], capture_output=True)
     assert not done.returncode, done.stderr.decode()
+
+
+def test_single_states_wait_for_no_machine_code(monkeypatch):
+    def compiled(**_):
+        raise AssertionError("compiled")
+
+    for name, value in {"_FEW": 3, "_MANY": 6, "decider": compiled}.items():
+        monkeypatch.setattr(decisions, name, value)
+    problem = problem_of("safe_envs/Scalar-v0")
+    given = SafetyFilter.for_problem(problem, problem.filter)
+    for _ in range(9):
+        given.filter([0.1], [1.0])
+    with pytest.raises(AssertionError, match="compiled"):
+        given.filter(np.full((9, 1), 0.1), np.ones((9, 1)))

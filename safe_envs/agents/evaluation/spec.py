@@ -272,9 +272,9 @@ class RunSettings:
             many threads as there are processors.
         record: keep trajectories for pictures.
         progress: called with the part of the work that is done, from 0 to 1.
-        engine: "numpy"; "compiled", which compiles each kind of simulation once, and needs Numba;
-            or "auto" for the compiled one from 5e6 control periods of a filter on, if it is there
-            and can do it. They agree to rounding, but for steps within rounding of a threshold.
+        engine: "numpy"; "compiled", which compiles each kind of simulation once; or "auto" for
+            the compiled one from 5e6 control periods of a filter on, if it can do it. They
+            agree to rounding, but for steps within rounding of a threshold.
         keep_episodes: keep the results of each episode in memory, 40 bytes for one; None for that
             where there are at most 1,000,000 of them, under all filters. What they are needed for
             is an error where they are not kept.

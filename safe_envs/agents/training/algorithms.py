@@ -36,7 +36,7 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     """Return the class of an algorithm.
 
     Args:
-        name: one of `safe_envs.agents.training.config.ALGORITHMS`.
+        name: one of `safe_envs.agents.training.hyperparameters.ALGORITHMS`.
     """
     if name == "ppo-lag":
         from safe_envs.agents.training.ppo_lagrangian import PPOLagrangian

@@ -126,7 +126,7 @@ class Training:
 
     Attributes:
         env_id: full id.
-        algorithm: one of `safe_envs.agents.training.config.ALGORITHMS`.
+        algorithm: one of `safe_envs.agents.training.hyperparameters.ALGORITHMS`.
         n_timesteps: control periods over all copies of the env.
         num_envs: number of copies.
         hyperparameters: of the algorithm, by the Zoo's names.

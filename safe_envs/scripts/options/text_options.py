@@ -38,8 +38,8 @@ Engine = Annotated[
         metavar="auto|numpy|compiled",
         callback=early_checks.one_of("engine", ("auto", "numpy", "compiled")),
         help=(
-            "What simulates: NumPy, or a program that is compiled once, which needs Numba. auto"
-            " takes that for long runs."
+            "What simulates: NumPy, or a program that Numba compiles once. auto takes that for long"
+            " runs."
         ),
     ),
 ]
