@@ -210,6 +210,15 @@ def project_interval(
         # The least sum lies between roots, and bounds may be infinite.
         near, far = clip(near, 0, 1, ends), clip(far, 0, 1, ends)
         u = least_slack(k, rows, forms, uncertain, v, near, far, weights)
+        # A move that is nothing but rounding is no intervention.
+        for part in range(2):
+            exact = clip(v if part == 1 else 0.0, 0, 1, ends)
+            alike = abs(u - exact) <= ROUNDING * (far - near)
+            for i in range(k):
+                value, allowed = interval_residual(i, k, rows, forms, uncertain, exact)
+                before, _ = interval_residual(i, k, rows, forms, uncertain, u)
+                alike = alike and value >= min(before, 0.0) - allowed
+            u = exact if alike else u
     out[0] = u
     feasible = True
     for i in range(k):
@@ -473,10 +482,7 @@ def project_rows(
         work[missed + i] = 0.0
         if not out[m + i] >= 0.0:
             # One that says nothing of the input cannot be met, and has no part in what follows.
-            silent = True
-            for j in range(m):
-                silent = silent and rows[i * m + j] == 0.0
-            if silent:
+            if is_silent(i, k, m, rows, ends):
                 hopeless += 1
             else:
                 work[missed + i] = 1.0
@@ -497,6 +503,15 @@ def project_rows(
         reduce_slacks(k, m, rows, ends, weights, corner, out, work)
         approach(k, m, rows, proposed, ends, weights, out, work)
     return count_unmet(k, m, rows, out) == 0
+
+
+def is_silent(i: int, k: int, m: int, rows: Floats, ends: Floats) -> bool:
+    """Return whether no input within its bounds changes a constraint by more than rounding may."""
+    reach = 0.0
+    for j in range(m):
+        a = abs(rows[i * m + j])
+        reach += a * (ends[m + j] - ends[j]) if a > 0.0 else 0.0
+    return reach <= SURELY * ROUNDING * abs(rows[k * m + i])
 
 
 def reduce_slacks(
@@ -532,7 +547,9 @@ def reduce_slacks(
         unit, top = sqrt(weights[m + i]) / size, 0.0
         for j in range(m):
             top = max(top, abs(rows[i * m + j]))
-        if 0.0 < unit * top < FAINT:
+        if is_silent(i, k, m, rows, ends):
+            unit = top = 0.0
+        elif unit * top < FAINT:
             unit = FAINT / top
         for j in range(m):
             work[scaled + i * m + j] = unit * rows[i * m + j]  # squares neither overflow nor vanish
@@ -854,9 +871,9 @@ def approach(
         work[move + j] = 0.0  # marks inputs on which a constraint depends
     whole, violated = 0.0, False
     for i in range(k):
-        size, square = 0.0, 0.0
+        size, square, silent = 0.0, 0.0, is_silent(i, k, m, rows, ends)
         for j in range(m):
-            x = rows[i * m + j] / work[root + j]
+            x = 0.0 if silent else rows[i * m + j] / work[root + j]
             work[normal + i * m + j] = x
             size = max(size, abs(x))
             if x != 0.0:

@@ -773,6 +773,18 @@ static int release(const qp *p, slacks *s, const real *u)
     return k + freed;
 }
 
+/* Return whether no input within its bounds changes a constraint by more than rounding may. */
+static bool is_silent(const qp *p, int i)
+{
+    const real rounding = sizeof(real) == sizeof(float) ? ROUNDING : SURELY * ROUNDING;
+    real reach = 0;
+    for (int j = 0; j < p->m; j++) {
+        const real a = ABS(p->a[i * p->m + j]);
+        reach += a > 0 ? a * (p->high[j] - p->low[j]) : 0;
+    }
+    return reach <= rounding * ABS(p->b[i]);
+}
+
 /* Move the input to where the sum of weighted squared slacks is least, inside its bounds.
  *
  * In a `corner`, its bounds hold the input from the start. `hard` receives which bounds hold it
@@ -792,11 +804,11 @@ static void reduce_slacks(const qp *p, bool corner, real *u, signed char *hard)
         size = larger(size, SQRT(p->priority[i]) * size_of(m, p->a + i * m));
     }
     for (int i = 0; i < k; i++) {
-        const real unit = SQRT(p->priority[i]);
+        const real unit = is_silent(p, i) ? 0 : SQRT(p->priority[i]) / size;
         for (int j = 0; j < m; j++) {
-            s.a[i * m + j] = unit * p->a[i * m + j] / size;
+            s.a[i * m + j] = unit * p->a[i * m + j];
         }
-        s.b[i] = size_of(m, p->a + i * m) > 0 ? unit * p->b[i] / size : 0;
+        s.b[i] = unit * p->b[i];
     }
     (void)slack_margins(p, &s, u);
     for (int i = 0; i < k; i++) {
@@ -925,8 +937,9 @@ static void approach(const qp *p, const signed char *hard, real *u)
     }
     for (int i = 0; i < k; i++) {
         real *row = normal + i * m;
+        const bool silent = is_silent(p, i);
         for (int j = 0; j < m; j++) {
-            row[j] = p->a[i * m + j] / root[j];
+            row[j] = silent ? 0 : p->a[i * m + j] / root[j];
             reached[j] = reached[j] || row[j] != 0;
         }
         const real size = size_of(m, row);
@@ -1099,7 +1112,7 @@ static bool project_rows(const qp *p, real *u, real *margin, bool *active)
         missed[i] = !(margin[i] >= 0);
         if (missed[i]) {
             /* One that says nothing of the input cannot be met, and has no part in what follows. */
-            missed[i] = size_of(m, p->a + i * m) > 0;
+            missed[i] = !is_silent(p, i);
             hopeless += !missed[i];
         }
     }

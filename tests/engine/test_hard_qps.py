@@ -57,6 +57,15 @@ for value in (-1e-12, 0.0, 1e-12, -5.0):
     rows = [[1, 0.2, 0], [0.3, 1, 0.1], [0, 0, 0]]
     hard(f"flat {value} beside two", one(rows, [-0.5, -0.5, value], [0] * 3), None, value >= 0)
 
+# Coefficients that are nothing but rounding do not drive inputs to their ends.
+rows = [[1, 2, 3, 1], [-1, -2, -3, -1], [-8e-16, 4e-15, 8e-16, 5e-15]]
+hard(
+    "coefficients of rounding",
+    one(rows, [-1.0, 1.0, -1.2], [0.1, 0.2, 0.1, 0.2]),
+    [0.1, 0.2, 0.1, 0.2],
+    False,
+)
+
 # Duplicates, opposite constraints, and constraints that meet in a point.
 hard("duplicates", one([[1, 1, 0]] * 2, [-1, -1], [0] * 3), [0.5, 0.5, 0], True)
 hard("opposite", one([[1, 0, 0], [-1, 0, 0]], [-0.3, 0.3], [0] * 3), [0.3, 0, 0], True)
