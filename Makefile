@@ -10,7 +10,6 @@
 # make thesis      list the artefacts of the thesis; ARGS="all --out report" computes them
 # make benchmark   measure the speed of filters, envs and commands
 # make docs        build the documentation in site/
-# make docs-test   build it, and open every page in a browser
 # Every target first creates the virtual environment .venv.
 
 PYTHON ?= python3
@@ -18,7 +17,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test check oracle clusters mutants golden lint wheel-test thesis benchmark docs docs-test clean
+.PHONY: demo test check oracle clusters mutants golden lint wheel-test thesis benchmark docs clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -58,9 +57,6 @@ benchmark: $(READY)
 
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-
-docs-test: docs
-	$(BIN)/python -m pytest -m docs tests/docs_site --site site
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv

@@ -34,7 +34,7 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("project")
 
 
-OWN_TARGETS = ("oracle", "cluster", "docs")
+OWN_TARGETS = ("oracle", "cluster")
 """Marks of tests that `make` runs by targets of their own."""
 
 
