@@ -393,7 +393,9 @@ def _load_decide() -> None:
     """Compile the decisions of filters, or read them from disk."""
     (text, digest), folder = _decide_text(), cache_folder(FOLDER)
     once, title = "compiling %s, which takes some 20 seconds", "the decisions of filters"
-    for _ in range(2 if folder is not None else 0):
+    for _ in range(2):
+        if folder is None:
+            break
         is_kept = _is_kept()
         if not is_kept:
             _LOG.warning(f"{once}, once for this machine", title)
