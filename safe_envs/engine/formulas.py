@@ -16,6 +16,7 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from safe_envs.dynamics.codegen import FloatPrinter, excerpt, prepared
 from safe_envs.engine.slots import Data
+from safe_envs.engine.trigonometry_kernel import arc_tangent, cosine, sine
 from safe_envs.errors import SystemDefinitionError
 
 WHOLE_FROM = 2.0**52
@@ -119,6 +120,15 @@ class _KernelPrinter(FloatPrinter):
 
     def _print_Min(self, expr: Any) -> str:  # noqa: N802
         return self._nested(formula_min, expr)
+
+    def _print_sin(self, expr: Any) -> str:
+        return self._call(sine, self._print(expr.args[0]))
+
+    def _print_cos(self, expr: Any) -> str:
+        return self._call(cosine, self._print(expr.args[0]))
+
+    def _print_atan2(self, expr: Any) -> str:
+        return self._call(arc_tangent, *map(self._print, expr.args))
 
     def _print_sign(self, e: Any) -> str:
         return self._call(formula_sign, self._print(e.args[0]))

@@ -22,6 +22,9 @@ __all__ = [
     "entry",
     "floats_at",
     "kernel",
+    "library_arc_tangent",
+    "library_cosine",
+    "library_sine",
     "part",
     "philox_block",
     "single",
@@ -195,3 +198,42 @@ def table_view(_: Any, array: Any, first: Any, rows: Any, columns: Any) -> Any:
     """See `plain_natives`."""
     place = numba.types.intp
     return numba.types.Array(array.dtype, 2, "C")(array, place, place, place), _view
+
+
+def _rare(name: str) -> Any:
+    """Return a function of the C library for branches that are seldom taken.
+
+    The compiler would call the sine that it knows in any case, wanted or not, and keep numbers in
+    memory for the calls.
+
+    Args:
+        name: of a function of floats.
+    """
+
+    def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = ir.DoubleType()
+        kind = ir.FunctionType(number, [number] * len(signature.args))
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        for attribute in ("cold", "nounwind", "readnone"):
+            function.attributes.add(attribute)
+        return builder.call(function, arguments)
+
+    return generate
+
+
+@intrinsic
+def library_sine(_: Any, x: Any) -> Any:
+    """See `plain_natives`."""
+    return numba.types.float64(x), _rare("sin")
+
+
+@intrinsic
+def library_cosine(_: Any, x: Any) -> Any:
+    """See `plain_natives`."""
+    return numba.types.float64(x), _rare("cos")
+
+
+@intrinsic
+def library_arc_tangent(_: Any, y: Any, x: Any) -> Any:
+    """See `plain_natives`."""
+    return numba.types.float64(y, x), _rare("atan2")

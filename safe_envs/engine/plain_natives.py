@@ -8,6 +8,7 @@ Source: J. Salmon, M. Moraes, R. Dror, D. Shaw, Parallel Random Numbers: As Easy
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import Any
 
@@ -87,3 +88,23 @@ def table_view(array: np.ndarray, first: int, rows: int, columns: int) -> np.nda
 def floats_at(address: int) -> Any:
     """Return the numbers from an address of memory on, in machine code alone."""
     raise NotImplementedError
+
+
+def library_sine(x: float) -> float:
+    """Return the sine of an angle in rad by the C library."""
+    return math.sin(x)
+
+
+def library_cosine(x: float) -> float:
+    """Return the cosine of an angle in rad by the C library."""
+    return math.cos(x)
+
+
+def library_arc_tangent(y: float, x: float) -> float:
+    """Return the angle of a vector in rad by the C library.
+
+    Args:
+        y: its second component.
+        x: its first component.
+    """
+    return math.atan2(y, x)

@@ -6,7 +6,9 @@ import itertools
 from collections.abc import Iterable
 from typing import Any
 
+from safe_envs.engine.decide import KIND, PLAIN
 from safe_envs.engine.formulas import Source, formulas
+from safe_envs.engine.qp import project_scalar
 from safe_envs.engine.slots import Data
 from safe_envs.filters.conditions.base import terms_source
 from safe_envs.filters.decisions import QPValues
@@ -62,6 +64,17 @@ def filter_source(qp: FilterQP, data: Data, name: str = "decide") -> Source:
     shape, weights, ends = (data.add(part) for part in (made.shape, made.weights, made.ends))
     numbers = [1, size, 0, shape, weights, values, u, ends, out, out, out, *scratch]
     k = len(qp.constraints)
+    if made.shape[KIND] == PLAIN and k == m == 1:  # the commonest, without a call
+        lines += [
+            f"out = vector_view(work, {out}, 3)",
+            "feasible = project_scalar(values[0], values[1], u[0],"
+            f" data[{ends}], data[{ends + 1}], out)",
+            "slack, sound = 0.0 if feasible else -out[1], isfinite(out[1] + u[0])",
+            "return (out[0],), u, out[2] > 0.0, feasible, (slack,), 0, sound",
+        ]
+        body = "".join(f"    {line}\n" for line in lines)
+        decision = Source(f"def {name}(x, u, data, work):\n{body}", (project_scalar,), starts[-1])
+        return text + decision
     slack = "".join(f"work[{out + m + 2 * k + i}], " for i in range(barriers))
     wanted = "".join(f"work[{out + m + 3 * k + j}], " for j in range(m))
     lines += [
