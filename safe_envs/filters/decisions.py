@@ -24,7 +24,7 @@ from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.engine import decide as text
 from safe_envs.engine.decide import answer_length, decide, scratch_lengths, shape_of
 from safe_envs.engine.program import MachineCode, decider
-from safe_envs.engine.qp import ROUNDING, project_scalar
+from safe_envs.engine.qp import ROUNDING, project
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
 from safe_envs.filters.other_solvers import BINDING, require_solver, solve_with
@@ -135,7 +135,7 @@ class FilterQPSolver:
         self._k, self._m, self._goal = k, m, goal
         self._barriers = int(shape[text.OWNED]) or k
         is_plain = shape[text.KIND] == text.PLAIN and solver is None
-        self._is_scalar = is_plain and k == m == 1  # the commonest, in no more than it takes
+        self._is_single = is_plain and k == 1  # the commonest, in no more time than it takes
         several = k + goal > 1 or shape[text.SAMPLED] > 0.0
         self._at_once = several and m + goal > 1
         self._fresh()
@@ -213,16 +213,15 @@ class FilterQPSolver:
         Raises:
             UndefinedConstraintError: A constraint or the goal has no finite value.
         """
-        if self._is_scalar and bounds is None:
-            low, high = self.values.ends
-            out = [0.0] * 3
-            a, b = self._values_at(x)
-            feasible = project_scalar(a, b, u[0], low, high, out)
-            action, margin, active = out
-            if not math.isfinite(margin + u[0]):
+        if self._is_single and bounds is None:
+            m, made, values = self._m, self.values, self._values_at(x)
+            out, work = [0.0] * (m + 2), [0.0] * made.lengths[8]
+            feasible = project(1, m, values, u, made.ends, made.weights, out, work)
+            margin = out[m]
+            if not math.isfinite(margin + sum(u)):
                 raise _undefined(text.UNDEFINED, 0)
             slack = 0.0 if feasible else -margin
-            return FilterDecision([action], [margin], [active > 0.0], feasible, [slack], 0, u)
+            return FilterDecision(out[:m], [margin], [out[-1] > 0.0], feasible, [slack], 0, u)
         ends = None if bounds is None else [*bounds[0], *bounds[1]]
         code, out = self._decide_one(self._values_at(x), u, ends)
         if code < 0:
