@@ -24,7 +24,7 @@ from safe_envs.dynamics.defined import NO_VALUE
 from safe_envs.engine import decide as text
 from safe_envs.engine.decide import answer_length, decide, scratch_lengths, shape_of
 from safe_envs.engine.program import MachineCode, decider
-from safe_envs.engine.qp import ROUNDING, project
+from safe_envs.engine.qp import ROUNDING, project, scratch_size
 from safe_envs.errors import ConfigurationError
 from safe_envs.filters.conditions.base import AffineConstraint
 from safe_envs.filters.other_solvers import BINDING, require_solver, solve_with
@@ -215,7 +215,7 @@ class FilterQPSolver:
         """
         if self._is_single and bounds is None:
             m, made, values = self._m, self.values, self._values_at(x)
-            out, work = [0.0] * (m + 2), [0.0] * made.lengths[8]
+            out, work = [0.0] * (m + 2), [0.0] * scratch_size(1, m)
             feasible = project(1, m, values, u, made.ends, made.weights, out, work)
             margin = out[m]
             if not math.isfinite(margin + sum(u)):
