@@ -241,10 +241,8 @@ def _of_module(name: str) -> ModuleType:
 
 @contextmanager
 def _running(path: Path | None, what: str) -> Iterator[None]:
-    """Run a user's code: its errors become ours, with the line.
-
-    Modules in its folder can be imported, as when Python runs it.
-    """
+    """Run a user's code: its errors become ours, with the line."""
+    # Modules in its folder can be imported, as when Python runs it.
     folder = None if path is None else str(path.parent)
     known = set(sys.modules)
     if folder is not None:

@@ -122,15 +122,7 @@ def text_width(text: str) -> int:
 
 
 def _goes_down(text: str, begin: int, opened: int, room: int, below: int) -> bool:
-    """Return whether a bracket is to begin a line: it fits there as a whole, and here it does not.
-
-    Args:
-        text: a line.
-        begin: of its part in the present line.
-        opened: place of the bracket.
-        room: width of the present line.
-        below: width of the next line.
-    """
+    """Return whether a bracket begins a line: it fits there as a whole, and here it does not."""
     closed = text.find(")", opened) + 1
     return (
         closed > 0

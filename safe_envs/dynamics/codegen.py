@@ -234,10 +234,8 @@ def in_plain_names(
 def _shared_subexpressions(
     expressions: Any,
 ) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
-    """Take out common subexpressions, and write small integer powers as products.
-
-    `pow` is many times slower.
-    """
+    """Take out common subexpressions, and write small integer powers as products."""
+    # `pow` is many times slower.
     shared: Any
     reduced: Any
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("x"), list=False)
@@ -426,10 +424,8 @@ def _compile(
 def _piece_by_piece(
     quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]
 ) -> Callable[..., Components]:
-    """Return a function of floats that evaluates only the pieces that apply.
-
-    A subexpression that other pieces share may have no value.
-    """
+    """Return a function of floats that evaluates only the pieces that apply."""
+    # A subexpression that other pieces share may have no value.
     careful = sp.lambdify(
         (_OWNER, *names), tuple(formulas), [math], printer=FloatPrinter(), docstring_limit=0
     )

@@ -74,11 +74,9 @@ def _nonzero_somewhere(expression: Any) -> bool:
 
 
 def _loses(part: Any, at: Mapping[Any, Any]) -> bool:
-    """Return whether a part of an expression may be lost in rounding to others at a point.
-
-    That is where a saturated function is next to its limit, or a power or a number of a size that
-    the digits of an evaluation do not hold.
-    """
+    """Return whether a part of an expression may be lost in rounding to others at a point."""
+    # That is where a saturated function is next to its limit, or a power or a number of a size that
+    # the digits of an evaluation do not hold.
     if isinstance(part, _SATURATED):
         argument: Any = part.args[0].xreplace(at)
         argument = argument.evalf(15, maxn=200)
@@ -183,11 +181,9 @@ class Pieces:
         return self._symbol(condition)
 
     def _sign(self, switch: Any) -> Any:
-        """Return the sign of an expression as a symbol.
-
-        It is the same for positive multiples of the expression, and the opposite for
-        negative ones.
-        """
+        """Return the sign of an expression as a symbol."""
+        # It is the same for positive multiples of the expression, and the opposite for negative
+        # ones.
         _, switch = sp.expand(switch).as_content_primitive()
         if switch.is_number:
             return sp.sign(switch)

@@ -149,12 +149,7 @@ def _solved(edge: Any, symbols: Sequence[sp.Symbol]) -> tuple[Any, list[Any]]:
 
 
 def _is_multiple(expression: Any, factor: Any) -> bool:
-    """Return whether one polynomial, of whatever functions, is shown to be a multiple of another.
-
-    Args:
-        expression: the first one.
-        factor: the other one.
-    """
+    """Return whether a polynomial, of whatever functions, is shown to be a multiple of another."""
     try:
         return sp.reduced(sp.expand(expression), [sp.expand(factor)])[1] == 0
     except sp.PolynomialError:

@@ -167,10 +167,8 @@ class ExpressionProgram:
 
 
 def _is_plain(expression: Any) -> bool:
-    """Return whether an expression is a number that is not composed of others.
-
-    A composed one is carried out, for digits of sin(1)^2 + cos(1)^2 - 1 say nothing of its sign.
-    """
+    """Return whether an expression is a number that is not composed of others."""
+    # A composed one is carried out, for digits of sin(1)^2 + cos(1)^2 - 1 say nothing of its sign.
     return expression.is_Rational or expression.is_Float or isinstance(expression, sp.NumberSymbol)
 
 

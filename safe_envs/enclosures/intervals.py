@@ -123,15 +123,7 @@ class IntervalArithmetic:
     def _outward(
         self, low: Any, high: Any, ulps: int = 1, tiny: float = 0.0, ends: Any = (-np.inf, np.inf)
     ) -> Interval:
-        """Return the interval between fresh values that are off by some units in the last place.
-
-        Args:
-            low: computed lower ends.
-            high: computed upper ends.
-            ulps: error relative to the values.
-            tiny: error in addition.
-            ends: numbers that no value of the operation exceeds.
-        """
+        """Return the interval between fresh values that are off by some units in the last place."""
         if not self._rounded:
             if high is low and not np.any(np.isnan(low)):
                 low = _at_most(_at_least(low, ends[0]), ends[1])

@@ -116,14 +116,12 @@ class ExpandedPolynomial:
         return with_range(center, slopes, radius, unknown, np.ones(boxes, dtype=bool))
 
     def _error(self, order: Order, reach: float, size: float) -> float:
-        """Return what rounding may have changed a derivative by on a box.
-
-        Each coefficient is a sum of products of exact ones with binomials and powers, so that its
-        error is a number of units in the last place of the sum of absolute values. That sum over
-        all coefficients is the derivative of the polynomial with absolute coefficients at the
-        corner that is farthest. Errors of the scaled variables, of less than 16 units in the last
-        place of what enters, move the argument, which costs what the next derivatives bound.
-        """
+        """Return what rounding may have changed a derivative by on a box."""
+        # Each coefficient is a sum of products of exact ones with binomials and powers, so that its
+        # error is a number of units in the last place of the sum of absolute values. That sum over
+        # all coefficients is the derivative of the polynomial with absolute coefficients at the
+        # corner that is farthest. Errors of the scaled variables, of less than 16 units in the last
+        # place of what enters, move the argument, which costs what the next derivatives bound.
         n, degrees = len(order), self._coefficients.shape
         operations = 8 * sum(degrees) + 16
         own = self._majorant(order, reach)

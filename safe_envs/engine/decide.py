@@ -137,9 +137,9 @@ def scratch_lengths(shape: Sequence[float]) -> tuple[int, ...]:
     if any(shape[COUNTS + IS_UNCERTAIN * k : COUNTS + IS_PARTIAL * k]):
         size = max(size, 1 << m)  # the corners of the bounds
     return (
-        m,  # want
+        m,  # wanted
         k * m + k,  # own
-        m + 1 + k,  # aim
+        m + 1 + k,  # target
         3 * k,  # flags
         3 * k + 3 * sampled + 1,  # forms
         2 * m + 2,  # wide
@@ -151,7 +151,7 @@ def scratch_lengths(shape: Sequence[float]) -> tuple[int, ...]:
         m + count if search else 0,  # priorities
         2 * count if search else 0,  # state
         ON_LINE * count if search else 0,  # line
-        m + 2 * count if search else 0,  # target
+        m + 2 * count if search else 0,  # answer
     )
 
 
@@ -188,7 +188,9 @@ def decide(
         `UNDEFINED`, `UNDEFINED_GOAL`.
     """
     k, m, goal = int(shape[K]), int(shape[M]), int(shape[GOAL])
-    want, own, aim, flags, forms, wide, rows, result, work = scratch[:9]
+    wanted, own, target, flags, forms, wide, rows, result, work = scratch[:9]
+    if k == 1 and shape[KIND] == PLAIN:
+        return conclude_single(m, u, project(1, m, values, u, ends, weights, out, work), out)
     total = 0.0
     for j in range(m):
         total += 0.0 * u[j]  # which does not overflow
@@ -196,30 +198,24 @@ def decide(
         return UNDEFINED
     if shape[KIND] == PLAIN:
         feasible = project(k, m, values, u, ends, weights, out, work)
-        if k == 1:  # the rule, which takes no longer than it must
-            margin = out[m]
-            out[m + 2] = 0.0 if feasible else -margin
-            if not isfinite(margin):
-                return UNDEFINED
-            if out[m + 1] == 0.0:
-                return 1
-            return 3 if feasible else 2
     else:
         for j in range(m):
-            want[j] = u[j]
+            wanted[j] = u[j]
         if goal > 0:
             total = 0.0
             for j in range(m + 1):
                 total += values[k * m + k + j]
             if not isfinite(total):
                 return UNDEFINED_GOAL
-            pursue(k, m, values, shape[UNIT], ends, weights, want, aim, wide, rows, result, work)
+            pursue(
+                k, m, values, shape[UNIT], ends, weights, wanted, target, wide, rows, result, work
+            )
             for j in range(m):
-                out[m + 3 * k + j] = want[j]
-        finite = read_constraints(shape, weights, values, ends, want, own, aim, flags, forms)
+                out[m + 3 * k + j] = wanted[j]
+        finite = read_constraints(shape, weights, values, ends, wanted, own, target, flags, forms)
         if not (finite and write_rows(shape, values, ends, weights, scratch)):
             return UNDEFINED
-        feasible = minimise(shape, ends, weights, out, aim, forms, wide, rows, result, work)
+        feasible = minimise(shape, ends, weights, out, target, forms, wide, rows, result, work)
         if shape[SAMPLED] > 0.0:
             feasible = hold(shape, values, ends, weights, out, scratch)
         feasible = leave_domains(k, m, own, out, flags) and feasible
@@ -235,7 +231,7 @@ def decide(
             if flags[k + i] == 0.0:
                 out[m + i], out[m + k + i] = -inf, 1.0
                 feasible = False
-        cause = furthest(k, m, own, aim, m + 1, want, weights, out)
+        cause = furthest(k, m, own, target, m + 1, wanted, weights, out)
         for i in range(k - 1, -1, -1):  # outside its domain one is further than any
             if flags[i] == 0.0 and largest(i, m, own) > 0.0:
                 cause = i
@@ -247,6 +243,27 @@ def decide(
     return 2 * cause + 3 if feasible else 2 * cause + 2
 
 
+def conclude_single(m: int, u: Floats, feasible: bool, out: Floats) -> int:
+    """Write the slack of a filter of one plain constraint; return what `decide` does.
+
+    Args:
+        m: number of inputs.
+        u: proposed input (m).
+        feasible: whether the constraint can be met.
+        out: input, margin and whether the constraint is active (m + 2); receives the slack (1).
+    """
+    margin = out[m]
+    out[m + 2] = 0.0 if feasible else -margin
+    total = margin
+    for j in range(m):
+        total += 0.0 * u[j]
+    if not isfinite(total):
+        return UNDEFINED
+    if out[m + 1] == 0.0:
+        return 1
+    return 3 if feasible else 2
+
+
 def pursue(
     k: int,
     m: int,
@@ -254,8 +271,8 @@ def pursue(
     unit: float,
     ends: Floats,
     weights: Floats,
-    want: Floats,
-    aim: Floats,
+    wanted: Floats,
+    target: Floats,
     wide: Floats,
     rows: Floats,
     result: Floats,
@@ -270,14 +287,14 @@ def pursue(
         wide[j] = low
         wide[m + 1 + j] = high
         rows[j] = -along
-        aim[j] = 0.0
-    wide[m] = aim[m] = 0.0
+        target[j] = 0.0
+    wide[m] = target[m] = 0.0
     wide[2 * m + 1] = 2.0 * most / unit if most > 0.0 else 1.0
     rows[m] = unit
     rows[m + 1] = -values[growth]
-    project(1, m + 1, rows, aim, wide, weights, result, work)
+    project(1, m + 1, rows, target, wide, weights, result, work)
     for j in range(m):
-        want[j] = result[j]
+        wanted[j] = result[j]
 
 
 def read_constraints(
@@ -285,9 +302,9 @@ def read_constraints(
     weights: Floats,
     values: Floats,
     ends: Floats,
-    want: Floats,
+    wanted: Floats,
     own: Floats,
-    aim: Floats,
+    target: Floats,
     flags: Floats,
     forms: Floats,
 ) -> bool:
@@ -295,7 +312,7 @@ def read_constraints(
 
     A constraint whose barrier has no value is 0, which every input meets. `flags` receives 1 for
     constraints inside their domain, for those that have a value, and where the values of each have
-    coefficients of its rate of change (3 k); `aim` what is asked for in place of b.
+    coefficients of its rate of change (3 k); `target` what is asked for in place of b.
     """
     k, m, goal = int(shape[K]), int(shape[M]), int(shape[GOAL])
     place, entries, total = k * m + k + goal * (m + 1), (m + 1) * (m + 2) >> 1, 0.0
@@ -332,7 +349,7 @@ def read_constraints(
             total += height if known > 0.0 else 0.0
             chosen = place
             if known > 0.0:
-                chosen += (m + 2) * nearest(functions, m, values, place, want, ends, weights)
+                chosen += (m + 2) * nearest(functions, m, values, place, wanted, ends, weights)
             b = values[chosen + m]
             place += functions * (m + 2)
         inside = inside if known > 0.0 else 1.0
@@ -342,9 +359,9 @@ def read_constraints(
         own[k * m + i] = b if known > 0.0 else 0.0
         total += own[k * m + i]
         if known > 0.0 and inside > 0.0:
-            aim[m + 1 + i] = b - demand
+            target[m + 1 + i] = b - demand
         else:
-            aim[m + 1 + i] = 0.0
+            target[m + 1 + i] = 0.0
         flags[i], flags[k + i], flags[2 * k + i] = inside, known, float(place)
         if shape[part + IS_SAMPLED * k] > 0.0:
             place += 1 + m + (m * (m + 1) >> 1)
@@ -352,7 +369,7 @@ def read_constraints(
 
 
 def nearest(
-    count: int, m: int, values: Floats, place: int, want: Floats, ends: Floats, weights: Floats
+    count: int, m: int, values: Floats, place: int, wanted: Floats, ends: Floats, weights: Floats
 ) -> int:
     """Return the function of a maximum whose constraint is nearest to an input.
 
@@ -373,7 +390,7 @@ def nearest(
         for j in range(m):
             a = values[at + j]
             square += a / unit * (a / unit) / weights[j]
-            value += a * want[j]
+            value += a * wanted[j]
             most += max(a * ends[j], a * ends[m + j])
         distance = -value / unit
         if square > 0.0:
@@ -390,11 +407,11 @@ def write_rows(
 ) -> bool:
     """Write the rows of the QP and what it is nearest to; return whether all is finite."""
     k, m, goal = int(shape[K]), int(shape[M]), int(shape[GOAL])
-    want, own, aim, flags, _, _, rows, result, work = scratch[:9]
+    wanted, own, target, flags, _, _, rows, result, work = scratch[:9]
     count, width, total, outside = k + goal, m + goal, 0.0, False
     if goal == 0:
         for j in range(m):
-            aim[j] = want[j]
+            target[j] = wanted[j]
     for i in range(k):
         inside = flags[i] > 0.0
         outside = outside or not inside
@@ -402,7 +419,7 @@ def write_rows(
             rows[i * width + j] = own[i * m + j] if inside else 0.0
         if goal > 0:
             rows[i * width + m] = 0.0
-        rows[count * width + i] = aim[m + 1 + i]
+        rows[count * width + i] = target[m + 1 + i]
         uncertain = shape[COUNTS + IS_UNCERTAIN * k + i] > 0.0 and shape[KIND] != UNCERTAIN
         if uncertain and flags[k + i] > 0.0:
             at = int(flags[2 * k + i]) - ((m + 1) * (m + 2) >> 1)
@@ -418,7 +435,7 @@ def write_rows(
         rows[k * width + m] = shape[UNIT]
         rows[count * width + k] = -values[growth]
     if outside:
-        aim_outwards(k, m, own, ends, weights, aim, flags, result)
+        target_outwards(k, m, own, ends, weights, target, flags, result)
     return isfinite(total)
 
 
@@ -427,7 +444,7 @@ def minimise(
     ends: Floats,
     weights: Floats,
     out: Floats,
-    aim: Floats,
+    target: Floats,
     forms: Floats,
     wide: Floats,
     rows: Floats,
@@ -437,10 +454,10 @@ def minimise(
     """Solve the QP; return whether its constraints can be met."""
     k, m, goal = int(shape[K]), int(shape[M]), int(shape[GOAL])
     if shape[KIND] == UNCERTAIN:
-        return project_uncertain(k, rows, forms, aim, ends, weights, out, work)
+        return project_uncertain(k, rows, forms, target, ends, weights, out, work)
     if goal == 0:
-        return project(k, m, rows, aim, ends, weights, out, work)
-    project(k + 1, m + 1, rows, aim, wide, weights, result, work)
+        return project(k, m, rows, target, ends, weights, out, work)
+    project(k + 1, m + 1, rows, target, wide, weights, result, work)
     feasible = True
     for j in range(m):
         out[j] = result[j]
@@ -464,17 +481,17 @@ def leave_domains(k: int, m: int, own: Floats, out: Floats, flags: Floats) -> bo
     return inside
 
 
-def aim_outwards(
+def target_outwards(
     k: int,
     m: int,
     own: Floats,
     ends: Floats,
     weights: Floats,
-    aim: Floats,
+    target: Floats,
     flags: Floats,
     rise: Floats,
 ) -> None:
-    """Aim far away where h of constraints outside their domain rises most.
+    """Set the target far away where h of constraints outside their domain rises most.
 
     The allowed input nearest to one so far off is where h rises most among the allowed ones. Other
     constraints are not to suffer from one that has no meaning.
@@ -494,8 +511,8 @@ def aim_outwards(
         reach += abs(rise[j]) * (ends[m + j] - ends[j])
     far = FAR_AWAY * reach / (steepness if steepness > 0.0 else 1.0)
     for j in range(m):
-        corner = ends[m + j] if rise[j] > 0.0 else ends[j] if rise[j] < 0.0 else aim[j]
-        aim[j] = corner + far * rise[j] / weights[j]
+        corner = ends[m + j] if rise[j] > 0.0 else ends[j] if rise[j] < 0.0 else target[j]
+        target[j] = corner + far * rise[j] / weights[j]
 
 
 def largest(i: int, m: int, a: Floats) -> float:
@@ -590,7 +607,7 @@ def hold(
     """Move the input to where its constraints hold all along the period; return whether they do."""
     k, m, count = int(shape[K]), int(shape[M]), int(shape[K] + shape[SAMPLED])
     flags, forms, rows, work = scratch[3], scratch[4], scratch[6], scratch[8]
-    held, tangent, priorities, state, line, target = scratch[9:15]
+    held, tangent, priorities, state, line, answer = scratch[9:15]
     goal = int(shape[GOAL])
     width, place = 1 + m + (m * (m + 1) >> 1), k
     for j in range(m):
@@ -621,13 +638,13 @@ def hold(
     for _ in range(ROUNDS):
         if feasible:
             break
-        project(count, m, tangent, out, ends, priorities, target, work)
-        left = move_on_line(count, m, held, forms, ends, priorities, out, target, line)
+        project(count, m, tangent, out, ends, priorities, answer, work)
+        left = move_on_line(count, m, held, forms, ends, priorities, out, answer, line)
         if m > 1 and left > SLOW:
             for axis in range(m):
                 for j in range(m):
-                    target[j] = out[j] + 1.0 if j == axis else out[j]
-                left *= move_on_line(count, m, held, forms, ends, priorities, out, target, line)
+                    answer[j] = out[j] + 1.0 if j == axis else out[j]
+                left *= move_on_line(count, m, held, forms, ends, priorities, out, answer, line)
         feasible = all_hold(count, m, held, forms, out, tangent, state)
         if not left < ENOUGH:
             break

@@ -129,10 +129,8 @@ def single(value: Any) -> Any:
 
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    """Generate an array of given first entry and shape that owns nothing.
-
-    A slice takes some 5 ns, and a reshaped one 20 ns, for it clips its bounds and checks strides.
-    """
+    """Generate an array of given first entry and shape that owns nothing."""
+    # A slice takes some 5 ns, and a reshaped one 20 ns, for it clips its bounds and checks strides.
     array, first, *shape = arguments
     size = context.get_constant(numba.types.intp, 8)
     strides = [size]
@@ -201,14 +199,9 @@ def table_view(_: Any, array: Any, first: Any, rows: Any, columns: Any) -> Any:
 
 
 def _rare(name: str) -> Any:
-    """Return a function of the C library for branches that are seldom taken.
-
-    The compiler would call the sine that it knows in any case, wanted or not, and keep numbers in
-    memory for the calls.
-
-    Args:
-        name: of a function of floats.
-    """
+    """Return a function of the C library for branches that are seldom taken."""
+    # The compiler would call the sine that it knows in any case, wanted or not, and keep numbers in
+    # memory for the calls.
 
     def generate(_: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = ir.DoubleType()

@@ -50,34 +50,6 @@ class _Module(NamedTuple):
     imports: dict[str, tuple[str, str]]
 
 
-class Definitions(NamedTuple):
-    """What a program consists of, as the kernel modules state it.
-
-    Attributes:
-        functions: by name, with docstrings and annotations.
-        constants: assignments of numbers by name.
-    """
-
-    functions: dict[str, ast.FunctionDef]
-    constants: dict[str, ast.stmt]
-
-
-def definitions(entries: Sequence[Callable[..., Any]], generated: Source) -> Definitions:
-    """Return entry points and all that they call; see `linked`.
-
-    Args:
-        entries: functions of kernel modules.
-        generated: functions of this program alone.
-
-    Raises:
-        SystemDefinitionError: Two functions have one name, or a generated one is missing.
-    """
-    link = _Link(generated)
-    for function in (*entries, *generated.uses):
-        link.need(function.__module__, function.__name__)
-    return link.definitions()
-
-
 def linked(
     entries: Sequence[Callable[..., Any]],
     generated: Source,
@@ -151,16 +123,12 @@ class _Link:
         for each in _kernel(module, name)[1] if is_function else _names(node):
             self.need(module, each)
 
-    def definitions(self) -> Definitions:
-        """Return what was found."""
-        found = {name: node for name, (_, node) in self._found.items()}
-        functions = {n: d for n, d in found.items() if isinstance(d, ast.FunctionDef)}
-        constants = {n: d for n, d in found.items() if not isinstance(d, ast.FunctionDef)}
-        return Definitions(functions | self._generated, constants)
-
     def text(self, entries: Sequence[str], marks: tuple[str, str]) -> str:
         """Return the module."""
-        functions, constants = self.definitions()
+        found = {name: node for name, (_, node) in self._found.items()}
+        functions = {n: d for n, d in found.items() if isinstance(d, ast.FunctionDef)}
+        constants = {n: d for n, d in found.items() if n not in functions}
+        functions |= self._generated
         parts = [f"from math import {', '.join(sorted(self._math))}"] * bool(self._math)
         parts += [ast.unparse(constants[name]) for name in sorted(constants)]
         # Entry points come last: some are compiled where they are defined.
@@ -392,26 +360,31 @@ def register_decide() -> int:
 def _load_decide() -> None:
     """Compile the decisions of filters, or read them from disk."""
     (text, digest), folder = _decide_text(), cache_folder(FOLDER)
-    once, title = "compiling %s, which takes some 20 seconds", "the decisions of filters"
-    for _ in range(2):
-        if folder is None:
-            break
-        is_kept = _is_kept()
-        if not is_kept:
-            _LOG.warning(f"{once}, once for this machine", title)
-        try:
-            _KeptProgram(folder / digest, text, title)
-            if not is_kept:
-                make_room()
-            return
-        except Exception as error:
-            if not is_kept or isinstance(error, OSError | ConfigurationError):
-                break  # The disk may be full.
-            # Kernels raise nothing: what is kept cannot be read.
-            for place in _places_of_decide():
-                shutil.rmtree(place, ignore_errors=True)
-    _LOG.warning(f"{once}; there is no folder of yours to keep them in", title)
-    _not_kept(text)
+    if folder is None or not _keep_decide(folder / digest, text):
+        _LOG.warning("%s; there is no folder of yours to keep them in", _COMPILING)
+        _not_kept(text)
+
+
+_COMPILING = "compiling the decisions of filters, which takes some 20 seconds"
+
+
+def _keep_decide(folder: Path, text: str) -> bool:
+    """Return whether the decisions of filters are compiled and kept, or read from disk."""
+    is_kept = _is_kept()
+    if not is_kept:
+        _LOG.warning("%s, once for this machine", _COMPILING)
+    try:
+        _KeptProgram(folder, text, "the decisions of filters")
+    except Exception as error:
+        if not is_kept or isinstance(error, OSError | ConfigurationError):
+            return False  # The disk may be full.
+        # Kernels raise nothing: what is kept cannot be read.
+        for place in _places_of_decide():
+            shutil.rmtree(place, ignore_errors=True)
+        return not _is_kept() and _keep_decide(folder, text)
+    if not is_kept:
+        make_room()
+    return True
 
 
 def _not_kept(text: str) -> dict[str, Any]:

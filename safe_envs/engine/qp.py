@@ -243,8 +243,8 @@ def interval_residual(
         root = sqrt(form if form > 0.0 else 0.0)
         value -= root
         form = form if form > 0.0 else 0.0
-        doubt = ROUNDING * (abs(forms[3 * i]) + abs(linear) + square)
-        allowed += sqrt(form + doubt) - root
+        rounding = ROUNDING * (abs(forms[3 * i]) + abs(linear) + square)
+        allowed += sqrt(form + rounding) - root
     return value, allowed
 
 
@@ -705,7 +705,7 @@ def fit_step(
     order, shares = basis + k * m, basis + k * m + m
     ones, target = shares + m, shares + 2 * m
     rest, nothing = target + k, target + 2 * k
-    count, taken = span(k, m, work, 0, violated, fixed, space, triangle, order), 0
+    count, taken = row_space(k, m, work, 0, violated, fixed, space, triangle, order), 0
     for i in range(k):
         taken += 1 if work[violated + i] > 0.0 else 0
     if taken == count:  # all margins can be 0
@@ -724,7 +724,7 @@ def fit_step(
             work[columns + c * k + i] = total
     for c in range(count):
         work[ones + c] = 1.0
-    count = span(count, k, work, columns, ones, nothing, basis, triangle, order)
+    count = row_space(count, k, work, columns, ones, nothing, basis, triangle, order)
     split(count, k, work, target, nothing, basis, triangle, shares, rest)
     for j in range(m):
         total = 0.0
@@ -736,7 +736,7 @@ def fit_step(
 def least_step(
     size: int, n: int, work: Floats, basis: int, triangle: int, values: int, step: int
 ) -> None:
-    """Write the shortest step whose products with the vectors of `span` are given values.
+    """Write the shortest step whose products with the vectors of `row_space` are given values.
 
     The values, in the order of the basis, are overwritten.
     """
@@ -752,7 +752,7 @@ def least_step(
             work[step + j] += value * work[basis + c * n + j]
 
 
-def span(
+def row_space(
     count: int,
     n: int,
     work: Floats,
@@ -817,7 +817,7 @@ def split(
 ) -> None:
     """Write the free entries of a vector as a sum of vectors and a rest that is normal to them.
 
-    `shares` receives the coefficients of the vectors in the basis of `span`, in its order.
+    `shares` receives the coefficients of the vectors in the basis of `row_space`, in its order.
     """
     for j in range(n):
         work[rest + j] = work[vector + j] if work[fixed + j] == 0.0 else 0.0
@@ -897,7 +897,7 @@ def approach(
         work[distance + j] = toward
         whole = max(whole, abs(toward))
     for _ in range(STEPS * (k + m)):
-        count = span(k, m, work, normal, binding, fixed, basis, triangle, order)
+        count = row_space(k, m, work, normal, binding, fixed, basis, triangle, order)
         left, size, part, stop = 0.0, 0.0, 1.0, -1
         for j in range(m):
             work[rest + j] = work[distance + j] - work[step + j]
@@ -959,7 +959,7 @@ def approach(
         out[j] = ends[j] if side < 0.0 else ends[m + j] if side > 0.0 else x
     # Where the input does not move, nearly parallel constraints would only add rounding.
     while moved:
-        count = span(k, m, work, normal, binding, fixed, basis, triangle, order)
+        count = row_space(k, m, work, normal, binding, fixed, basis, triangle, order)
         for _ in range(2):  # the second time takes back rounding
             for c in range(count):
                 i = int(work[order + c])

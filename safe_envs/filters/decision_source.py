@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Iterable
 from typing import Any
 
-from safe_envs.engine.decide import KIND, PLAIN
+from safe_envs.engine.decide import KIND, PLAIN, conclude_single
 from safe_envs.engine.formulas import Source, formulas
 from safe_envs.engine.qp import project_scalar
 from safe_envs.engine.slots import Data
@@ -64,27 +64,26 @@ def filter_source(qp: FilterQP, data: Data, name: str = "decide") -> Source:
     shape, weights, ends = (data.add(part) for part in (made.shape, made.weights, made.ends))
     numbers = [1, size, 0, shape, weights, values, u, ends, out, out, out, *scratch]
     k = len(qp.constraints)
-    if made.shape[KIND] == PLAIN and k == m == 1:  # the commonest, without a call
+    is_scalar = made.shape[KIND] == PLAIN and k == m == 1
+    if is_scalar:  # the commonest, without a call of what others need
         lines += [
-            f"out = vector_view(work, {out}, 3)",
+            f"out = vector_view(work, {out}, 4)",
             "feasible = project_scalar(values[0], values[1], u[0],"
             f" data[{ends}], data[{ends + 1}], out)",
-            "slack, sound = 0.0 if feasible else -out[1], isfinite(out[1] + u[0])",
-            "return (out[0],), u, out[2] > 0.0, feasible, (slack,), 0, sound",
+            "code = conclude_single(1, u, feasible, out)",
         ]
-        body = "".join(f"    {line}\n" for line in lines)
-        decision = Source(f"def {name}(x, u, data, work):\n{body}", (project_scalar,), starts[-1])
-        return text + decision
+    else:
+        lines.append(f"code = decide_at(data, work, {data.add(numbers)})")
     slack = "".join(f"work[{out + m + 2 * k + i}], " for i in range(barriers))
     wanted = "".join(f"work[{out + m + 3 * k + j}], " for j in range(m))
     lines += [
-        f"code = decide_at(data, work, {data.add(numbers)})",
         f"chosen = ({''.join(f'work[{out + j}], ' for j in range(m))})",
         f"wanted = {f'({wanted})' if qp.clf is not None else 'u'}",
         f"return chosen, wanted, code > 1, code % 2 == 1, ({slack}), code // 2 - 1, code >= 0",
     ]
     body = "".join(f"    {line}\n" for line in lines)
-    return text + Source(f"def {name}(x, u, data, work):\n{body}", (), starts[-1])
+    uses = (project_scalar, conclude_single) if is_scalar else ()
+    return text + Source(f"def {name}(x, u, data, work):\n{body}", uses, starts[-1])
 
 
 def _terms(qp: FilterQP, data: Data) -> tuple[Source, list[str], str, int]:

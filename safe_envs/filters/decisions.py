@@ -21,8 +21,14 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.defined import NO_VALUE
-from safe_envs.engine import decide as text
-from safe_envs.engine.decide import answer_length, decide, scratch_lengths, shape_of
+from safe_envs.engine import decide as kernel
+from safe_envs.engine.decide import (
+    answer_length,
+    conclude_single,
+    decide,
+    scratch_lengths,
+    shape_of,
+)
 from safe_envs.engine.program import MachineCode, decider
 from safe_envs.engine.qp import ROUNDING, project, scratch_size
 from safe_envs.errors import ConfigurationError
@@ -78,10 +84,8 @@ class QPValues:
             self.expressions += [growth, *along]
             weights, unit = [input_weight] * (m + 1), math.sqrt(input_weight / slack_weight)
         parts = [self._add(qp, i) for i in range(k)]
-        plain = qp.plain and not any(c.uncertainty for c in constraints)
-        kind = text.CHANGED
-        if plain or solved_as_cones(qp):
-            kind = text.PLAIN if plain else text.UNCERTAIN
+        kind = kernel.UNCERTAIN if solved_as_cones(qp) else kernel.CHANGED
+        kind = kernel.PLAIN if qp.plain else kind
         self.shape = shape_of((k, m, goal), kind, qp.dt, unit, parts)
         self.weights = [*map(float, (*weights, *qp.priorities, *([1.0] * goal)))]
         self.ends = [*map(float, (*qp.low, *qp.high))]
@@ -124,19 +128,19 @@ class FilterQPSolver:
         self._qp, self.values, self._solver = qp, QPValues(qp), solver
         if solver is not None:
             require_solver(solver)
-            if self.values.shape[text.KIND] != text.PLAIN:
+            if self.values.shape[kernel.KIND] != kernel.PLAIN:
                 raise ConfigurationError(
                     f"solver = {solver!r} solves filters of affine constraints; take no solver with"
                     " reciprocal, learned or first-order conditions, goals, maxima and barriers"
                     " without a value"
                 )
         shape = self.values.shape
-        k, m, goal = (int(shape[i]) for i in (text.K, text.M, text.GOAL))
+        k, m, goal = (int(shape[i]) for i in (kernel.K, kernel.M, kernel.GOAL))
         self._k, self._m, self._goal = k, m, goal
-        self._barriers = int(shape[text.OWNED]) or k
-        is_plain = shape[text.KIND] == text.PLAIN and solver is None
-        self._is_single = is_plain and k == 1  # the commonest, in no more time than it takes
-        several = k + goal > 1 or shape[text.SAMPLED] > 0.0
+        self._barriers = int(shape[kernel.OWNED]) or k
+        is_plain = shape[kernel.KIND] == kernel.PLAIN and solver is None
+        self._is_single, self._scratch_size = is_plain and k == 1, scratch_size(k, m)
+        several = k + goal > 1 or shape[kernel.SAMPLED] > 0.0
         self._at_once = several and m + goal > 1
         self._fresh()
 
@@ -213,20 +217,15 @@ class FilterQPSolver:
         Raises:
             UndefinedConstraintError: A constraint or the goal has no finite value.
         """
-        if self._is_single and bounds is None:
-            m, made, values = self._m, self.values, self._values_at(x)
-            out, work = [0.0] * (m + 2), [0.0] * scratch_size(1, m)
-            feasible = project(1, m, values, u, made.ends, made.weights, out, work)
-            margin = out[m]
-            if not math.isfinite(margin + sum(u)):
-                raise _undefined(text.UNDEFINED, 0)
-            slack = 0.0 if feasible else -margin
-            return FilterDecision(out[:m], [margin], [out[-1] > 0.0], feasible, [slack], 0, u)
         ends = None if bounds is None else [*bounds[0], *bounds[1]]
-        code, out = self._decide_one(self._values_at(x), u, ends)
+        decide_one = self._decide_single if self._is_single else self._decide_one
+        code, out = decide_one(self._values_at(x), u, ends)
         if code < 0:
             raise _undefined(code, 0)
         k, m, count = self._k, self._m, self._barriers
+        if self._is_single:
+            active, feasible = out[m + 1] > 0.0, code & 1 == 1
+            return FilterDecision(out[:m], [out[m]], [active], feasible, [out[m + 2]], 0, u)
         return FilterDecision(
             list(out[:m]),
             list(out[m : m + count]),
@@ -255,6 +254,19 @@ class FilterQPSolver:
         except NO_VALUE:
             # Plain floats raise where arrays overflow or give no number.
             return self._table([np.array([c]) for c in x], 1)[:, 0].tolist()
+
+    def _decide_single(
+        self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
+    ) -> _Answer:
+        """Decide on one plain constraint as `decide` does, without what only others need."""
+        m, made = self._m, self.values
+        out, work = [0.0] * (m + 3), [0.0] * self._scratch_size
+        bounds = made.ends if ends is None else ends
+        try:
+            feasible = project(1, m, values, u, bounds, made.weights, out, work)
+        except ArithmeticError:
+            return self._decide_one(values, u, ends)
+        return conclude_single(m, u, feasible, out), out
 
     def _decide_one(
         self, values: Sequence[float], u: Sequence[float], ends: Sequence[float] | None
@@ -285,8 +297,8 @@ class FilterQPSolver:
         except ArithmeticError:  # NumPy's numbers overflow, and have quotients by 0
             with np.errstate(all="ignore"):
                 given, proposed, answer = np.array(values), np.array(u), np.array(out)
-                rooms = [np.array(room) for room in scratch]
-                code = decide(made.shape, made.weights, given, proposed, bounds, answer, rooms)
+                arrays = [np.array(part) for part in scratch]
+                code = decide(made.shape, made.weights, given, proposed, bounds, answer, arrays)
             out = answer.tolist()
         self._frames.append(scratch)
         return code, out
@@ -297,7 +309,7 @@ class FilterQPSolver:
         """Return the answer of another solver, in the form of ours."""
         k, m, weights = self._k, self._m, self.values.weights
         if not math.isfinite(sum(values) + sum(u)):
-            return text.UNDEFINED, []
+            return kernel.UNDEFINED, []
         a, b = np.reshape(values[: k * m], (k, m)), np.array(values[k * m :])
         action, feasible = solve_with(solver, np.column_stack([a, b]), u, ends, weights)
         margin, start = a @ action + b, np.clip(u, ends[:m], ends[m:])
@@ -305,9 +317,9 @@ class FilterQPSolver:
         near = margin <= BINDING * (np.abs(a) @ np.abs(action) + np.abs(b))
         active = near & bool((a @ start + b < 0.0).any())
         out = [*action, *margin.tolist(), *active.astype(float).tolist(), *slack.tolist()]
-        cause = text.furthest(k, m, list(values), list(values), k * m, list(u), weights, out)
-        if self.values.shape[text.OWNED] > 0.0:
-            cause = text.gather_barriers(k, m, self.values.shape, cause, out)
+        cause = kernel.furthest(k, m, list(values), list(values), k * m, list(u), weights, out)
+        if self.values.shape[kernel.OWNED] > 0.0:
+            cause = kernel.gather_barriers(k, m, self.values.shape, cause, out)
         return 2 * cause + 2 + int(feasible), out
 
     def _machine_frame(self) -> CallFrame:
@@ -407,7 +419,7 @@ class CallFrame:
     def __init__(
         self, shape: Sequence[float], weights: Sequence[float], ends: Sequence[float], size: int
     ) -> None:
-        k, m, goal = (int(shape[i]) for i in (text.K, text.M, text.GOAL))
+        k, m, goal = (int(shape[i]) for i in (kernel.K, kernel.M, kernel.GOAL))
         self._ends, self._length = ends, answer_length(k, m, goal)
         parts = [size, m, 2 * m, self._length, *scratch_lengths(shape)]
         starts = [0, *itertools.accumulate(parts)]
@@ -469,7 +481,7 @@ def _address(numbers: np.ndarray) -> int:
 
 
 def _undefined(code: int, index: int) -> UndefinedConstraintError:
-    what = "the goal" if code == text.UNDEFINED_GOAL else "the constraint"
+    what = "the goal" if code == kernel.UNDEFINED_GOAL else "the constraint"
     return UndefinedConstraintError(index, what)
 
 
@@ -495,10 +507,8 @@ def functions_of(constraint: AffineConstraint) -> list[sp.Expr]:
 
 
 def _beyond_rounding(h: sp.Expr) -> sp.Expr:
-    """Return h less its own rounding.
-
-    Where that is not positive, a state and a batch may find h on either side of 0.
-    """
+    """Return h less its own rounding."""
+    # Where that is not positive, a state and a batch may find h on either side of 0.
     return h - sp.Float(ROUNDING, 17) * _size(h)
 
 

@@ -95,4 +95,5 @@ def _solve(solver: str, w: Any, v: Any, g: Any, h: Any, low: Any, high: Any) -> 
 
     problem = qpsolvers.Problem(np.diag(w), -w * v, g, h, lb=low, ub=high)
     found = qpsolvers.solve_problem(problem, solver=solver, **_SETTINGS.get(solver, {}))
-    return found.x if found.found else None
+    x = found.x if found.found else None
+    return x if x is not None and np.isfinite(x).all() else None

@@ -69,7 +69,7 @@ class FilterQP:
         """Whether the constraints at the proposed input are all there is.
 
         Then there is no demand of a reciprocal condition, no sampling margin of first order, no
-        maximum, no goal, no barrier that may have no value, and uncertainty only for one input.
+        maximum, no goal, no uncertainty, and no barrier that may have no value.
         """
         return (
             not self.partial
@@ -78,7 +78,7 @@ class FilterQP:
                 c.demand is None
                 and c.change is None
                 and not c.alternatives
-                and (c.uncertainty is None or self.model.m == 1)
+                and c.uncertainty is None
                 for c in self.constraints
             )
         )

@@ -356,7 +356,7 @@ class SafetyFilter:
     def _solve_by(self, qp: FilterQP, names: Sequence[str]) -> None:
         """Solve a QP; the barriers' names are for messages."""
         self.qp, self._names = qp, names
-        self._decisions = FilterQPSolver(qp, self._solver)
+        self._qp_solver = FilterQPSolver(qp, self._solver)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -365,7 +365,7 @@ class SafetyFilter:
 
     def compile(self) -> None:
         """Import and compile all that any decision may need."""
-        self._decisions.compile()
+        self._qp_solver.compile()
 
     def decide_floats(
         self, x: Sequence[float], u: Sequence[float], bounds: Bounds | None = None
@@ -384,7 +384,7 @@ class SafetyFilter:
             NumericalError: The constraint has no finite value.
         """
         try:
-            return self._decisions.floats(x, u, bounds)
+            return self._qp_solver.floats(x, u, bounds)
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, x) from error
 
@@ -403,7 +403,7 @@ class SafetyFilter:
             The decisions in components.
         """
         try:
-            return self._decisions.arrays(x, u, bounds)
+            return self._qp_solver.arrays(x, u, bounds)
         except UndefinedConstraintError as error:
             raise self.undefined(error.what, [float(c[error.index]) for c in x]) from error
 
@@ -420,7 +420,7 @@ class SafetyFilter:
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.qp.symbols, x, strict=True))
         if which is None and "goal" not in what:
             owners = self.qp.owner_of_each
-            which = list(dict.fromkeys(owners[i] for i in self._decisions.undefined_at(x)))
+            which = list(dict.fromkeys(owners[i] for i in self._qp_solver.undefined_at(x)))
         names = f" on {', '.join([self._names[i] for i in which])}" if which else ""
         return NumericalError(
             f"{what}{names} has no finite value at {at}; check it and the model there"

@@ -449,11 +449,7 @@ class Specification:
         return grow(now, later if len(parts) == 1 else shrink(parts[1], later))
 
     def _subformulas(self) -> tuple[Formula, ...]:
-        """Return the temporal subformulas, and what their windows become.
-
-        Raises:
-            ConfigurationError: There are too many.
-        """
+        """Return the temporal subformulas, and what their windows become."""
         found: dict[Formula, None] = {}
         for part in _parts_of(self.formula):
             pending = part.following if part.kind in ("until", "release") else None
@@ -471,13 +467,7 @@ class Specification:
 
 
 def _formula(given: Parsed, *, negated: bool, outermost: bool) -> Formula:
-    """Return a formula or its negation.
-
-    Args:
-        given: as written.
-        negated: whether to negate it.
-        outermost: whether it is evaluated at the start of the episode.
-    """
+    """Return a formula or its negation."""
 
     def part(i: int, outermost: bool = False) -> Formula:
         return _formula(given.parts[i], negated=negated, outermost=outermost)
@@ -800,14 +790,8 @@ def _common(accepting: bool, following: Sequence[int]) -> int:
 
 
 def _begun(first: np.ndarray, table: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the initial state and the transitions of instant 0.
-
-    Only the initial state has any then, so that it can be one that has these later, or else any.
-
-    Args:
-        first: state after each label of instant 0.
-        table: transitions of instant 1.
-    """
+    """Return the initial state and the transitions of instant 0."""
+    # Only the initial state has any then, so that it can be one that has these later, or else any.
     for a, row in enumerate(table):
         if (row == first).all():
             return a, table

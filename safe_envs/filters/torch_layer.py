@@ -85,10 +85,8 @@ class ActiveSets:
         return held, missed, binding
 
     def _forced(self, a: np.ndarray, u: np.ndarray, slack: np.ndarray) -> np.ndarray:
-        """Return the inputs (m,) that unmet constraints press against their bounds.
-
-        The sum of the forces decides; a (k, m), slack (k,).
-        """
+        """Return the inputs (m,) that unmet constraints press against their bounds."""
+        # The sum of the forces decides; a (k, m), slack (k,).
         forces = (self.priorities * slack)[:, None] * a
         force, size = forces.sum(axis=0), np.abs(forces).sum(axis=0)
         gap = np.where(force > 0.0, self.high - u, u - self.low)
@@ -135,24 +133,13 @@ def _held_and_binding(
     missed: np.ndarray,
     binding: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inputs (m,) and constraints (k,) that hold the action of one state where it is.
-
-    The signs of their multipliers say so.
-
-    The way from the proposal to the action is a nonnegative sum of the normals of the constraints
-    that bind and of the input bounds, and of those of the missed constraints in either direction,
-    since the way must not change what these miss. Nonnegative least squares uses independent ones
-    only.
-
-    Args:
-        a: coefficients in units of the weights, shape (k, m).
-        way: from the proposal to the action, in the same units, shape (m,).
-        low: inputs that may be held at their lower bounds, shape (m,).
-        high: inputs that may be held at their upper bounds, shape (m,).
-        fixed: inputs that are held in any case, shape (m,).
-        missed: constraints that cannot be met, shape (k,).
-        binding: constraints that may bind, shape (k,).
-    """
+    """Return the inputs (m,) and constraints (k,) that hold the action of one state where it is."""
+    # The signs of their multipliers say so.
+    #
+    # The way from the proposal to the action is a nonnegative sum of the normals of the constraints
+    # that bind and of the input bounds, and of those of the missed constraints in either direction,
+    # since the way must not change what these miss. Nonnegative least squares uses independent ones
+    # only.
     left, m = ~fixed, len(way)
     size = np.abs(way[left]).max(initial=0.0)
     if size == 0.0:
@@ -380,11 +367,7 @@ class TorchFilter(torch.nn.Module):
     def _formula(
         self, states: torch.Tensor, inputs: torch.Tensor, found: Any
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the actions (B, m) as functions of states (B, n) and inputs (B, m).
-
-        Returns:
-            The formulas, which hold near these states and inputs, and where they do (B,).
-        """
+        """Return the actions (B, m) as functions of states (B, n) and inputs (B, m)."""
         sets = self._sets
         m, k = len(sets.low), len(sets.priorities)
         action, active, slack = (

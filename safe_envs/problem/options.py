@@ -56,10 +56,8 @@ def _option(
     repeatable: bool = False,
     least: int | None = None,
 ) -> Any:
-    """Return a field with what a command line needs: the reader is None where a number is read.
-
-    The least number is that of an option that takes whole ones.
-    """
+    """Return a field with what a command line needs: the reader is None where a number is read."""
+    # The least number is that of an option that takes whole ones.
     of_texts = {"reader": reader, "metavar": metavar, "repeatable": repeatable, "least": least}
     return field(default=None, metadata={"help": text, **of_texts})
 

@@ -107,11 +107,7 @@ def _require_gains(gains: Sequence[float], name: str, degree: int) -> None:
 
 
 def _safe_starts(problem: SafetyProblem) -> Components:
-    """Return the starts that are in the workspace and safe.
-
-    Raises:
-        SystemDefinitionError: there are none.
-    """
+    """Return the starts that are in the workspace and safe."""
     proposals = problem.starts[problem.start].proposals(_STARTS)
     x, states = tuple(proposals.T.copy()), problem.plant.states
     within = np.ones(_STARTS, dtype=bool)

@@ -174,20 +174,16 @@ class SafeSetAnalysis:
         )
 
     def _noise_at_the_edge(self, i: int) -> bool:
-        """Return whether |sigma' grad h|^2 does not fall with h like h, by which it is divided.
-
-        The largest one over points with a small h is compared with the largest one over points with
-        an even smaller h.
-        """
+        """Return whether |sigma' grad h|^2 does not fall with h like h, by which it is divided."""
+        # The largest one over points with a small h is compared with the largest one over points
+        # with an even smaller h.
         far, near = (self._largest_variation(i, part) for part in (_NEAR, _NEARER))
         typical = float(np.nanmedian(self.formulas.variation_rates(self.safe.points)[:, i]))
         return near > _FALL * far and near > _TOUCHED * _NEARER * typical
 
     def _largest_variation(self, i: int, part: float) -> float:
-        """Return the largest |sigma' grad h|^2 where h is a part of its size in C.
-
-        The states are on the straight lines from points of C to points beyond.
-        """
+        """Return the largest |sigma' grad h|^2 where h is a part of its size in C."""
+        # The states are on the straight lines from points of C to points beyond.
         formulas, rng = self.formulas, self.rng(3)
 
         def h(x: np.ndarray) -> np.ndarray:

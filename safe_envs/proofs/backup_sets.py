@@ -593,10 +593,8 @@ def _bisected(cells: Interval, width: np.ndarray, cut: np.ndarray) -> Interval:
 
 
 def _meeting(e: Ellipsoid, cells: Interval) -> Interval:
-    """Return the cells without those that are surely outside of the ellipsoid.
-
-    On a cell with the midpoint m and the half widths r, |L'(y - e)| >= |L'(m - e)| - | |L'| r |.
-    """
+    """Return the cells without those that are surely outside of the ellipsoid."""
+    # On a cell with the midpoint m and the half widths r, |L'(y - e)| >= |L'(m - e)| - | |L'| r |.
     middle = 0.5 * cells.low + 0.5 * cells.high
     radius = np.maximum(cells.high - middle, middle - cells.low)
     distance = np.linalg.norm((middle - e.center) @ e.root, axis=1)

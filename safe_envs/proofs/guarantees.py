@@ -1263,10 +1263,8 @@ class ChainGuarantee:
 
     @property
     def _surely_nothing(self) -> bool:
-        """Whether the bound is 0 at the starts whatever the judge proves.
-
-        The numbers that the search found are too small, if anything, and make it too large.
-        """
+        """Whether the bound is 0 at the starts whatever the judge proves."""
+        # The numbers that the search found are too small, if anything, and make it too large.
         suprema = self.analysis.suprema
         if self.formulas.certain or not np.isfinite(suprema).all():
             return False

@@ -457,10 +457,8 @@ class BranchAndBound:
     def _crosses(
         self, low: np.ndarray, high: np.ndarray, found: Enclosures, chosen: np.ndarray
     ) -> bool:
-        """Return whether the claim fails on a whole box across which a zero is crossed.
-
-        One of the expressions that are 0 in the region is continuous, and takes both signs there.
-        """
+        """Return whether the claim fails on a whole box across which a zero is crossed."""
+        # One of the expressions that are 0 in the region is continuous, and takes both signs there.
         if len(found.zeros) != 1:
             return False
         fails = found.inside & (found.claim.range.high < 0.0) & np.isfinite(found.claim.range.low)

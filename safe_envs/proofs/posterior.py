@@ -378,10 +378,8 @@ def _require_smooth(
 
 
 def _require_consistent(posterior: Posterior) -> None:
-    """Raise ConfigurationError where the data show a misfit or varying noise beyond chance.
-
-    The regions of the weights and of sigma are for exact features and constant noise.
-    """
+    """Raise ConfigurationError where the data show a misfit or varying noise beyond chance."""
+    # The regions of the weights and of sigma are for exact features and constant noise.
     for state, misfit, varying in zip(
         posterior.features.states, posterior.misfit, posterior.variation, strict=True
     ):
@@ -400,10 +398,8 @@ def _require_consistent(posterior: Posterior) -> None:
 def _require_inside(
     level: Score, region: Region, problem: SafetyProblem, rng: np.random.Generator
 ) -> None:
-    """Raise ConfigurationError where C reaches beyond ranges that were chosen for unbounded states.
-
-    It may reach beyond the workspace, where episodes are at an end.
-    """
+    """Raise ConfigurationError where C reaches beyond the ranges of unbounded states."""
+    # It may reach beyond the workspace, where episodes are at an end.
     if (level(region.beyond(rng, *workspace_of(problem))) >= 0.0).any():
         raise ConfigurationError(
             "C reaches beyond the states that are searched, so that neither sup h nor the shortfall"

@@ -246,11 +246,9 @@ def _evolved(
 
 
 def _moved(x: np.ndarray, top: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
-    """Return a trial for each member, by a difference or by a normal step.
-
-    A quarter begins at the best member, the others at themselves. Normal steps are of all
-    sizes, along one axis or all: where a whole ridge is best, differences never get small.
-    """
+    """Return a trial for each member, by a difference or by a normal step."""
+    # A quarter begins at the best member, the others at themselves. Normal steps are of all sizes,
+    # along one axis or all: where a whole ridge is best, differences never get small.
     size, n = x.shape
     base = np.where(rng.random((size, 1)) < 0.25, top, x)
     difference = rng.uniform(0.3, 1.0, (size, 1)) * (
@@ -906,10 +904,8 @@ def _nearest_zero(
     region: Region,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray | None, bool]:
-    """Return a state (n,) of the set where a function is next to 0, and whether it reaches 0 there.
-
-    None if no such state is found.
-    """
+    """Return a state (n,) of the set where a function is next to 0, and whether it is 0 there."""
+    # None if no such state is found.
     values = tabulated(states, [base])
 
     def size(x: np.ndarray) -> np.ndarray:

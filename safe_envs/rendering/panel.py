@@ -95,10 +95,8 @@ class BarrierChart:
         canvas.text(now, (right - width - 14, y), INK, SMALL, bold=True, align=(1.0, 0.0))
 
     def _period(self, now: float) -> Range:
-        """Return the times that the chart shows: the horizon, or the latest part of that length.
-
-        Without a horizon all is shown, for 100, 200, 400, ... control periods.
-        """
+        """Return the times that the chart shows: the horizon, or the latest part of that length."""
+        # Without a horizon all is shown, for 100, 200, 400, ... control periods.
         if self._problem.steps == 1:
             first = _FIRST_STEPS * self._problem.dt
             return 0.0, first * 2.0 ** max(0, math.ceil(math.log2(max(now, first) / first)))

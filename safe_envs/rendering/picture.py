@@ -76,11 +76,9 @@ class Window:
 
 
 def _forget_all() -> None:
-    """Destroy the windows that ended with the display.
-
-    SDL may give a new window the address of an old one: destroying the old one later would end the
-    new one.
-    """
+    """Destroy the windows that ended with the display."""
+    # SDL may give a new window the address of an old one: destroying the old one later would end
+    # the new one.
     for each in _OPEN:
         each._window.destroy()
 
@@ -140,13 +138,7 @@ class Picture:
 
 
 def _photograph(canvas: Canvas, pixels: np.ndarray, box: Box) -> None:
-    """Show a picture as large as it fits into a box.
-
-    Args:
-        canvas: to draw on.
-        pixels: uint8 of shape (height, width, 3).
-        box: left, top, width and height.
-    """
+    """Show a picture as large as it fits into a box."""
     left, top, width, height = box
     shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
     scale = min(width / shown.get_width(), height / shown.get_height())

@@ -149,11 +149,7 @@ def _evaluate_rare(
     policy: str,
     arguments: dict[str, Any],
 ) -> None:
-    """Estimate, print and write.
-
-    Raises:
-        ConfigurationError: one of the refused options was given.
-    """
+    """Estimate, print and write."""
     from safe_envs.agents.rare_events.estimate import estimate_rare
     from safe_envs.scripts.reports.evaluation import print_rare
 

@@ -116,11 +116,7 @@ def identify(
 
 
 def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Transitions:
-    """Load the data of a file, for a method that can learn from them.
-
-    Raises:
-        ConfigurationError: the method cannot, or the file holds none.
-    """
+    """Load the data of a file, for a method that can learn from them."""
     from safe_envs.filters.learning.data import Transitions
 
     if "data" not in inspect.signature(learner).parameters:

@@ -82,14 +82,13 @@ def turn_rate_towards(wanted_x: sp.Expr, wanted_y: sp.Expr) -> sp.Expr:
 
 
 def _patrol(r: float) -> tuple[sp.Expr, sp.Expr]:
-    """Return reward and turn rate for riding a circle that lies partly outside the disk.
-
-    The vehicle rides counterclockwise.
-
-    The wanted course is the circle's tangent, turned outward inside the circle and inward beyond
-    it, in proportion to the distance from it. The circle is not the edge itself: a filtered vehicle
-    would come arbitrarily near to h = 0 there, where rounding decides whether that is a violation.
-    """
+    """Return reward and turn rate for riding a circle that lies partly outside the disk."""
+    # The vehicle rides counterclockwise.
+    #
+    # The wanted course is the circle's tangent, turned outward inside the circle and inward beyond
+    # it, in proportion to the distance from it. The circle is not the edge itself: a filtered
+    # vehicle would come arbitrarily near to h = 0 there, where rounding decides whether that is a
+    # violation.
     radius, from_center = 0.75 * r, x - 0.5 * r
     distance = sp.sqrt(
         from_center**2 + y**2 + 1e-9 * r**2

@@ -166,10 +166,8 @@ class _Pairs:
         ]
 
     def _test(self, coordinate: Variable, period: float, value: Any) -> None:
-        """Take functions of a coordinate whose products tell laws apart.
-
-        Products such as r cos(phi) and r^2 cos(phi)^2 are smooth where a distance r is not.
-        """
+        """Take functions of a coordinate whose products tell laws apart."""
+        # Products such as r cos(phi) and r^2 cos(phi)^2 are smooth where a distance r is not.
         if value == 0:
             return
         width = coordinate.high - coordinate.low
@@ -298,11 +296,9 @@ class _Pairs:
         yield tuple(self._random.uniform(*box).tolist())
 
     def _region(self, margin: float = 0.0) -> list[tuple[float, float]]:
-        """Return where states are drawn.
-
-        That is the workspace and a margin around it, and for unbounded states where the system is
-        sampled.
-        """
+        """Return where states are drawn."""
+        # That is the workspace and a margin around it, and for unbounded states where the system is
+        # sampled.
         try:
             explored: Any = self._problem.sampling_domain.region
         except SystemDefinitionError:

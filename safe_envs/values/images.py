@@ -298,10 +298,8 @@ class Step:
         )
 
     def _intervals(self) -> list[int]:
-        """Return numbers of intervals of the boxed normals.
-
-        The more one of them moves the coordinates, as parts of their ranges, the more it has.
-        """
+        """Return numbers of intervals of the boxed normals."""
+        # The more one of them moves the coordinates, as parts of their ranges, the more it has.
         reduced, channels = self._reduced, len(self.parts.boxed)
         if channels < 2:
             return [_ALONE] * channels

@@ -648,10 +648,8 @@ class LookAhead:
         sign: int,
         a: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return bounds under inputs (1 or B, V, m, 2).
-
-        A positive sign is for the lower table, a negative one for that of the negative upper one.
-        """
+        """Return bounds under inputs (1 or B, V, m, 2)."""
+        # A positive sign is for the lower table, a negative one for that of the negative upper one.
         k, q = np.asarray(k), self._coordinates(x)
         if self._product is None:
             return self._tables.bounds(k, q, inputs, sign, np.zeros(len(k), dtype=np.int64))

@@ -436,11 +436,9 @@ class PromiseFilter:
         begun: tuple[np.ndarray, np.ndarray],
         spacing: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Go from allowed inputs towards the proposed ones, as far as q_k is seen to allow it.
-
-        q_k need not be monotone on the way: only inputs whose own q_k is large enough are taken.
-        The way beyond the next of the inputs that were looked at, not allowed, is left out.
-        """
+        """Go from allowed inputs towards the proposed ones, as far as q_k is seen to allow it."""
+        # q_k need not be monotone on the way: only inputs whose own q_k is large enough are taken.
+        # The way beyond the next of the inputs that were looked at, not allowed, is left out.
         action, found = begun
         way = given - action
         length = np.sqrt((way**2).sum(axis=1))
@@ -464,10 +462,8 @@ class PromiseFilter:
 def _closest(
     inputs: np.ndarray, values: np.ndarray, level: np.ndarray, given: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest allowed inputs, of V (V, m) whose q_k are (B, V), and their q_k.
-
-    Where none is allowed it is another one, with a q_k below the level.
-    """
+    """Return the nearest allowed inputs, of V (V, m) whose q_k are (B, V), and their q_k."""
+    # Where none is allowed it is another one, with a q_k below the level.
     distance = sum((inputs[:, j] - given[:, j, None]) ** 2 for j in range(inputs.shape[1]))
     where = np.where(values >= level[:, None], distance, np.inf).argmin(axis=1)
     return inputs[where], np.take_along_axis(values, where[:, None], axis=1)[:, 0]

@@ -364,10 +364,8 @@ def _quotient(
 
 
 def _unrolled(axis: Axis, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return edges, also of the copies of a periodic axis, their numbers, and their errors.
-
-    The number of an edge is that of the step at it: from the cell before to that cell.
-    """
+    """Return edges, also of the copies of a periodic axis, their numbers, and their errors."""
+    # The number of an edge is that of the step at it: from the cell before to that cell.
     if not axis.period:
         return axis.edges, np.arange(axis.count + 1), np.zeros(axis.count + 1)
     copies = int(np.ceil(REACH * 1.01 * size / axis.period)) + 1

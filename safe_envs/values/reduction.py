@@ -191,11 +191,9 @@ def _collected(expression: Any, symbol: sp.Symbol) -> Any:
 
 
 def _with_mean_angles(expression: Any) -> Any:
-    """Write the sum of two cosines as twice the cosine of the mean times that of half the gap.
-
-    The rates that a step of Runge and Kutta takes of a heading are at its start, middle and end: so
-    the heading occurs once.
-    """
+    """Write the sum of two cosines as twice the cosine of the mean times that of half the gap."""
+    # The rates that a step of Runge and Kutta takes of a heading are at its start, middle and end:
+    # so the heading occurs once.
     turns: dict[Any, list[Any]] = {}
     rest: list[Any] = []
     for term in sp.Add.make_args(expression):

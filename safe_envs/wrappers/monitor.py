@@ -282,10 +282,8 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         )
 
     def _of_same_step(self, observation: Any, ended: np.ndarray, info: Info) -> Info:
-        """Return what is shown after a step that restarted the envs that ended.
-
-        Their last step goes to `final_info`.
-        """
+        """Return what is shown after a step that restarted the envs that ended."""
+        # Their last step goes to `final_info`.
         if not ended.any():
             return self._seen(observation, self.episodes.everywhere)
         # Observations may be dicts or tuples of arrays.

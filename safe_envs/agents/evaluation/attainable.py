@@ -136,15 +136,7 @@ def simulate(
 def _play(
     env: SafeVectorEnv, policy: BestPolicy, seeds: list[int], counts: np.ndarray, tell: Progress
 ) -> tuple[int, int]:
-    """Count the episodes of a batch that stay safe to their end, and those that leave while safe.
-
-    Args:
-        env: to simulate.
-        policy: who acts.
-        seeds: of the episodes.
-        counts: which of them count.
-        tell: called with the part that is done.
-    """
+    """Count the episodes of a batch that stay safe to their end, and that leave while safe."""
     plant, problem = env.problem.plant, env.problem
     outside = compile_function(plant.states, (plant.numeric(problem.outside),), "arrays")
     observation, info = env.reset(seed=seeds)
@@ -500,16 +492,8 @@ def leaves_safely(problem: SafetyProblem) -> bool:
 
 
 def _extents(barrier: Any) -> dict[Any, tuple[float, float]]:
-    """Return the range of each state in the ellipsoid where a concave quadratic form is positive.
-
-    With c + b'x - x'Qx = h0 - (x - x0)'Q(x - x0), the range of x_i is x0_i -+ sqrt(h0 (1/Q)_ii).
-
-    Args:
-        barrier: any expression.
-
-    Returns:
-        Nothing where it is no such form, or nowhere positive.
-    """
+    """Return the range of each state where a concave quadratic form is positive."""
+    # With c + b'x - x'Qx = h0 - (x - x0)'Q(x - x0), the range of x_i is x0_i -+ sqrt(h0 (1/Q)_ii).
     symbols: list[Any] = sorted(barrier.free_symbols, key=str)
     if not symbols or not barrier.is_polynomial(*symbols):
         return {}

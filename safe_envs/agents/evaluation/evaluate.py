@@ -554,10 +554,8 @@ def refine(
 
 
 def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
-    """Return a row without bounds of continuous control that the rate of a finer one contradicts.
-
-    What is of the env's own steps is of its own period, and no other one contradicts it.
-    """
+    """Return a row without continuous bounds that the rate of a finer one contradicts."""
+    # What is of the env's own steps is of its own period, and no other one contradicts it.
     for evaluation in finer:
         finer_row = evaluation.row(row.filter)
         row = continuous_judged(row, *upper_ends_of(finer_row, evaluation.spec.confidence))

@@ -20,21 +20,6 @@ def action_of_input(u: float, low: float, high: float, center: float, half: floa
     return (clipped - center) / half
 
 
-def input_of_action(action: float, center: float, half: float) -> float:
-    """Return the input that an env executes for an action; NaN for NaN.
-
-    Args:
-        action: what lies beyond [-1, 1] is clipped.
-        center: middle of the input bounds.
-        half: half of their distance.
-    """
-    if action > 1.0:
-        return center + half
-    if action < -1.0:
-        return center - half
-    return center + half * action
-
-
 def random_action(place: int, k0: int, k1: int) -> float:
     """Return the action that a word of the policy's stream of an episode stands for.
 

@@ -194,7 +194,7 @@ class CLFController(StatelessPolicy):
             [pair[1] for pair in problem.input_bounds],
         )
         qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
-        self._qp, self._decisions = qp, FilterQPSolver(qp)
+        self._qp, self._qp_solver = qp, FilterQPSolver(qp)
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Solve the QP; see `StatelessPolicy.actions`.
@@ -205,10 +205,10 @@ class CLFController(StatelessPolicy):
         x = np.ascontiguousarray(given[..., self._columns].T)
         try:
             if given.ndim == 1:
-                found = self._decisions.floats(tuple(x.tolist()), [0.0] * len(self._half))
+                found = self._qp_solver.floats(tuple(x.tolist()), [0.0] * len(self._half))
             else:
                 nothing = (np.zeros(len(given)),) * len(self._half)
-                found = self._decisions.arrays(tuple(x), nothing)
+                found = self._qp_solver.arrays(tuple(x), nothing)
             inputs = found.proposed
         except (ArithmeticError, ValueError) as error:
             row = (

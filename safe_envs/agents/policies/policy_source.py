@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from safe_envs.agents.policies.actions_kernel import input_of_action
 from safe_envs.agents.policies.base import Policy, not_compilable
 from safe_envs.engine.formulas import Source
 from safe_envs.engine.program import has_own_source
 from safe_envs.engine.slots import Data
+from safe_envs.envs.batch_kernel import scaled_action
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.problem.problem import SafetyProblem
 
@@ -34,10 +34,10 @@ def policy_source(policy: Any, problem: SafetyProblem, data: Data) -> Source:
     entries = ""
     for j, (center, half) in enumerate(zip(*center_and_half_width(problem), strict=True)):
         place = data.add([center, half])
-        entries += f"input_of_action(actions[{j}], data[{place}], data[{place + 1}]), "
+        entries += f"scaled_action(actions[{j}], data[{place}], data[{place + 1}]), "
     return chosen + Source(
         "def act(observation, step, k0, k1, data, work):\n"
         "    actions = choose(observation, step, k0, k1, data, work)\n"
         f"    return ({entries})\n",
-        (input_of_action,),
+        (scaled_action,),
     )

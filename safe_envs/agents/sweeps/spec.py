@@ -243,10 +243,8 @@ def _word(name: str, value: Any, what: str) -> str:
 
 
 def _number(name: str, value: Any, what: str) -> Any:
-    """Return a finite number, or a word where an env takes one.
-
-    All but those of a barrier, which may be counts, are floats, so that equal cells are one cell.
-    """
+    """Return a finite number, or a word where an env takes one."""
+    # All but those of a barrier, which may be counts, are floats, so that equal cells are one cell.
     given = value
     if isinstance(value, str):
         try:

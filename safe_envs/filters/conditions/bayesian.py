@@ -161,10 +161,8 @@ class BayesianSCBF(LearnedCondition):
         return 1.0 - (self.simultaneous or 0.0) - self.delta_theta
 
     def _least_ito_term(self, system: ControlAffineSDE, barrier: Barrier) -> sp.Expr:
-        """Return 1/2 tr(sigma sigma' h_xx).
-
-        For the simultaneous form it is the smallest that the intervals of the sigma_i allow.
-        """
+        """Return 1/2 tr(sigma sigma' h_xx)."""
+        # For the simultaneous form it is the smallest that the intervals of the sigma_i allow.
         if self.simultaneous is None:
             return ito_correction(system, barrier.expression)
         curvatures = [sp.diff(barrier.expression, s, 2) / 2 for s in system.states]

@@ -118,11 +118,7 @@ def generator_parts(
 def _ito_parts(
     certificate: BarrierCertificate,
 ) -> tuple[list[tuple[sp.Expr, Polynomial]], Polynomial]:
-    """Return 1/2 tr(sigma' psi_xx sigma) + a psi + m in parts.
-
-    Returns:
-        Second derivatives with weights that depend on the state, and the sum of all else.
-    """
+    """Return 1/2 tr(sigma' psi_xx sigma) + a psi + m in parts."""
     plant, psi = certificate.plant, certificate.psi
     sigma: Any = sp.Matrix(plant.diffusion)
     covariance, n = sigma * sigma.T, len(plant.states)

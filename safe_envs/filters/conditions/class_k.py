@@ -81,10 +81,8 @@ def parsed(text: str) -> Any:
 
 
 def _require_few_parts(tree: ast.expr) -> None:
-    """Raise ConfigurationError for an expression larger than a person writes.
-
-    It does not recurse, since the tree may be as deep as it is large.
-    """
+    """Raise ConfigurationError for an expression larger than a person writes."""
+    # It does not recurse, since the tree may be as deep as it is large.
     parts, functions, left = 0, 0, [(tree, 0)]
     while left:
         node, depth = left.pop()
@@ -145,11 +143,7 @@ def _number(text: str) -> int | float:
 
 
 def _small(expression: Any, node: ast.expr) -> Any:
-    """Return an expression whose numbers are small, so that the next operation takes no time.
-
-    Raises:
-        ConfigurationError: one is not.
-    """
+    """Return an expression whose numbers are small, so that the next operation takes no time."""
     exponents = [power.exp for power in expression.atoms(sp.Pow)]
     numbers = expression.atoms(sp.Number)
     fits = all(e.is_Number and abs(e) <= _LARGEST_EXPONENT for e in exponents) and all(
@@ -208,10 +202,8 @@ def _tanh(argument: Any) -> Any:
 
 
 def _modulus(argument: Any) -> Any:
-    """Return the modulus of a number.
-
-    That of a complex number is real, but floats have no complex number on the way there.
-    """
+    """Return the modulus of a number."""
+    # That of a complex number is real, but floats have no complex number on the way there.
     if isinstance(argument, mpmath.mpc):
         raise ValueError("the modulus of a number that is not real")
     return abs(argument)

@@ -291,10 +291,8 @@ def fit(rows: Rows, design: np.ndarray, features: Features | None, prior: Prior)
 
 
 def _residuals(rows: Rows, design: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the noise in the R transitions, (R, n), and its degrees of freedom N.
-
-    It is the scatter within the rows where these repeat, and else what a first fit leaves.
-    """
+    """Return the noise in the R transitions, (R, n), and its degrees of freedom N."""
+    # It is the scatter within the rows where these repeat, and else what a first fit leaves.
     if rows.repeated:
         return rows.deviation, float(len(rows.group) - len(rows.count))
     weight = np.sqrt(rows.dt * rows.count)[:, None]
@@ -345,10 +343,8 @@ def _regressed(
 
 
 def _variation(rows: Rows, residual: np.ndarray, noise: Diffusion) -> np.ndarray:
-    """Return the part by which the variance of each state varies as a quadratic of the state, (n,).
-
-    It is 0 where that may be chance.
-    """
+    """Return the share of each state's variance that is quadratic in the state, (n,)."""
+    # It is 0 where that may be chance.
     centred = rows.x - rows.x.mean(axis=0)
     scaled = centred / np.maximum(abs(centred).max(axis=0), np.finfo(float).tiny)
     terms = np.column_stack((np.ones(len(scaled)), scaled, scaled**2))
@@ -364,10 +360,8 @@ def _variation(rows: Rows, residual: np.ndarray, noise: Diffusion) -> np.ndarray
 
 
 def _correlation(white: np.ndarray) -> np.ndarray:
-    """Return the correlations (n, n) of residuals (R, n) of variance 1.
-
-    They are the unit matrix where none is significant, and 0 for a state without noise.
-    """
+    """Return the correlations (n, n) of residuals (R, n) of variance 1."""
+    # They are the unit matrix where none is significant, and 0 for a state without noise.
     n = white.shape[1]
     sizes = np.sqrt((white**2).sum(axis=0))
     sizes[sizes == 0] = 1.0
@@ -641,10 +635,8 @@ def _confounded(terms: Sequence[str], null: np.ndarray) -> str:
 def _weak(
     terms: Sequence[str], seen: np.ndarray, learned: Gaussian, prior: float
 ) -> list[tuple[str, ...]]:
-    """Return for each output the terms in directions that the data hardly show.
-
-    `seen` (r, D) is a basis of the directions that they show at all.
-    """
+    """Return for each output the terms in directions that the data hardly show."""
+    # `seen` (r, D) is a basis of the directions that they show at all.
     values, vectors = np.linalg.eigh(seen @ learned.covariance @ seen.T)
     found = []
     for sizes, directions in zip(values, vectors, strict=True):
@@ -825,12 +817,10 @@ def _degree(problem: SafetyProblem, rows: int) -> int:
 def _held_out(
     data: Transitions, features: Features, scale: np.ndarray, varying: Features | None, prior: Prior
 ) -> dict[str, float]:
-    """Return root-mean-square errors of the rates at start states left out, for each state.
-
-    They are in its units per s, with the part that the noise of the data explains; and in standard
-    deviations of the prediction, which are 1 where the posterior is right. Empty where the data are
-    too few to leave any out.
-    """
+    """Return root-mean-square errors of the rates at start states left out, for each state."""
+    # They are in its units per s, with the part that the noise of the data explains; and in
+    # standard deviations of the prediction, which are 1 where the posterior is right. Empty where
+    # the data are too few to leave any out.
     if len(np.unique(data.x, axis=0)) < _FEWEST_HELD_OUT:
         return {}
     trained, held = (

@@ -203,14 +203,12 @@ def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:
 def _standardisation(
     columns: np.ndarray, sizes: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and scale of each column (N, k).
-
-    A column that should be constant, such as Delta_2 of a Dubins vehicle, still varies by the
-    rounding and truncation of its labels, up to about 1e-5 of its size. Divided by its own
-    deviation, that noise would weigh as much in the loss as a signal; so the scale is at least 1e-4
-    of the size. The network can still follow such a column, to a fraction of that. There is no
-    absolute floor: units may make a signal as small as they like.
-    """
+    """Return mean and scale of each column (N, k)."""
+    # A column that should be constant, such as Delta_2 of a Dubins vehicle, still varies by the
+    # rounding and truncation of its labels, up to about 1e-5 of its size. Divided by its own
+    # deviation, that noise would weigh as much in the loss as a signal; so the scale is at least
+    # 1e-4 of the size. The network can still follow such a column, to a fraction of that. There is
+    # no absolute floor: units may make a signal as small as they like.
     least = 1e-4 * (np.abs(columns).max(axis=0) if sizes is None else sizes)
     scale = np.maximum(columns.std(axis=0), least)
     return columns.mean(axis=0), np.where(scale > 0, scale, 1.0)
@@ -481,10 +479,8 @@ def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
 
 
 def _differences(h: np.ndarray, degree: int, dt: float) -> np.ndarray:
-    """Return derivatives 1..degree at the beginning of paths with samples (..., S + 1) dt apart.
-
-    The shape is (..., degree).
-    """
+    """Return derivatives 1..degree at the beginning of paths with samples (..., S + 1) dt apart."""
+    # The shape is (..., degree).
     # Exact rationals, about 1 as sympy has it: weights that miss the sum 0 by a rounding would add
     # that times h/dt^j.
     table = sp.finite_diff_weights(degree, list(range(1, h.shape[-1] + 1)))

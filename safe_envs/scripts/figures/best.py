@@ -130,15 +130,7 @@ def _draw_plane(
     lower: np.ndarray,
     upper: np.ndarray,
 ) -> list[Any]:
-    """Draw the lower envelope over a plane with level lines, and the set where it is high.
-
-    Args:
-        figure: with the panel, for the colour bar.
-        panel: to draw on.
-        edges: of the cells along both axes.
-        lower: lower envelope, shape (N, M).
-        upper: upper envelope, of the same shape.
-    """
+    """Draw the lower envelope over a plane with level lines, and the set where it is high."""
     colors = ListedColormap(list(_SHADES))
     norm = BoundaryNorm(_LEVELS, colors.N)
     shown = np.ma.masked_where(upper <= 0.0, lower).T

@@ -118,10 +118,8 @@ def _on_grid(
 def _limits(
     safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.ndarray, alike: bool
 ) -> np.ndarray:
-    """Return limits (low, high) of both axes.
-
-    They contain the trajectories, and the whole safe set if it is bounded and not far larger.
-    """
+    """Return limits (low, high) of both axes."""
+    # They contain the trajectories, and the whole safe set if it is bounded and not far larger.
     limits = np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)], axis=1)
     width = np.maximum(limits[:, 1] - limits[:, 0], 1e-3)
     horizontal, vertical, h = _on_grid(safe, limits + np.outer(width, (-1.0, 1.0)))
@@ -214,15 +212,7 @@ def _first_episodes(evaluation: Evaluation, looks: _Looks, most: int) -> dict[st
 
 
 def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> dict[str, list[Axes]]:
-    """Draw the first episode under each filter in a column of its own, with common scales.
-
-    Args:
-        grid: for the panels.
-        episodes: by filter.
-
-    Returns:
-        The panels, by filter.
-    """
+    """Draw the first episode under each filter in a column of its own, with common scales."""
     shape, h_at = grid.get_geometry(), next(iter(episodes.values())).barrier_panel
     panels = np.array([grid.figure.add_subplot(cell) for cell in grid]).reshape(shape)
     for (name, drawn), column in zip(episodes.items(), panels.T, strict=True):
@@ -248,13 +238,7 @@ def _draw_episodes(grid: Any, episodes: dict[str, LogPanels]) -> dict[str, list[
 def _handles_of(
     evaluation: Evaluation, episodes: dict[str, LogPanels], panels: dict[str, list[Axes]]
 ) -> list[Any]:
-    """Return the entries of the legend that the first episodes add to those of the filters.
-
-    Args:
-        evaluation: with the barriers.
-        episodes: by filter.
-        panels: of each.
-    """
+    """Return the entries of the legend that the first episodes add to those of the filters."""
     marks: dict[str, Any] = {}
     seen: set[int] = set()
     for name, drawn in episodes.items():
@@ -284,10 +268,8 @@ def _faintness(evaluation: Evaluation) -> float:
 
 
 def _draw_barrier(axes: Axes, evaluation: Evaluation, looks: _Looks) -> None:
-    """Draw median and 5 to 95 % band of h, as long as half of the episodes are under way.
-
-    Later quantiles would be of the survivors, and jump when one ends.
-    """
+    """Draw median and 5 to 95 % band of h, as long as half of the episodes are under way."""
+    # Later quantiles would be of the survivors, and jump when one ends.
     lowest = highest = last = 0.0
     faint = _faintness(evaluation)
     for row in evaluation.rows:

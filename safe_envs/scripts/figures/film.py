@@ -144,11 +144,9 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -
 
 
 def _durations(seconds: float) -> Iterator[int]:
-    """Yield how long each frame of an animation is shown, in ms.
-
-    The format counts in hundredths of a second. The ends of frames are rounded, not their lengths,
-    so that errors do not add up.
-    """
+    """Yield how long each frame of an animation is shown, in ms."""
+    # The format counts in hundredths of a second. The ends of frames are rounded, not their
+    # lengths, so that errors do not add up.
     end = 0
     for k in itertools.count(1):
         start, end = end, max(end + 1, round(100 * k * seconds))

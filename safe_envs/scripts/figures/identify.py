@@ -140,11 +140,7 @@ def _constant_noise(found: IdentifyAnswer) -> Diffusion | None:
 
 
 def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
-    """Draw estimates against a truth that varies, or a histogram for one that does not.
-
-    Returns:
-        The handle for the legend.
-    """
+    """Draw estimates against a truth that varies, or a histogram for one that does not."""
     off = "truth 0" if function.relative is None else f"error {relative_text(function.relative)}"
     lines = [function_symbol(function.name), off]
     power = _power(np.concatenate([function.truth, function.estimate]))

@@ -321,10 +321,8 @@ def _write(figure: Figure, part: Path, kind: str) -> None:
 
 @contextmanager
 def _laid_out(figure: Figure) -> Iterator[None]:
-    """Let a figure have one layout in all formats, however often it is written.
-
-    That of Matplotlib begins where the last one ended, with the letters of the format.
-    """
+    """Let a figure have one layout in all formats, however often it is written."""
+    # That of Matplotlib begins where the last one ended, with the letters of the format.
     engine = figure.get_layout_engine()
     if not isinstance(engine, ConstrainedLayoutEngine):
         yield
@@ -588,17 +586,7 @@ def _extent(axes: Axes, text: str) -> np.ndarray:
 def _free_place(
     axes: Axes, own: np.ndarray, others: np.ndarray, half: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the place on a contour line that is furthest from what is drawn.
-
-    Args:
-        axes: that the value is to be inside of.
-        own: points of the contour line, shape (k, 2).
-        others: points of everything else, shape (m, 2).
-        half: of the width and the height of the value.
-
-    Returns:
-        The place and points that fill the value's box; None if it has no room.
-    """
+    """Return the place on a contour line that is furthest from what is drawn."""
     best, margin = None, 1.0
     inside = axes.bbox.padded(-float(half.max()))
     for k in range(3, len(own) - 3, max(1, len(own) // _TRIED)):

@@ -262,13 +262,7 @@ def _draw_returns(
 
 
 def _turn_labels(figure: Figure, grid: np.ndarray, room: float) -> None:
-    """Write the values across upwards where they do not fit next to each other.
-
-    Args:
-        figure: of the panels, which grows by the length of the values.
-        grid: of the panels.
-        room: width in inches of a panel, with the labels at its side.
-    """
+    """Write the values across upwards where they do not fit next to each other."""
     shown = [axes for axes in grid.flat if axes.get_visible()]
     labels = [label for axes in shown for label in axes.get_xticklabels()]
     widest = max(label.get_window_extent().width for label in labels) / figure.dpi
@@ -310,11 +304,9 @@ def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
 
 
 def _rate(rows: Sequence[Row]) -> Rate | None:
-    """Return the rate of cells that differ in their seeds only; None without cells.
-
-    Their episodes are independent, unless the filter was retrained for each seed: then the interval
-    is over models and episodes.
-    """
+    """Return the rate of cells that differ in their seeds only; None without cells."""
+    # Their episodes are independent, unless the filter was retrained for each seed: then the
+    # interval is over models and episodes.
     if not rows:
         return None
     if len(rows) == 1:

@@ -124,10 +124,8 @@ _LEVELS = (0.2, 0.4, 0.6, 0.8)
 
 
 def _draw_slice(axes: Axes, found: Verification, starts: np.ndarray) -> ContourSet | None:
-    """Draw h, the chain and where no action meets the conditions, in the plane of the worst state.
-
-    The contours of h inside the safe set are returned, for `write_levels`.
-    """
+    """Draw h, the chain and where no action meets the conditions, through the worst state."""
+    # The contours of h inside the safe set are returned, for `write_levels`.
     lines = None
     problem, worst = found.problem, found.part.worst
     formulas, plane = found.formulas, _plane(problem)
@@ -213,10 +211,8 @@ def _states_over(
 
 
 def _others(found: Verification, count: int) -> np.ndarray:
-    """Return states whose coordinates outside the plane are tried.
-
-    They are evenly spread, or in the invariant set where such states would rarely be in it.
-    """
+    """Return states whose coordinates outside the plane are tried."""
+    # They are evenly spread, or in the invariant set where such states would rarely be in it.
     rng = np.random.default_rng(0)
     if found.problem.plant.n == 3 or found.invariant_set is None:
         return found.region.draw(count.bit_length() - 1, rng)

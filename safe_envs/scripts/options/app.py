@@ -221,10 +221,8 @@ def write_sections(formatter: Any, sections: dict[str, list[Entry]]) -> None:
 
 
 def _entry(name: str, text: str, column: int, width: int) -> str:
-    """Return the lines of an entry.
-
-    Words are not divided at hyphens, as Click does: `--closed-loop` is to be found and copied.
-    """
+    """Return the lines of an entry."""
+    # Words are not divided at hyphens, as Click does: `--closed-loop` is to be found and copied.
     lines = [
         line
         for paragraph in text.split("\n\n")

@@ -262,10 +262,8 @@ def _one(inputs: Sequence[float]) -> np.ndarray:
 
 
 def _blocks(inputs: Sequence[np.ndarray]) -> np.ndarray:
-    """Return components (B,) as blocks of states (blocks, _BLOCK, p), filled up with zeros.
-
-    NaN stands for infinity.
-    """
+    """Return components (B,) as blocks of states (blocks, _BLOCK, p), filled up with zeros."""
+    # NaN stands for infinity.
     count = len(inputs[0])
     x = np.zeros((-(-count // _BLOCK), _BLOCK, len(inputs)))
     rows = x.reshape(-1, len(inputs))
